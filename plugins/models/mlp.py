@@ -1,0 +1,106 @@
+"""Multilayer perceptron, and its population of S agents as batched matrix products.
+
+Source: the paper's classical models (section 'Experimental Setup'). The paper's text says "He
+initialization"; its released code uses the default of `torch.nn.Linear`, which is ours too (`init = "he"` is
+the text's).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from torch import Tensor, nn
+
+from qrlsuite.population import linear
+
+ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "none": lambda x: x}
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Options:
+    """Options of the multilayer perceptron."""
+
+    width: Annotated[int, Field(ge=1, le=4096, description="units of each hidden layer")] = 64
+    depth: Annotated[int, Field(ge=1, le=16, description="number of hidden layers")] = 2
+    activation: Annotated[
+        Literal["relu", "tanh", "none"], Field(description="after each hidden layer")
+    ] = "relu"
+    init: Annotated[
+        Literal["torch", "he"],
+        Field(description="torch: uniform(-1/sqrt(in), 1/sqrt(in)), as released; he: normal(0, sqrt(2/in))"),
+    ] = "torch"
+
+
+class MLP(nn.Module):
+    """One agent's perceptron: `depth` hidden layers of `width` units; (B, in) -> (B, out).
+
+    Parameters `w0, b0, w1, b1, ...`: w (out, in), b (out,). For 3 inputs and outputs they are
+    (depth - 1) w^2 + (depth + 6) w + 3 scalars at width w.
+    """
+
+    def __init__(self, sizes: Sequence[int], options: Options, generator: torch.Generator) -> None:
+        super().__init__()
+        self.layers = len(sizes) - 1
+        self.activation = options.activation
+        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:])):
+            weight, bias = initial_layer(fan_in, fan_out, options.init, generator)
+            self.register_parameter(f"w{i}", nn.Parameter(weight))
+            self.register_parameter(f"b{i}", nn.Parameter(bias))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, in) to (B, out)."""
+        state = {name: p[None] for name, p in self.named_parameters()}
+        return _forward(x[None], state, self.layers, self.activation)[0]
+
+
+class MLPPopulation(nn.Module):
+    """S perceptrons; (S, B, in) -> (S, B, out); parameters as in `MLP` with a leading axis S."""
+
+    def __init__(self, modules: Sequence[MLP]) -> None:
+        super().__init__()
+        self.layers = modules[0].layers
+        self.activation = modules[0].activation
+        for name, _ in modules[0].named_parameters():
+            stacked = torch.stack([m.get_parameter(name).detach() for m in modules])
+            self.register_parameter(name, nn.Parameter(stacked))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (S, B, in) to (S, B, out)."""
+        return _forward(x, dict(self.named_parameters()), self.layers, self.activation)
+
+
+def initial_layer(
+    fan_in: int, fan_out: int, init: str, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draw a layer's weight (fan_out, fan_in) and bias (fan_out,) as `torch.nn.Linear` or He et al. do."""
+    bound = 1.0 / math.sqrt(fan_in)
+    if init == "he":
+        weight = torch.randn((fan_out, fan_in), generator=generator) * math.sqrt(2.0 / fan_in)
+        return weight, torch.zeros(fan_out)
+    weight = (torch.rand((fan_out, fan_in), generator=generator) * 2.0 - 1.0) * bound
+    bias = (torch.rand(fan_out, generator=generator) * 2.0 - 1.0) * bound
+    return weight, bias
+
+
+def _forward(x: Tensor, state: dict[str, Tensor], layers: int, activation: str) -> Tensor:
+    function = ACTIVATIONS[activation]
+    for i in range(layers):
+        x = linear(x, state[f"w{i}"], state[f"b{i}"])
+        if i < layers - 1:
+            x = function(x)
+    return x
+
+
+def build(obs_dim: int, out_dim: int, options: Options, generator: torch.Generator) -> MLP:
+    """Build one agent's perceptron with its initial parameters drawn from `generator`."""
+    return MLP([obs_dim, *[options.width] * options.depth, out_dim], options, generator)
+
+
+def population(modules: Sequence[MLP], options: Options) -> MLPPopulation:
+    """Stack built perceptrons."""
+    return MLPPopulation(modules)

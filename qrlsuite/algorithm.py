@@ -1,0 +1,48 @@
+"""What the core expects of a learning algorithm: one class, one file.
+
+An algorithm trains S agents at once. Every tensor it keeps has the seed axis S first, so that a checkpointed
+group of seeds can be split and merged by slicing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+BuildModel = Callable[[int], nn.Module]
+"""`build_model(out_dim)` returns a population of S freshly initialized agents; every call draws anew."""
+
+
+class Algorithm(Protocol):
+    """A learning algorithm over S seeds with E environments each.
+
+    Constructed as `factory(envs, build_model, options, streams, device)`: `envs` is a
+    `qrlsuite.environment.LaneEnv` of S * E seed-major lanes that has not been reset, `streams` a list of S
+    `qrlsuite.seeding.Streams`. Randomness is drawn per seed, from streams that carry the epoch as index where
+    a whole epoch's numbers are drawn at once.
+    """
+
+    def start(self) -> None:
+        """Reset the environments. Called once for a new run; a resumed run calls `load_state_dict` instead."""
+
+    def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
+        """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,)."""
+
+    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the greedy actions (S, B) for observations (S, B, obs)."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that training depends on, seed-first, environments' state excluded."""
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore `state_dict`, also onto a group cut from or merged of others at the same epoch."""
+
+    def policy_state(self) -> dict[str, Tensor]:
+        """Return the parameters that `act` uses, seed-first: what is published as the trained agents."""
+
+
+AlgorithmFactory = Callable[..., Any]

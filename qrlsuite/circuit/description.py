@@ -1,0 +1,268 @@
+"""Circuits written once, run on every backend.
+
+A `Circuit` is a list of operations on qubits 0..n-1. Every rotation angle is affine in one input feature:
+
+    angle = constant + scale * input + weight
+
+where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale
+with an input present counts as 1). Reading order is application order. Qubit 0 is the most significant bit of
+a basis state's index, as in PennyLane. The measured observables are Pauli Z on chosen qubits (default: every).
+
+An ansatz is a function that writes such a circuit::
+
+    def ry_ring(qubits, layers, options):
+        circuit = Circuit(qubits)
+        weights = circuit.parameter("weights", (layers, qubits))
+        for layer in range(layers):
+            for q in range(qubits):
+                circuit.append("RX", q, circuit.input(q))
+                circuit.append("RY", q, weights[layer, q])
+            for q in range(qubits):
+                circuit.append("CZ", (q, (q + 1) % qubits))
+        return circuit
+
+Only numpy is imported here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from qrlsuite.errors import OptionError, nearest
+
+MAX_QUBITS = 20
+
+
+class GateSignature(NamedTuple):
+    """How many wires and angles a gate takes, and whether it may be controlled by one more qubit."""
+
+    wires: int
+    angles: int
+    controllable: bool
+
+
+GATES: dict[str, GateSignature] = {
+    "RX": GateSignature(1, 1, True),  # exp(-i a X / 2)
+    "RY": GateSignature(1, 1, True),  # exp(-i a Y / 2)
+    "RZ": GateSignature(1, 1, True),  # exp(-i a Z / 2)
+    "Rot": GateSignature(1, 3, True),  # RZ(a2) RY(a1) RZ(a0)
+    "U3": GateSignature(1, 3, True),  # PennyLane's U3(theta, phi, delta)
+    "H": GateSignature(1, 0, False),
+    "X": GateSignature(1, 0, False),
+    "Y": GateSignature(1, 0, False),
+    "Z": GateSignature(1, 0, False),
+    "S": GateSignature(1, 0, False),
+    "T": GateSignature(1, 0, False),
+    "CNOT": GateSignature(2, 0, False),  # wires: control, target
+    "CZ": GateSignature(2, 0, False),
+    "SWAP": GateSignature(2, 0, False),
+}
+"""Every gate a circuit may contain. `U3(t, p, d) = [[cos t/2, -e^{id} sin t/2], [e^{ip} sin t/2, e^{i(p+d)} cos t/2]]`."""
+
+
+class Element(NamedTuple):
+    """One scalar of a named parameter: its name and its index in the flattened (C order) array."""
+
+    parameter: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Angle:
+    """`constant + scale * input + weight`, in radians. Built with `+` and `*` from inputs and parameters."""
+
+    constant: float = 0.0
+    input: int | None = None
+    scale: Element | None = None
+    weight: Element | None = None
+
+    def __mul__(self, other: Angle) -> Angle:
+        """Multiply an input by a trainable scale (in either order); nothing else may be multiplied."""
+        for a, b in ((self, other), (other, self)):
+            if isinstance(b, Angle) and a.is_bare_input and b.is_bare_weight:
+                return Angle(input=a.input, scale=b.weight)
+        raise OptionError("an angle is affine: only input * parameter can be multiplied")
+
+    def __add__(self, other: Angle | float) -> Angle:
+        """Add two angles: at most one input term and one weight may remain."""
+        if isinstance(other, (int, float)):
+            return replace(self, constant=self.constant + float(other))
+        if not isinstance(other, Angle):
+            return NotImplemented
+        if (self.input is not None and other.input is not None) or (self.weight and other.weight):
+            raise OptionError("an angle holds at most one input term and one weight: scale * input + weight")
+        term = self if self.input is not None else other
+        return Angle(
+            constant=self.constant + other.constant,
+            input=term.input,
+            scale=term.scale,
+            weight=self.weight or other.weight,
+        )
+
+    __radd__ = __add__
+
+    @property
+    def is_bare_input(self) -> bool:
+        """Whether this is an input and nothing else."""
+        return self.input is not None and self.scale is None and self.weight is None and self.constant == 0.0
+
+    @property
+    def is_bare_weight(self) -> bool:
+        """Whether this is a single trainable parameter and nothing else."""
+        return self.input is None and self.weight is not None and self.constant == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A named trainable array; indexing it gives an `Angle`. Initial values are uniform in [low, high)."""
+
+    name: str
+    shape: tuple[int, ...]
+    low: float = 0.0
+    high: float = 2.0 * math.pi
+
+    @property
+    def size(self) -> int:
+        """Number of scalars."""
+        return math.prod(self.shape)
+
+    def __getitem__(self, index: int | tuple[int, ...]) -> Angle:
+        """Return the scalar at a full multi-index as an angle."""
+        position = (index,) if isinstance(index, int) else index
+        if len(position) != len(self.shape) or not all(0 <= i < n for i, n in zip(position, self.shape)):
+            raise OptionError(f"parameter '{self.name}' of shape {self.shape} has no element {position}")
+        return Angle(weight=Element(self.name, int(np.ravel_multi_index(position, self.shape))))
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One gate: `wires` are its targets (for CNOT: control, target), `control` an extra control qubit."""
+
+    gate: str
+    wires: tuple[int, ...]
+    angles: tuple[Angle, ...] = ()
+    control: int | None = None
+
+    @property
+    def qubits(self) -> tuple[int, ...]:
+        """Every qubit touched, an extra control first."""
+        return self.wires if self.control is None else (self.control, *self.wires)
+
+
+class Circuit:
+    """A parametrised circuit on `qubits` qubits with `inputs` input features (default: one per qubit).
+
+    Raises
+    ------
+    OptionError
+        If the number of qubits is not 1..20 or the number of inputs is not positive.
+    """
+
+    def __init__(self, qubits: int, inputs: int | None = None) -> None:
+        if not isinstance(qubits, int) or not 1 <= qubits <= MAX_QUBITS:
+            raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
+        self.qubits = qubits
+        self.inputs = qubits if inputs is None else inputs
+        if not isinstance(self.inputs, int) or self.inputs < 1:
+            raise OptionError(f"inputs = {inputs!r}: a circuit has at least one input")
+        self.parameters: dict[str, Parameter] = {}
+        self._operations: list[Operation] = []
+        self._observables: tuple[int, ...] = tuple(range(qubits))
+
+    @property
+    def operations(self) -> tuple[Operation, ...]:
+        """The gates in order of application."""
+        return tuple(self._operations)
+
+    @property
+    def observables(self) -> tuple[int, ...]:
+        """The qubits whose Pauli Z is measured, in output order."""
+        return self._observables
+
+    def measure(self, wires: Sequence[int]) -> None:
+        """Measure Pauli Z on these qubits, in this order, instead of on all."""
+        if not wires or len(set(wires)) != len(wires) or not all(0 <= w < self.qubits for w in wires):
+            raise OptionError(f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1} are needed")
+        self._observables = tuple(int(w) for w in wires)
+
+    def input(self, index: int) -> Angle:
+        """Return input feature `index` as an angle (radians)."""
+        if not 0 <= index < self.inputs:
+            raise OptionError(f"input {index}: this circuit has inputs 0..{self.inputs - 1}")
+        return Angle(input=index)
+
+    def parameter(self, name: str, shape: tuple[int, ...], low: float = 0.0, high: float = 2 * math.pi) -> Parameter:
+        """Declare a trainable array, initially uniform in [low, high)."""
+        if not name.isidentifier():
+            raise OptionError(f"parameter name {name!r} is not an identifier")
+        if name in self.parameters:
+            raise OptionError(f"parameter '{name}' is declared twice")
+        if not shape or any(not isinstance(n, int) or n < 1 for n in shape):
+            raise OptionError(f"parameter '{name}': shape {shape!r} needs positive integers")
+        self.parameters[name] = Parameter(name, tuple(shape), low, high)
+        return self.parameters[name]
+
+    def append(self, gate: str, wires: int | Sequence[int], *angles: Angle | float, control: int | None = None) -> None:
+        """Add a gate.
+
+        Parameters
+        ----------
+        gate:
+            A key of `GATES`.
+        wires:
+            The qubit, or (control, target) for CNOT, or the pair for CZ and SWAP.
+        angles:
+            As many as the gate takes, in radians.
+        control:
+            Apply the gate only where this qubit is 1 (rotations only).
+        """
+        if gate not in GATES:
+            raise OptionError(f"unknown gate '{gate}'{nearest(gate, GATES)}")
+        signature = GATES[gate]
+        targets = (wires,) if isinstance(wires, int) else tuple(wires)
+        if control is not None and not signature.controllable:
+            raise OptionError(f"{gate} takes no extra control; use CNOT or CZ, or a controlled rotation")
+        touched = targets if control is None else (control, *targets)
+        if len(targets) != signature.wires or len(set(touched)) != len(touched):
+            raise OptionError(f"{gate} needs {signature.wires} distinct wire(s), got {touched}")
+        if not all(isinstance(w, int) and 0 <= w < self.qubits for w in touched):
+            raise OptionError(f"{gate} on qubits {touched}: this circuit has qubits 0..{self.qubits - 1}")
+        if len(angles) != signature.angles:
+            raise OptionError(f"{gate} takes {signature.angles} angle(s), got {len(angles)}")
+        exact = tuple(a if isinstance(a, Angle) else Angle(constant=float(a)) for a in angles)
+        for angle in exact:
+            self._check(angle)
+        self._operations.append(Operation(gate, targets, exact, control))
+
+    def _check(self, angle: Angle) -> None:
+        if not math.isfinite(angle.constant):
+            raise OptionError("an angle's constant must be finite")
+        if angle.input is not None and not 0 <= angle.input < self.inputs:
+            raise OptionError(f"input {angle.input}: this circuit has inputs 0..{self.inputs - 1}")
+        if angle.scale is not None and angle.input is None:
+            raise OptionError("a scale needs an input to multiply")
+        for element in (angle.scale, angle.weight):
+            if element is None:
+                continue
+            parameter = self.parameters.get(element.parameter)
+            if parameter is None or not 0 <= element.index < parameter.size:
+                raise OptionError(f"the angle uses {element}, which this circuit does not declare")
+
+    def __iter__(self) -> Iterator[Operation]:
+        return iter(self._operations)
+
+    def __len__(self) -> int:
+        return len(self._operations)
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of trainable scalars."""
+        return sum(p.size for p in self.parameters.values())
+
+    def __repr__(self) -> str:
+        return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count})"

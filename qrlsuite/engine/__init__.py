@@ -1,0 +1,1 @@
+"""Where groups of seeds run. Engines only decide that; the results folder is the one source of truth."""

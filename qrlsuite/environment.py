@@ -1,0 +1,71 @@
+"""The environments' side of the core: vector environments whose lanes have random streams of their own.
+
+Lanes are seed-major: with S seeds and E environments each, lane = s * E + e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+
+State = dict[str, NDArray[Any]]
+"""A checkpointed state: arrays whose first axis is the lane, without random streams (the core keeps those)."""
+
+
+class LaneEnv(VectorEnv):  # type: ignore[type-arg]
+    """A `gymnasium.vector.VectorEnv` with same-step autoreset and given random streams.
+
+    A subclass sets `num_envs`, `single_observation_space`, `single_action_space`, `observation_space` and
+    `action_space`, and implements `reset`, `step`, `state_dict` and `load_state_dict`. `step` takes actions
+    (num_envs,) int64 and returns observations (num_envs, ...) float32, rewards (num_envs,) float64,
+    terminated and truncated (num_envs,) bool, and infos. Where an episode ends, the lane is reset in the same
+    step; then infos hold, as Gymnasium's same-step mode does, `final_obs` (num_envs, ...) with mask
+    `_final_obs`, and `final_info`, a dict that may hold `score` (num_envs,) with mask `_score`.
+
+    All randomness comes from `self.streams`: stream g serves the lanes g*m .. (g+1)*m - 1, m =
+    num_envs / len(streams), in lane order, so that an episode never depends on lanes of another stream.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+    streams: list[np.random.Generator]
+    autoreset: bool = True
+    """False in validation: an ended lane need not be reset; stepping it on is allowed and means nothing."""
+
+    def seed_lanes(self, streams: Sequence[np.random.Generator]) -> None:
+        """Replace the random streams; their number divides `num_envs`. Takes effect at the next reset."""
+        if not streams or self.num_envs % len(streams):
+            raise ValueError(f"{len(streams)} streams cannot serve {self.num_envs} lanes evenly")
+        self.streams = list(streams)
+
+    def seed_from(self, seed: int | None) -> None:
+        """Give every lane a stream of its own, derived from one integer: Gymnasium's `reset(seed=...)`."""
+        children = np.random.SeedSequence(seed).spawn(self.num_envs)
+        self.seed_lanes([np.random.Generator(np.random.PCG64(child)) for child in children])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin a new episode in every lane; `seed` is Gymnasium's, None continues the lanes' streams."""
+        raise NotImplementedError
+
+    def state_dict(self) -> State:
+        """Return everything but the random streams that the rest of the episodes depends on, lane-first."""
+        raise NotImplementedError
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore what `state_dict` returned."""
+        raise NotImplementedError
+
+
+def batched_spaces(env: LaneEnv, observation: gymnasium.Space[Any], action: gymnasium.Space[Any], lanes: int) -> None:
+    """Set the number of lanes and the four spaces of a lane environment."""
+    env.num_envs = lanes
+    env.single_observation_space = observation
+    env.single_action_space = action
+    env.observation_space = gymnasium.vector.utils.batch_space(observation, lanes)
+    env.action_space = gymnasium.vector.utils.batch_space(action, lanes)

@@ -1,0 +1,55 @@
+"""The errors a user can cause.
+
+Everything raised on purpose derives from `QrlSuiteError`; the command line turns it into one clear line and
+exit code 2. Anything else that escapes is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class QrlSuiteError(Exception):
+    """Something the user gave cannot be used; the message says what, where and what to type instead."""
+
+
+class UnknownNameError(QrlSuiteError):
+    """A task, model, algorithm, ansatz, option or entry of that name does not exist."""
+
+
+class TaskError(QrlSuiteError):
+    """A task file is malformed; the message lists every problem with its path in the file."""
+
+
+class OptionError(QrlSuiteError):
+    """An option has a value that it cannot have."""
+
+
+class PluginError(QrlSuiteError):
+    """A plugin broke a rule of registration; the message names its distribution."""
+
+
+class StoreError(QrlSuiteError):
+    """A results folder or file cannot be read or written; nothing in it was changed."""
+
+
+class EnvironmentFailure(QrlSuiteError):
+    """An environment raised while it was being stepped; the message carries the environment's own."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return `"; did you mean 'x'?"` for the closest known name, else the list of what there is.
+
+    Parameters
+    ----------
+    name:
+        What was typed.
+    known:
+        Every name that would have been accepted.
+    """
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; known: {', '.join(names)}" if names else "; none is registered"

@@ -1,0 +1,54 @@
+"""Ctrl-C and SIGTERM as one interruption, which waits while results are being written."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType, TracebackType
+from typing import Any
+
+
+class Interruptible:
+    """While entered, SIGINT and SIGTERM raise KeyboardInterrupt, inside `deferred()` only at its end.
+
+    Outside the main thread, where signals cannot be handled, it changes nothing.
+    """
+
+    def __init__(self) -> None:
+        self._deferring = 0
+        self._pending = False
+        self._old: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Interruptible:
+        """Install the handlers."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Restore the earlier handlers."""
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._deferring:
+            self._pending = True
+        else:
+            raise KeyboardInterrupt
+
+    @contextlib.contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Hold an interruption back until the block has been left."""
+        self._deferring += 1
+        try:
+            yield
+        finally:
+            self._deferring -= 1
+        if self._pending and not self._deferring:
+            self._pending = False
+            raise KeyboardInterrupt

@@ -1,0 +1,168 @@
+"""Options: pydantic dataclasses, resolved from defaults, presets and `--set` words.
+
+Every error names where the value came from, what is wrong with it, and what to type instead.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import pydantic
+
+from qrlsuite.errors import OptionError, nearest
+
+Values = dict[str, Any]
+
+
+def field_names(cls: type[Any]) -> list[str]:
+    """Return the option names of an options dataclass."""
+    return [f.name for f in fields(cls)]
+
+
+def describe(cls: type[Any]) -> list[dict[str, Any]]:
+    """Return name, type, default and description of every option, for `qrlsuite show`."""
+    properties = pydantic.TypeAdapter(cls).json_schema().get("properties", {})
+    rows = []
+    for name in field_names(cls):
+        schema = properties.get(name, {})
+        rows.append(
+            {
+                "name": name,
+                "values": _values(schema),
+                "default": schema.get("default"),
+                "description": schema.get("description", ""),
+            }
+        )
+    return rows
+
+
+def _values(schema: Mapping[str, Any]) -> str:
+    """Say in a few words which values a JSON schema admits."""
+    if "enum" in schema:
+        return " | ".join(str(v) for v in schema["enum"])
+    if "const" in schema:
+        return str(schema["const"])
+    if "anyOf" in schema:
+        return " or ".join(_values(s) for s in schema["anyOf"])
+    kind = str(schema.get("type", "value"))
+    bounds = [
+        f"{sign} {schema[key]:g}"
+        for key, sign in (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
+        if key in schema
+    ]
+    return " ".join([kind, *bounds])
+
+
+def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
+    """Validate values into an options object.
+
+    Parameters
+    ----------
+    cls:
+        The options dataclass.
+    values:
+        Given values by name; absent ones take their defaults.
+    where:
+        What the values belong to, for messages: `"model 'mlp'"`.
+
+    Raises
+    ------
+    OptionError
+        Listing every unknown name (with its nearest match) and every bad value at once.
+    """
+    known = field_names(cls)
+    problems = [f"{where} has no option '{name}'{nearest(name, known)}" for name in values if name not in known]
+    try:
+        result = pydantic.TypeAdapter(cls).validate_python({k: v for k, v in values.items() if k in known})
+    except pydantic.ValidationError as error:
+        problems += [f"{where}: {line}" for line in validation_lines(error)]
+    if problems:
+        raise OptionError("; ".join(problems))
+    return result
+
+
+def validation_lines(error: pydantic.ValidationError) -> list[str]:
+    """Turn a pydantic error into lines `path = value: what is wrong`."""
+    lines = []
+    for item in error.errors(include_url=False):
+        path = ".".join(str(part) for part in item["loc"])
+        given = item.get("input")
+        shown = "" if isinstance(given, Mapping) or item["type"] == "missing" else f" = {_short(given)}"
+        message = str(item["msg"]).removeprefix("Value error, ")
+        lines.append(f"{path}{shown}: {message}" if path else message)
+    return lines
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def plain(options: Any) -> Values:
+    """Return an options object as JSON-compatible values, every default written out."""
+    result: Values = pydantic.TypeAdapter(type(options)).dump_python(options, mode="json")
+    return result
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One word of `--set`: `side.name=value`, or `name=value` where the side is to be found."""
+
+    side: str | None
+    name: str
+    value: Any
+
+
+def parse_setting(word: str) -> Setting:
+    """Parse `[environment.|model.|algorithm.]name=value`; the value is read as TOML, else as text.
+
+    Raises
+    ------
+    OptionError
+        If there is no `=` or no name.
+    """
+    key, equals, text = word.partition("=")
+    if not equals or not key.strip():
+        raise OptionError(f"--set {word}: write name=value, for example --set qubits=6")
+    side, dot, name = key.strip().partition(".")
+    value = parse_value(text.strip())
+    return Setting(side, name, value) if dot else Setting(None, side, value)
+
+
+def parse_value(text: str) -> Any:
+    """Read a value as TOML would (`6`, `0.5`, `.5`, `true`, `[1, 2]`, `"text"`), else as bare text."""
+    for candidate in (text, f"0{text}" if text.startswith(".") else text):
+        try:
+            return tomllib.loads(f"value = {candidate}")["value"]
+        except tomllib.TOMLDecodeError:
+            continue
+    return text
+
+
+def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[str, Values]:
+    """Distribute settings over the sides (`environment`, `model`, `algorithm`) that have options of that name.
+
+    Raises
+    ------
+    OptionError
+        For an unknown side or name (with the nearest match), or a bare name that several sides have.
+    """
+    result: dict[str, Values] = {side: {} for side in sides}
+    every = {f"{side}.{name}" for side, cls in sides.items() for name in field_names(cls)}
+    for setting in settings:
+        owners = [side for side, cls in sides.items() if setting.name in field_names(cls)]
+        if setting.side is not None:
+            if setting.side not in sides:
+                raise OptionError(f"--set {setting.side}.{setting.name}: sides are {', '.join(sides)}")
+            owners = [setting.side]
+        if not owners:
+            bare = {name.partition(".")[2] for name in every}
+            raise OptionError(f"--set {setting.name}: no option of that name{nearest(setting.name, bare)}")
+        if len(owners) > 1:
+            choices = " or ".join(f"--set {side}.{setting.name}=..." for side in owners)
+            raise OptionError(f"--set {setting.name}: several have that option; write {choices}")
+        result[owners[0]][setting.name] = setting.value
+    return result

@@ -1,0 +1,173 @@
+"""What a plugin hands over: a name, one line of summary, and *references* to code.
+
+A reference is a string `"package.module:Name"`. It is resolved only by the command that needs it, so that
+registering imports neither torch nor PennyLane nor Qiskit, and `qrlsuite list` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from qrlsuite.errors import PluginError
+
+NAME = re.compile(r"[a-z][a-z0-9]*(?:[-_.][a-z0-9]+)*")
+"""Names are lower case, digits, and single hyphens, underscores or dots: safe in a path and on a command line."""
+
+
+def resolve(reference: str) -> Any:
+    """Import what a reference `"package.module:Name"` points at.
+
+    Raises
+    ------
+    PluginError
+        If the reference is malformed, the module cannot be imported or the name is not in it.
+    """
+    module_name, separator, attribute = reference.partition(":")
+    if not separator or not module_name or not attribute:
+        raise PluginError(f"reference {reference!r} should read 'package.module:Name'")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise PluginError(f"reference {reference!r} cannot be imported: {error}") from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError:
+        raise PluginError(f"reference {reference!r}: module '{module_name}' has no '{attribute}'") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """What every registered thing has.
+
+    Attributes
+    ----------
+    name:
+        Unique within its kind; lower case, matching `NAME`.
+    summary:
+        One line for `qrlsuite list`.
+    """
+
+    name: str
+    summary: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not NAME.fullmatch(self.name) or len(self.name) > 64:
+            raise PluginError(
+                f"name {self.name!r} is not usable: lower-case letters, digits and single '-', '_', '.' "
+                "between them, beginning with a letter, 64 characters at most"
+            )
+        if not isinstance(self.summary, str) or not self.summary.strip() or "\n" in self.summary:
+            raise PluginError(f"'{self.name}': the summary must be one line of text")
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentSpec(Spec):
+    """An environment.
+
+    Attributes
+    ----------
+    options:
+        Reference to a pydantic dataclass; its fields are the keyword arguments of the environment.
+    gymnasium_id:
+        The id under which `gymnasium.make` finds the single environment.
+    entry_point:
+        Reference to the `gymnasium.Env` class, registered under `gymnasium_id` when it is first needed;
+        None where Gymnasium knows the id already.
+    vector:
+        Reference to `factory(options, num_envs) -> qrlsuite.environment.LaneEnv`; None uses a generic one
+        over `gymnasium.make`.
+    """
+
+    options: str
+    gymnasium_id: str
+    entry_point: str | None = None
+    vector: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSpec(Spec):
+    """A function approximator.
+
+    Attributes
+    ----------
+    family:
+        `"classical"` or `"quantum"`; selects family-dependent presets of a task.
+    options:
+        Reference to a pydantic dataclass.
+    build:
+        Reference to `build(obs_dim, out_dim, options, generator) -> torch.nn.Module`, an ordinary
+        single-agent module (B, obs_dim) -> (B, out_dim), every random number drawn from `generator`
+        (a `torch.Generator`).
+    population:
+        Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
+        (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
+        `qrlsuite.population.stack`.
+    """
+
+    family: Literal["classical", "quantum"]
+    options: str
+    build: str
+    population: str | None = None
+
+    def __post_init__(self) -> None:
+        Spec.__post_init__(self)
+        if self.family not in ("classical", "quantum"):
+            raise PluginError(f"model '{self.name}': family {self.family!r} is neither 'classical' nor 'quantum'")
+
+
+@dataclass(frozen=True, slots=True)
+class AlgorithmSpec(Spec):
+    """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`)."""
+
+    options: str
+    factory: str
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSpec(Spec):
+    """A benchmark task: `path` names its TOML file."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class AnsatzSpec(Spec):
+    """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`."""
+
+    options: str
+    build: str
+
+
+@dataclass(frozen=True, slots=True)
+class CircuitBackendSpec(Spec):
+    """Something that computes expectation values of a circuit, differentiably, in torch.
+
+    Attributes
+    ----------
+    options:
+        Reference to a pydantic dataclass.
+    factory:
+        Reference to `factory(circuit, options) -> backend`, see `qrlsuite.circuit.api.CircuitBackend`.
+    """
+
+    options: str
+    factory: str
+
+
+@dataclass(frozen=True, slots=True)
+class SignificanceTestSpec(Spec):
+    """A rule that decides, per (epsilon, delta) cell, whether one entry needs significantly fewer samples."""
+
+    factory: str
+
+
+@dataclass(frozen=True, slots=True)
+class EngineSpec(Spec):
+    """Where groups of seeds run: `factory` references a class with `run(plan, display)`."""
+
+    factory: str
+    options: str | None = None
+    extras: dict[str, str] = field(default_factory=dict)

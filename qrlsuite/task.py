@@ -1,0 +1,265 @@
+"""Benchmark tasks: one TOML file each, validated whole, every error at once with its path in the file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from qrlsuite import options, registry, specs
+from qrlsuite.errors import TaskError, nearest
+
+FORMAT_VERSION = 1
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class EnvironmentSection(_Section):
+    """Which environment, with which options."""
+
+    name: Annotated[str, Field(description="a registered environment")]
+    options: Annotated[dict[str, Any], Field(description="its options; absent ones take their defaults")] = {}
+
+
+class ProtocolSection(_Section):
+    """How much each seed interacts, and how it is validated."""
+
+    seeds: Annotated[int, Field(ge=1, description="independent runs of a complete entry")] = 100
+    epochs: Annotated[int, Field(ge=1, description="epochs of a complete run")] = 100
+    algorithm_epochs: Annotated[
+        dict[str, Annotated[int, Field(ge=1)]], Field(description="epochs where an algorithm needs others")
+    ] = {}
+    environments: Annotated[int, Field(ge=1, description="training environments per seed")] = 10
+    interactions: Annotated[int, Field(ge=1, description="environment steps per epoch, all environments together")]
+    validation_episodes: Annotated[int, Field(ge=1, description="fresh greedy episodes after every epoch")] = 100
+
+    @model_validator(mode="after")
+    def _whole_rounds(self) -> ProtocolSection:
+        if self.interactions % self.environments:
+            raise ValueError(
+                f"interactions = {self.interactions} is not a multiple of environments = {self.environments}"
+            )
+        return self
+
+    @property
+    def rounds(self) -> int:
+        """Steps of every training environment per epoch."""
+        return self.interactions // self.environments
+
+
+class ScoreSection(_Section):
+    """How an episode's score in [0, 1] comes about."""
+
+    source: Annotated[
+        Literal["info", "return"],
+        Field(description="info: the environment's info['score']; return: the episode's return over max_return"),
+    ] = "info"
+    max_return: Annotated[float | None, Field(description="best possible return, for source = 'return'")] = None
+
+    @model_validator(mode="after")
+    def _maximum(self) -> ScoreSection:
+        if self.max_return is not None and self.max_return == 0:
+            raise ValueError("max_return = 0 cannot scale a return")
+        return self
+
+
+class Cell(_Section):
+    """One cell of the ranking grid."""
+
+    epsilon: Annotated[float, Field(ge=0, lt=1)]
+    delta: Annotated[float, Field(gt=0, le=1)]
+
+
+class RankingSection(_Section):
+    """On which cells entries are compared."""
+
+    epsilons: Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=1)]
+    deltas: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)]
+    reference: Cell
+    horizon: Annotated[int, Field(ge=1, description="environment steps at which S_hat is capped")]
+
+    @model_validator(mode="after")
+    def _reference_in_grid(self) -> RankingSection:
+        if self.reference.epsilon not in self.epsilons or self.reference.delta not in self.deltas:
+            # the reference cell need not be a grid point, but must lie inside the grid's range
+            inside = (
+                min(self.epsilons) <= self.reference.epsilon <= max(self.epsilons)
+                and min(self.deltas) <= self.reference.delta <= max(self.deltas)
+            )
+            if not inside:
+                raise ValueError("the reference cell lies outside the ranking grid")
+        return self
+
+
+Family = Literal["all", "classical", "quantum"]
+
+
+class TaskFile(_Section):
+    """A whole task file."""
+
+    format_version: Literal[1]
+    name: Annotated[str, Field(pattern=specs.NAME.pattern, max_length=64)]
+    summary: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    environment: EnvironmentSection
+    protocol: ProtocolSection
+    score: ScoreSection = ScoreSection()
+    ranking: RankingSection
+    default_algorithm: str = "ddqn"
+    default_preset: str | None = None
+    presets: Annotated[
+        dict[str, dict[str, dict[Family, dict[str, Any]]]],
+        Field(description="[presets.NAME.ALGORITHM.FAMILY]: algorithm options, FAMILY all, classical or quantum"),
+    ] = {}
+
+    @model_validator(mode="after")
+    def _preset_exists(self) -> TaskFile:
+        if self.default_preset is not None and self.default_preset not in self.presets:
+            raise ValueError(f"default_preset '{self.default_preset}'{nearest(self.default_preset, self.presets)}")
+        return self
+
+
+class Task:
+    """A validated task with its environment's options resolved.
+
+    Attributes
+    ----------
+    file:
+        The task file's content.
+    environment_options:
+        The environment's options object.
+    definition:
+        Everything that a run's numbers depend on, as plain values.
+    hash:
+        The first 16 hexadecimal digits of SHA-256 over the definition; the key of all random streams.
+    """
+
+    def __init__(self, file: TaskFile, source: str) -> None:
+        self.file = file
+        self.source = source
+        self.name = file.name
+        self.environment = registry.environment(file.environment.name)
+        cls = specs.resolve(self.environment.options)
+        where = f"{source}: environment.options"
+        self.environment_options = options.build(cls, file.environment.options, where)
+        self.definition: dict[str, Any] = {
+            "environment": file.environment.name,
+            "environment_options": options.plain(self.environment_options),
+            "environments": file.protocol.environments,
+            "interactions": file.protocol.interactions,
+            "validation_episodes": file.protocol.validation_episodes,
+            "score": file.score.model_dump(mode="json"),
+        }
+        self.hash = digest(self.definition)
+
+    def epochs(self, algorithm: str) -> int:
+        """Return the epochs of a complete run of an algorithm."""
+        return self.file.protocol.algorithm_epochs.get(algorithm, self.file.protocol.epochs)
+
+    def with_environment(self, values: dict[str, Any]) -> Task:
+        """Return the task with other environment options, under a name that says so."""
+        if not values:
+            return self
+        merged = {**self.file.environment.options, **values}
+        section = self.file.environment.model_copy(update={"options": merged})
+        changed = Task(self.file.model_copy(update={"environment": section}), self.source)
+        if changed.hash != self.hash:
+            changed.name = f"{self.name}+{changed.hash[:8]}"
+        return changed
+
+    def preset(self, name: str | None, algorithm: str, family: str) -> tuple[str | None, dict[str, Any]]:
+        """Return the chosen preset's name and its values for an algorithm and a model family.
+
+        Raises
+        ------
+        TaskError
+            If the task has no preset of that name.
+        """
+        chosen = name or self.file.default_preset
+        if chosen is None:
+            return None, {}
+        if chosen not in self.file.presets:
+            raise TaskError(f"task '{self.name}' has no preset '{chosen}'{nearest(chosen, self.file.presets)}")
+        tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
+        return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+
+
+def digest(content: Any) -> str:
+    """Return 16 hexadecimal digits of SHA-256 over content in canonical JSON."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def parse(text: str, source: str) -> Task:
+    """Parse and validate a task.
+
+    Parameters
+    ----------
+    text:
+        TOML.
+    source:
+        Where it came from, for messages.
+
+    Raises
+    ------
+    TaskError
+        Listing every problem with its path in the file.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TaskError(f"{source}: not valid TOML: {error}") from None
+    try:
+        file = TaskFile.model_validate(data)
+    except pydantic.ValidationError as error:
+        raise TaskError(f"{source}: " + "; ".join(_lines(error, data))) from None
+    return Task(file, source)
+
+
+def load(name: str) -> Task:
+    """Load a registered task by name, or a task file by path (anything that ends in `.toml`).
+
+    Raises
+    ------
+    UnknownNameError
+        If no task has the name.
+    TaskError
+        If the file cannot be read or is malformed.
+    """
+    path = Path(name) if name.endswith(".toml") else Path(registry.task(name).path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TaskError(f"task file {path} cannot be read: {error}") from None
+    return parse(text, path.name)
+
+
+def _lines(error: pydantic.ValidationError, data: dict[str, Any]) -> list[str]:
+    """Validation lines, with the nearest known key for each unknown one."""
+    lines = []
+    for item, line in zip(error.errors(include_url=False), options.validation_lines(error)):
+        if item["type"] == "extra_forbidden":
+            *parents, key = (str(part) for part in item["loc"])
+            where = f" in [{'.'.join(parents)}]" if parents else ""
+            lines.append(f"unknown key '{key}'{where}{nearest(key, _keys(parents))}")
+        elif item["type"] == "missing":
+            lines.append(f"missing key '{'.'.join(str(part) for part in item['loc'])}'")
+        else:
+            lines.append(line)
+    return lines
+
+
+def _keys(path: list[str]) -> list[str]:
+    """Known keys of a (nested) section of the task file."""
+    model: Any = TaskFile
+    for part in path:
+        info = getattr(model, "model_fields", {}).get(part)
+        model = info.annotation if info is not None else None
+    return list(getattr(model, "model_fields", {}))
