@@ -1,0 +1,116 @@
+"""Options of BeamManagement6G, the keyword arguments of `gymnasium.make` and the keys of a task file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+from pydantic.dataclasses import dataclass
+from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, Name
+from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
+
+from qrlsuite.errors import OptionError, nearest
+
+MAIN: tuple[Antenna, ...] = (
+    ((1.5, 1.0), (1.0, 0.0)),
+    ((1.5, 5.0), (-1.0, 0.0)),
+    ((4.5, 3.0), (0.0, 1.0)),
+)
+"""The paper's standard instance, `a3-main`."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Options:
+    """Options of BeamManagement6G."""
+
+    antennas: Annotated[
+        tuple[Antenna, ...],
+        Field(
+            description="at least two antennas ((x, y), (d_x, d_y)): position in [0, 6] x [0, 6], in units "
+            "of the model, and orientation, normalized to length 1"
+        ),
+    ] = MAIN
+    degree: Annotated[
+        int,
+        Field(description="number of support points of a trajectory, 2 to 32: the higher, the more curved"),
+    ] = 3
+    steps: Annotated[int, Field(ge=1, le=100_000, description="actions per episode, the horizon")] = 200
+    physics: Annotated[
+        Name,
+        Field(description="released: as in the paper's code, 1/R^4; text: as in the paper's text, 1/R^2"),
+    ] = "released"
+    rejection: Annotated[
+        Rejection,
+        Field(
+            description="tolerant: keep every path within 1e-9 of the field; released: also reject paths by "
+            "the rounding error at their first point, as the paper's code does (slow)"
+        ),
+    ] = "tolerant"
+    stack: Annotated[
+        int, Field(ge=1, le=1000, description="number of last observations that make one, the oldest first")
+    ] = 1
+
+    @field_validator("antennas")
+    @classmethod
+    def _antennas(cls, antennas: tuple[Antenna, ...]) -> tuple[Antenna, ...]:
+        if len(antennas) < 2:
+            raise ValueError(
+                f"{len(antennas)} given, at least 2 are needed: the action is the choice of an antenna, and "
+                "the observation divides its index by their number minus one"
+            )
+        return tuple(_checked(i, antenna) for i, antenna in enumerate(antennas))
+
+    @field_validator("degree")
+    @classmethod
+    def _degree(cls, degree: int) -> int:
+        if degree < 2:
+            raise ValueError(
+                f"{degree} given, at least 2 is needed: a path has a first and a last support point"
+            )
+        if degree > 32:
+            raise ValueError(
+                f"{degree} given, at most 32 is allowed: hardly any random path would stay in the field"
+            )
+        return degree
+
+
+def _checked(index: int, antenna: Antenna) -> Antenna:
+    """Return an antenna with a unit orientation, or raise a ValueError that says what is wrong."""
+    (x, y), (d_x, d_y) = antenna
+    if not all(math.isfinite(value) for value in (x, y, d_x, d_y)):
+        raise ValueError(f"antenna {index} has a value that is not a finite number: {antenna}")
+    if not (0.0 <= x <= FIELD and 0.0 <= y <= FIELD):
+        raise ValueError(f"antenna {index} stands at ({x:g}, {y:g}), outside the field [0, 6] x [0, 6]")
+    length = math.hypot(d_x, d_y)
+    if length < 1e-12:
+        raise ValueError(f"antenna {index} has the orientation (0, 0), which is no direction")
+    if abs(length - 1.0) > 1e-12:  # leave unit vectors their bits, so that stored options stay as they are
+        d_x, d_y = d_x / length, d_y / length
+    return ((x, y), (d_x, d_y))
+
+
+_ADAPTER = TypeAdapter(Options)
+
+
+def parse(values: Mapping[str, Any]) -> Options:
+    """Return the options that `values` describe.
+
+    Raises
+    ------
+    OptionError
+        If a key is unknown or a value cannot be used; the message lists every problem.
+    """
+    try:
+        return _ADAPTER.validate_python(dict(values))
+    except ValidationError as error:
+        problems = [_problem(item["loc"], item["type"], item["msg"]) for item in error.errors()]
+        raise OptionError("BeamManagement6G: " + "; ".join(problems)) from None
+
+
+def _problem(location: tuple[int | str, ...], kind: str, message: str) -> str:
+    where = ".".join(str(part) for part in location)
+    if kind == "unexpected_keyword_argument":
+        return f"unknown option '{where}'{nearest(where, Options.__dataclass_fields__)}"
+    return f"{where}: {message.removeprefix('Value error, ')}"
