@@ -1,0 +1,84 @@
+"""Sample complexity, its confidence, and what may be concluded from it.
+
+Arrays in, arrays out: learning curves are (N runs, T epochs), results are (E epsilons, D deltas). Nothing
+here knows about tasks, stores or commands, and importing it costs no more than numpy.
+
+- `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
+- `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
+- `board` and `ranking`: all pairs, and tiers.
+- `calibration`: how often all this errs.
+"""
+
+from qrlsuite.statistics.board import Board, outperformance
+from qrlsuite.statistics.bootstrap import (
+    bootstrap_draws,
+    bootstrap_draws_at,
+    bootstrap_interval,
+    bootstrap_interval_at,
+)
+from qrlsuite.statistics.calibration import (
+    Rates,
+    SmoothedRuns,
+    board_false_winners,
+    false_winners,
+    power,
+    split_halves,
+)
+from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
+from qrlsuite.statistics.curves import LearningCurves, common_horizon
+from qrlsuite.statistics.estimator import (
+    at_cap,
+    printed,
+    sample_complexity,
+    sample_complexity_at,
+    unsettled,
+    unsettled_at,
+)
+from qrlsuite.statistics.grid import Grid
+from qrlsuite.statistics.ranking import Ranked, Ranking, rank
+from qrlsuite.statistics.significance import (
+    BUILT_IN_RULES,
+    DifferenceRule,
+    Evidence,
+    IntervalRule,
+    Resampling,
+    SignificanceRule,
+)
+
+__all__ = [
+    "BUILT_IN_RULES",
+    "MIN_RUNS",
+    "Board",
+    "Comparison",
+    "DifferenceRule",
+    "Evidence",
+    "Grid",
+    "IntervalRule",
+    "LearningCurves",
+    "Outcome",
+    "Ranked",
+    "Ranking",
+    "Rates",
+    "Resampling",
+    "SignificanceRule",
+    "SmoothedRuns",
+    "Verdict",
+    "at_cap",
+    "board_false_winners",
+    "bootstrap_draws",
+    "bootstrap_draws_at",
+    "bootstrap_interval",
+    "bootstrap_interval_at",
+    "common_horizon",
+    "compare",
+    "false_winners",
+    "outperformance",
+    "power",
+    "printed",
+    "rank",
+    "sample_complexity",
+    "sample_complexity_at",
+    "split_halves",
+    "unsettled",
+    "unsettled_at",
+]

@@ -1,0 +1,285 @@
+"""How often a rule declares a winner where there is none, and how often it finds one where there is.
+
+A significance rule's promise is only worth what a simulation of it shows. Two ways are offered:
+
+- `split_halves`: cut one entry's runs at random into two halves and compare them. Real curves, but only at
+  N/2 runs, and the splits of one entry share its runs: quote the spread over entries, never over splits.
+- `false_winners` and `board_false_winners`: draw independent runs from a smoothed model of an entry's curves
+  (`SmoothedRuns`), at any numbers of runs. `power` draws from two models.
+
+Rates are reported per cell, per grid (any cell of a pair; and: a pair with an overall winner) and per board
+(any pair among M entries).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.board import outperformance
+from qrlsuite.statistics.compare import Outcome, overall
+from qrlsuite.statistics.curves import LearningCurves
+from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
+from qrlsuite.statistics.significance import (
+    Evidence,
+    IntervalRule,
+    Resampling,
+    SignificanceRule,
+    check_signs,
+)
+
+
+class SmoothedRuns:
+    """Independent runs that resemble an entry's: a smoothed bootstrap of whole curves.
+
+    A drawn run is V = mean + (V_i - mean + h Z) / sqrt(1 + h^2), with i one of the entry's N runs at random
+    and Z a Gaussian curve with the entry's covariance between epochs, drawn as a random combination of the
+    centered runs. Jitter is thus as smooth in time as the runs themselves, and mean and covariance stay
+    what they were (Silverman and Young 1987: shrunken smoothed bootstrap). Clipped to `bounds`.
+
+    Without jitter (h = 0) draws repeat the N runs, and tie far more often than new runs would. The Gaussian
+    part fills gaps between distinct groups of runs (some learn, some do not) as h grows.
+
+    Parameters
+    ----------
+    entry:
+        The entry; two runs or more.
+    jitter:
+        h, relative to the spread of the runs.
+    bounds:
+        Lowest and highest possible score; None for returns without known bounds.
+
+    Raises
+    ------
+    OptionError
+        If the entry has a single run or a value that is not finite, `jitter` is negative, or the bounds are
+        not in order.
+    """
+
+    def __init__(
+        self,
+        entry: LearningCurves,
+        jitter: float = 0.3,
+        bounds: tuple[float, float] | None = (0.0, 1.0),
+    ) -> None:
+        if entry.n_runs < 2:
+            raise OptionError(f"'{entry.name}' has a single run: there is no spread to draw from")
+        if not np.isfinite(entry.values).all():
+            raise OptionError(f"'{entry.name}' has infinite values: they cannot be smoothed")
+        if not 0 <= jitter < np.inf:
+            raise OptionError(f"jitter = {jitter!r} is not a finite number >= 0")
+        if bounds is not None and not bounds[0] < bounds[1]:
+            raise OptionError(f"bounds = {bounds!r} are not in order")
+        self.entry = entry
+        self.jitter = float(jitter)
+        self.bounds = bounds
+        self._mean: FloatArray = entry.values.mean(axis=0, dtype=np.float64)
+        self._centered: FloatArray = entry.values.astype(np.float64) - self._mean
+
+    def draw(self, n_runs: int, generator: np.random.Generator) -> LearningCurves:
+        """Return `n_runs` independent runs under the entry's name."""
+        count, available = whole(n_runs, "n_runs", at_least=1), self.entry.n_runs
+        chosen = self._centered[generator.integers(0, available, size=count)]
+        mixture = generator.standard_normal((count, available)) / np.sqrt(available)
+        curves = self._mean + (chosen + self.jitter * (mixture @ self._centered)) / np.hypot(1, self.jitter)
+        if self.bounds is not None:
+            curves = np.clip(curves, *self.bounds)
+        return LearningCurves(curves, self.entry.steps_per_epoch, self.entry.name)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rates:
+    """How often a rule found what, over many simulated pairs of the same first and second entry.
+
+    Attributes
+    ----------
+    rule:
+        Name of the rule.
+    n_runs:
+        Runs of the first and the second entry.
+    n_pairs:
+        Simulated pairs.
+    fewer, more:
+        Shape (E, D): fraction of pairs in which the first needs significantly fewer, more samples.
+    any_cell:
+        Fraction of pairs with a significant difference in any cell.
+    first_wins, second_wins:
+        Fraction of pairs in which the first outperforms the second, and the reverse.
+    """
+
+    rule: str
+    n_runs: tuple[int, int]
+    n_pairs: int
+    fewer: FloatArray
+    more: FloatArray
+    any_cell: float
+    first_wins: float
+    second_wins: float
+
+    @property
+    def per_cell(self) -> FloatArray:
+        """Shape (E, D): fraction of pairs with a significant difference in the cell, either way."""
+        return self.fewer + self.more
+
+    @property
+    def winner(self) -> float:
+        """Fraction of pairs in which either outperforms the other."""
+        return self.first_wins + self.second_wins
+
+    @property
+    def winner_error(self) -> float:
+        """Monte-Carlo standard error of `winner`, for independent pairs."""
+        return float(np.sqrt(self.winner * (1 - self.winner) / self.n_pairs))
+
+
+def split_halves(
+    entry: LearningCurves,
+    grid: Grid,
+    rule: SignificanceRule | None = None,
+    n_splits: int = 100,
+    seed: int = 0,
+    resampling: Resampling | None = None,
+) -> Rates:
+    """Compare random halves of one entry's runs; every declared winner is false.
+
+    Splits of one entry share its runs, so `Rates.winner_error` does not apply: run this on several entries
+    and quote the spread over them. With an odd number of runs one is left out of each split.
+
+    Raises
+    ------
+    OptionError
+        If the entry has fewer than 2 runs, or an argument is out of its range.
+    """
+    half = entry.n_runs // 2
+    if half < 1:
+        raise OptionError(f"'{entry.name}' has a single run: it has no halves")
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    pairs = []
+    for _ in range(whole(n_splits, "n_splits", at_least=1)):
+        order = generator.permutation(entry.n_runs)
+        sides = [entry.values[order[:half]], entry.values[order[half : 2 * half]]]
+        pairs.append([LearningCurves(side, entry.steps_per_epoch, entry.name) for side in sides])
+    return _rates(pairs, grid, rule, resampling)
+
+
+def false_winners(
+    model: SmoothedRuns,
+    n_first: int,
+    n_second: int,
+    grid: Grid,
+    rule: SignificanceRule | None = None,
+    n_pairs: int = 200,
+    seed: int = 0,
+    resampling: Resampling | None = None,
+) -> Rates:
+    """Compare pairs of entries drawn from one model; every declared winner is false.
+
+    Pairs are judged also below 20 runs, where `compare` would refuse: that is how the limit can be checked.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range.
+    """
+    return power(model, model, n_first, n_second, grid, rule, n_pairs, seed, resampling)
+
+
+def power(
+    first: SmoothedRuns,
+    second: SmoothedRuns,
+    n_first: int,
+    n_second: int,
+    grid: Grid,
+    rule: SignificanceRule | None = None,
+    n_pairs: int = 200,
+    seed: int = 0,
+    resampling: Resampling | None = None,
+) -> Rates:
+    """Compare pairs drawn from two models: `Rates.first_wins` is the chance to find that the first is better.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range or the models have different horizons.
+    """
+    if first.entry.horizon != second.entry.horizon:
+        raise OptionError(
+            f"'{first.entry.name}' ends at {first.entry.horizon} steps, '{second.entry.name}' at "
+            f"{second.entry.horizon}: cut them to one horizon"
+        )
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    pairs = [
+        [first.draw(n_first, generator), second.draw(n_second, generator)]
+        for _ in range(whole(n_pairs, "n_pairs", at_least=1))
+    ]
+    return _rates(pairs, grid, rule, resampling)
+
+
+def board_false_winners(
+    model: SmoothedRuns,
+    n_runs: Sequence[int],
+    grid: Grid,
+    rule: SignificanceRule | None = None,
+    n_boards: int = 50,
+    seed: int = 0,
+    resampling: Resampling | None = None,
+) -> float:
+    """Return the fraction of boards on which any entry outperforms another, though all are equal.
+
+    Parameters
+    ----------
+    model:
+        What every entry of a board is drawn from.
+    n_runs:
+        Runs of each of the M entries; below 20 an entry is never judged.
+    grid, rule, resampling:
+        As in `qrlsuite.statistics.compare.compare`.
+    n_boards:
+        Simulated boards.
+    seed:
+        Of the simulation.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range.
+    """
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    boards = whole(n_boards, "n_boards", at_least=1)
+    found = 0
+    for _ in range(boards):
+        entries = [model.draw(count, generator) for count in n_runs]
+        found += bool(outperformance(entries, grid, rule, resampling).outperforms.any())
+    return found / boards
+
+
+def _rates(
+    pairs: Sequence[Sequence[LearningCurves]],
+    grid: Grid,
+    rule: SignificanceRule | None,
+    resampling: Resampling | None,
+) -> Rates:
+    chosen = rule or IntervalRule()
+    signs = np.stack([_signs(pair, grid, chosen, resampling) for pair in pairs])
+    outcomes = [overall(int((each > 0).sum()), int((each < 0).sum())) for each in signs]
+    return Rates(
+        rule=chosen.name,
+        n_runs=(pairs[0][0].n_runs, pairs[0][1].n_runs),
+        n_pairs=len(pairs),
+        fewer=(signs > 0).mean(axis=0),
+        more=(signs < 0).mean(axis=0),
+        any_cell=float((signs != 0).any(axis=(1, 2)).mean()),
+        first_wins=outcomes.count(Outcome.OUTPERFORMS) / len(pairs),
+        second_wins=outcomes.count(Outcome.OUTPERFORMED) / len(pairs),
+    )
+
+
+def _signs(
+    pair: Sequence[LearningCurves], grid: Grid, rule: SignificanceRule, resampling: Resampling | None
+) -> IntArray:
+    n_runs = min(entry.n_runs for entry in pair)
+    first, second = (Evidence(entry, grid, n_runs, resampling) for entry in pair)
+    return check_signs(rule(first, second), grid.shape, rule)

@@ -1,0 +1,127 @@
+"""Empirical sample complexity: how many environment steps until most runs are good enough.
+
+S_hat(V*, delta) = steps per epoch x number of epochs t with P_hat_t < delta, where P_hat_t is the fraction
+of the N runs with V_t >= V* (paper, definition "Estimator empirical sample complexity", section "Sample
+Complexity Estimator", and its general case in the appendix). Every epoch counts, also one after the first
+crossing: an algorithm that forgets pays for it. An entry that never gets there has S_hat equal to its
+horizon, so an unreached goal is a lower bound and not infinity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qrlsuite.statistics.curves import Curve, checked, reached
+from qrlsuite.statistics.grid import BoolArray, Grid, IntArray, whole
+
+
+def sample_complexity(
+    curves: ArrayLike,
+    epsilons: ArrayLike | Sequence[Any],
+    deltas: ArrayLike | Sequence[Any],
+    steps_per_epoch: int,
+) -> IntArray:
+    """Return S_hat in environment steps, shape (E, D), for scores with a known maximum of 1.
+
+    Parameters
+    ----------
+    curves:
+        Shape (N, T), scores in [0, 1].
+    epsilons:
+        E tolerances in [0, 1): the threshold is 1 - epsilon, computed in decimal.
+    deltas:
+        D probabilities in (0, 1], compared as counts: 0.7 of 100 runs means 70.
+    steps_per_epoch:
+        Environment steps per epoch.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range or the curves are empty, of the wrong shape or not numbers.
+    """
+    values = checked(curves, relative=True)
+    steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
+    return complexity(values, Grid.relative(epsilons, deltas), steps)
+
+
+def sample_complexity_at(
+    curves: ArrayLike,
+    thresholds: ArrayLike | Sequence[Any],
+    deltas: ArrayLike | Sequence[Any],
+    steps_per_epoch: int,
+) -> IntArray:
+    """Return S_hat in environment steps, shape (E, D), at thresholds V* given directly (the general case).
+
+    The curves, shape (N, T), may hold any numbers, infinities included; otherwise as `sample_complexity`.
+
+    Raises
+    ------
+    OptionError
+        If a threshold is not finite; otherwise as `sample_complexity`.
+    """
+    values = checked(curves)
+    steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
+    return complexity(values, Grid.absolute(thresholds, deltas), steps)
+
+
+def complexity(curves: Curve, grid: Grid, steps_per_epoch: int) -> IntArray:
+    """Return S_hat in environment steps, shape (E, D), for checked curves of shape (N, T)."""
+    steps: IntArray = epochs_below(curves, grid) * steps_per_epoch
+    return steps
+
+
+def epochs_below(curves: Curve, grid: Grid) -> IntArray:
+    """Return, shape (E, D), the number of epochs with P_hat_t < delta, for checked curves of shape (N, T)."""
+    counts = np.count_nonzero(reached(curves, grid), axis=2)
+    required = grid.required_counts(curves.shape[0])
+    below = counts[:, None, :] < required[None, :, None]
+    epochs: IntArray = np.count_nonzero(below, axis=2).astype(np.int64)
+    return epochs
+
+
+def unsettled(
+    curves: ArrayLike, epsilons: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]
+) -> BoolArray:
+    """Return, shape (E, D), where P_hat < delta at the last epoch: there S_hat is only a lower bound.
+
+    Parameters and errors as in `sample_complexity`.
+    """
+    return _below_at_end(checked(curves, relative=True), Grid.relative(epsilons, deltas))
+
+
+def unsettled_at(
+    curves: ArrayLike, thresholds: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]
+) -> BoolArray:
+    """Return, shape (E, D), where P_hat < delta at the last epoch, at thresholds given directly."""
+    return _below_at_end(checked(curves), Grid.absolute(thresholds, deltas))
+
+
+def _below_at_end(curves: Curve, grid: Grid) -> BoolArray:
+    return epochs_below(curves[:, -1:], grid) > 0
+
+
+def at_cap(intervals: ArrayLike, horizon: int) -> BoolArray:
+    """Return, shape (E, D), where the upper percentile equals the horizon (the paper fades such bars).
+
+    Parameters
+    ----------
+    intervals:
+        Shape (E, D, 2), in environment steps, as `bootstrap_interval` returns them.
+    horizon:
+        T x steps per epoch.
+    """
+    upper: BoolArray = np.asarray(intervals)[..., 1] >= whole(horizon, "horizon", at_least=1)
+    return upper
+
+
+def printed(steps: int, *, is_unsettled: bool) -> str:
+    """Return S_hat as it is printed: `44000`, or `>= 44000` where it is a lower bound.
+
+    >>> printed(44000, is_unsettled=True)
+    '>= 44000'
+    """
+    return f">= {steps}" if is_unsettled else f"{steps}"

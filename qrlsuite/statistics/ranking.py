@@ -1,0 +1,158 @@
+"""From pairwise outperformance to tiers.
+
+Outperformance is not transitive, and can be cyclic: three entries can each beat the next at another cell.
+So entries that outperform each other in a circle (a strongly connected component of the relation) share a
+tier; tier = 1 + the length of the longest chain of components above. Adjacent tiers do not imply that a
+member of the upper one outperforms a given member of the lower one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.grid import BoolArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Ranked:
+    """One entry's place.
+
+    Attributes
+    ----------
+    name:
+        The entry.
+    tier:
+        1 is the best; None where no pair with this entry is decided.
+    copeland:
+        Entries it outperforms minus entries that outperform it, on the whole board; orders a tier.
+    outperforms, outperformed_by:
+        Their names.
+    cycle:
+        The entries, itself included, that outperform each other in a circle with it; empty if there are none.
+    """
+
+    name: str
+    tier: int | None
+    copeland: int
+    outperforms: tuple[str, ...]
+    outperformed_by: tuple[str, ...]
+    cycle: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Ranking:
+    """The result of `rank`.
+
+    Attributes
+    ----------
+    tiers:
+        The ranked entries, best tier first; within a tier by Copeland score, then by name.
+    undecided:
+        Entries that stand apart: fewer than 20 runs, or no decided pair. By name.
+    """
+
+    tiers: tuple[tuple[Ranked, ...], ...]
+    undecided: tuple[Ranked, ...]
+
+    @property
+    def entries(self) -> tuple[Ranked, ...]:
+        """All entries in the order of the board, the undecided last."""
+        return tuple(entry for tier in self.tiers for entry in tier) + self.undecided
+
+
+def rank(names: Sequence[str], outperforms: ArrayLike, decided: ArrayLike) -> Ranking:
+    """Return the tiers of M entries.
+
+    Parameters
+    ----------
+    names:
+        M different names.
+    outperforms:
+        Shape (M, M), boolean: whether the row's entry outperforms the column's.
+    decided:
+        Shape (M, M), boolean, symmetric: whether the pair could be judged at all.
+
+    Raises
+    ------
+    OptionError
+        If names repeat, shapes disagree, `decided` is not symmetric, an entry outperforms itself, or two
+        entries outperform each other or do so in a pair that is not decided.
+    """
+    beats, known = _relation(names, outperforms, decided)
+    ranked: BoolArray = np.count_nonzero(known, axis=1) > 0
+    same = _circles(beats)
+    tiers = _tiers(beats, same, ranked)
+    copeland = beats.sum(axis=1, dtype=np.int64) - beats.sum(axis=0, dtype=np.int64)
+
+    def named(members: BoolArray) -> tuple[str, ...]:
+        return tuple(names[index] for index in np.flatnonzero(members).tolist())
+
+    def entry(index: int) -> Ranked:
+        circle = named(same[index])
+        return Ranked(
+            name=names[index],
+            tier=int(tiers[index]) if ranked[index] else None,
+            copeland=int(copeland[index]),
+            outperforms=named(beats[index]),
+            outperformed_by=named(beats[:, index]),
+            cycle=circle if len(circle) > 1 else (),
+        )
+
+    entries = sorted((entry(index) for index in range(len(names))), key=lambda e: (-e.copeland, e.name))
+    last = int(tiers[ranked].max(initial=0))
+    return Ranking(
+        tiers=tuple(tuple(e for e in entries if e.tier == tier) for tier in range(1, last + 1)),
+        undecided=tuple(e for e in entries if e.tier is None),
+    )
+
+
+def _relation(
+    names: Sequence[str], outperforms: ArrayLike, decided: ArrayLike
+) -> tuple[BoolArray, BoolArray]:
+    """Check the arguments of `rank`; return (outperforms, decided) without the diagonal of the second."""
+    beats, known = np.asarray(outperforms, dtype=bool), np.array(decided, dtype=bool)
+    size = len(names)
+    if len(set(names)) != size:
+        twice = next(name for name in names if list(names).count(name) > 1)
+        raise OptionError(f"two entries are called '{twice}'")
+    for what, matrix in (("outperforms", beats), ("decided", known)):
+        if matrix.shape != (size, size):
+            raise OptionError(f"{what}: expected shape ({size}, {size}) for {size} names, got {matrix.shape}")
+    np.fill_diagonal(known, False)
+    if (known != known.T).any():
+        raise OptionError("decided: the matrix is not symmetric")
+    for row, column in np.argwhere(beats & (beats.T | ~known)).tolist():
+        where = f"'{names[row]}' outperforms '{names[column]}'"
+        if row == column:
+            raise OptionError(f"{where}: an entry cannot outperform itself")
+        problem = "also the reverse" if beats[column, row] else "the pair is undecided"
+        raise OptionError(f"{where}, but {problem}")
+    return beats, known
+
+
+def _circles(beats: BoolArray) -> BoolArray:
+    """Return, shape (M, M), whether two entries can each be reached from the other (reflexive)."""
+    reach = beats | np.eye(len(beats), dtype=bool)
+    for _ in range(max(len(beats) - 1, 1).bit_length()):  # paths of doubled length each time
+        reach = reach.astype(np.float32) @ reach.astype(np.float32) > 0
+    circles: BoolArray = reach & reach.T
+    return circles
+
+
+def _tiers(beats: BoolArray, same: BoolArray, ranked: BoolArray) -> IntArray:
+    """Peel the board: a tier is every entry whose circle nobody left outperforms. 0 where not ranked."""
+    above = beats & ~same
+    tiers = np.zeros(len(beats), dtype=np.int64)
+    left, tier = ranked.copy(), 0
+    while left.any():
+        tier += 1
+        beaten = np.count_nonzero(above[left], axis=0) > 0
+        top = left & (np.count_nonzero(same & beaten, axis=1) == 0)
+        tiers[top] = tier
+        left &= ~top
+    return tiers

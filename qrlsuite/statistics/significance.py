@@ -1,0 +1,302 @@
+"""Rules that decide, cell by cell, whether one entry needs significantly fewer samples than another.
+
+A rule is called with two `Evidence` objects, which are already cut to a common horizon and resampled at a
+common number of runs, and returns +1 where the first entry needs significantly fewer samples, -1 where it
+needs significantly more and 0 elsewhere. What follows from the cells (outperformance, ranking) is the same
+for every rule, see `qrlsuite.statistics.compare`.
+
+Two rules are built in:
+
+- `IntervalRule`, the paper's: the 5th to 95th percentile intervals do not overlap. A promise per cell only.
+- `DifferenceRule`: a bootstrap of the difference of both sample complexities with one critical value for
+  the whole grid (the maximum over the cells of the studentized deviation), which controls the probability
+  that *any* cell of two equal entries is declared different.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.bootstrap import (
+    central_epochs,
+    check_percentiles,
+    draw_epochs,
+    widened_percentiles,
+)
+from qrlsuite.statistics.curves import LearningCurves
+from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, whole
+
+Signs = NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True)
+class Resampling:
+    """How runs are redrawn.
+
+    Attributes
+    ----------
+    n_resamples:
+        Number of resamples R.
+    seed:
+        Every entry is resampled from this seed, so its interval does not depend on whom it is compared with.
+
+    Raises
+    ------
+    OptionError
+        If one of them is not an integer in its range.
+    """
+
+    n_resamples: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        whole(self.n_resamples, "n_resamples", at_least=1)
+        whole(self.seed, "seed", at_least=0)
+
+
+class Evidence:
+    """What a rule may know about one entry of a pair; computed when first asked for.
+
+    Parameters
+    ----------
+    entry:
+        The entry, already cut to the common horizon.
+    grid:
+        The E x D cells.
+    n_runs:
+        Runs per resample: the smaller number of runs of the pair.
+    resampling:
+        Number of resamples and seed.
+
+    Raises
+    ------
+    OptionError
+        If the entry has fewer than `n_runs` runs, or the grid is relative and a score lies outside [0, 1].
+    """
+
+    def __init__(
+        self, entry: LearningCurves, grid: Grid, n_runs: int, resampling: Resampling | None = None
+    ) -> None:
+        self.entry = entry
+        self.grid = grid
+        self.n_runs = whole(n_runs, "n_runs", at_least=1)
+        self.resampling = resampling or Resampling()
+        self._intervals: dict[tuple[float, float], FloatArray] = {}
+        if grid.epsilons is not None:
+            entry.require_unit_interval()
+        if n_runs > entry.n_runs:
+            raise OptionError(f"'{entry.name}' has {entry.n_runs} runs, not {n_runs}")
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Environment steps per epoch: the resolution of every number below."""
+        return self.entry.steps_per_epoch
+
+    @functools.cached_property
+    def epoch_draws(self) -> NDArray[np.int32]:
+        """S_hat of every resample in epochs, shape (E, D, R)."""
+        return self._draw()
+
+    @functools.cached_property
+    def point(self) -> FloatArray:
+        """The estimate in environment steps, shape (E, D).
+
+        S_hat where `n_runs` is all the entry has; else the median of the draws, because S_hat at another
+        number of runs is another quantity.
+        """
+        drawn = np.empty((*self.grid.shape, 0), np.int32) if self._is_whole else self.epoch_draws
+        return central_epochs(self.entry.values, self.grid, drawn, self.n_runs) * self.steps_per_epoch
+
+    def interval(self, percentiles: tuple[float, float] = (5, 95)) -> FloatArray:
+        """Return the percentile interval in steps, widened to contain `point`, shape (E, D, 2)."""
+        key = check_percentiles(percentiles)
+        if key not in self._intervals:
+            # on a board of hundreds the draws of an entry are not kept unless a rule asks for them
+            drawn = self.epoch_draws if "epoch_draws" in self.__dict__ else self._draw()
+            center = central_epochs(self.entry.values, self.grid, drawn, self.n_runs)
+            self._intervals[key] = widened_percentiles(drawn, center, key, self.steps_per_epoch)
+        return self._intervals[key]
+
+    @property
+    def _is_whole(self) -> bool:
+        return self.n_runs == self.entry.n_runs
+
+    def _draw(self) -> NDArray[np.int32]:
+        return draw_epochs(
+            self.entry.values, self.grid, self.resampling.n_resamples, self.resampling.seed, self.n_runs
+        )
+
+
+@runtime_checkable
+class SignificanceRule(Protocol):
+    """A rule for one pair of entries; register one with the hook `register_significance_tests`.
+
+    A rule must be antisymmetric: `rule(a, b) == -rule(b, a)`. A rule that can judge one entry against many
+    at once may also have a method `against(first, others) -> (M, E, D)`; boards use it where it exists.
+
+    >>> class MedianRule:
+    ...     name = "twice"
+    ...     promise = "none: whoever needs less than half is declared the winner"
+    ...     def __call__(self, first, second):
+    ...         fewer, more = 2 * first.point < second.point, 2 * second.point < first.point
+    ...         return fewer.astype("int8") - more.astype("int8")
+    """
+
+    @property
+    def name(self) -> str:
+        """A short name, for options and tables."""
+
+    @property
+    def promise(self) -> str:
+        """One sentence: which error probability the rule controls, and which it does not."""
+
+    def __call__(self, first: Evidence, second: Evidence) -> Signs:
+        """Return, shape (E, D), +1 where `first` needs significantly fewer samples, -1 where more, else 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalRule:
+    """The paper's rule: significant where the two percentile intervals do not overlap; touching overlaps.
+
+    Source: paper, definition "Significant Outperformance" and the paragraph below it.
+
+    Attributes
+    ----------
+    percentiles:
+        Lower and upper percentile of both intervals.
+    """
+
+    percentiles: tuple[float, float] = (5, 95)
+
+    def __post_init__(self) -> None:
+        check_percentiles(self.percentiles)
+
+    @property
+    def name(self) -> str:
+        """The rule's name."""
+        return "intervals"
+
+    @property
+    def promise(self) -> str:
+        """What the rule controls."""
+        return (
+            "each cell by itself: two equal entries rarely have disjoint intervals in a given cell; "
+            "the chance of a false difference somewhere on the grid grows with the number of cells"
+        )
+
+    def __call__(self, first: Evidence, second: Evidence) -> Signs:
+        """Return the sign of every cell, shape (E, D)."""
+        signs: Signs = self.against(first, [second])[0]
+        return signs
+
+    def against(self, first: Evidence, others: Sequence[Evidence]) -> Signs:
+        """Return the signs of one entry against M others, shape (M, E, D)."""
+        own = first.interval(self.percentiles)
+        theirs = np.stack([other.interval(self.percentiles) for other in others])
+        fewer = own[..., 1] < theirs[..., 0]
+        more = own[..., 0] > theirs[..., 1]
+        return fewer.astype(np.int8) - more.astype(np.int8)
+
+
+@dataclass(frozen=True, slots=True)
+class DifferenceRule:
+    """Significant where the difference of sample complexities exceeds one critical value for the whole grid.
+
+    With D the difference of both estimates in a cell, D* its bootstrap draws and s their standard deviation,
+    the critical value q is the (1 - alpha) quantile over the draws of max over cells |D* - D| / s, and a cell
+    is significant where |D| / s > q (single-step max-T; Westfall and Young 1993; studentized simultaneous
+    bands). One critical value accounts for the number of cells and for their strong dependence.
+
+    s includes the rounding of S_hat to whole epochs (variance 1/12 of the coarser epoch squared), so a cell
+    whose draws never vary is not declared different for less than about one epoch.
+
+    Attributes
+    ----------
+    alpha:
+        Probability, for two equal entries, that any cell of the grid is declared different (approximate: the
+        bootstrap is valid for many runs).
+    paired:
+        Whether run i of both entries belongs together (same seed, same validation episodes): both are then
+        resampled by the same runs. The entries must have the same number of runs, in the same order.
+    """
+
+    alpha: float = 0.05
+    paired: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.alpha < 1:
+            raise OptionError(f"alpha = {self.alpha!r} is outside (0, 1)")
+
+    @property
+    def name(self) -> str:
+        """The rule's name."""
+        return "difference-paired" if self.paired else "difference"
+
+    @property
+    def promise(self) -> str:
+        """What the rule controls."""
+        return (
+            f"the whole grid of one pair: two equal entries differ significantly in any cell with "
+            f"probability about {self.alpha:g}; not the whole board of many pairs"
+        )
+
+    def __call__(self, first: Evidence, second: Evidence) -> Signs:
+        """Return the sign of every cell, shape (E, D).
+
+        Raises
+        ------
+        OptionError
+            If `paired` and the entries differ in their number of runs or their resampling, or there are fewer
+            than 2 resamples.
+        """
+        if first.resampling.n_resamples != second.resampling.n_resamples or first.resampling.n_resamples < 2:
+            raise OptionError("a bootstrap of the difference needs two or more resamples, as many for both")
+        own, theirs = first.epoch_draws, second.epoch_draws
+        if self.paired:
+            same = first.entry.n_runs == second.entry.n_runs and first.resampling == second.resampling
+            if not same:
+                names = " and ".join(f"'{e.entry.name}' ({e.entry.n_runs} runs)" for e in (first, second))
+                raise OptionError(f"{names} cannot be paired: run i of both must belong together")
+        else:
+            # One seed resamples both entries, so draw r of one goes with draw R-1-r of the other, which is
+            # independent of it. An involution: swapping the entries changes the signs and nothing else. With
+            # R odd, the middle draw would meet itself, and is left out.
+            even = own.shape[2] // 2 * 2
+            own, theirs = own[..., :even], theirs[..., :even][..., ::-1]
+        resolution = max(first.steps_per_epoch, second.steps_per_epoch)
+        # float32 halves the time; steps are whole numbers, exact up to 2^24 and good to 1e-7 beyond
+        difference = own * np.float32(first.steps_per_epoch) - theirs * np.float32(second.steps_per_epoch)
+        observed = first.point - second.point
+        spread = np.sqrt(difference.var(axis=2, dtype=np.float64) + resolution**2 / 12)
+        deviations = np.abs(difference - observed[..., None].astype(np.float32))
+        largest = (deviations / spread[..., None].astype(np.float32)).max(axis=(0, 1))
+        critical = float(np.quantile(largest, 1 - self.alpha))
+        significant: BoolArray = np.abs(observed) / spread > critical
+        signs: Signs = np.where(significant, -np.sign(observed), 0).astype(np.int8)
+        return signs
+
+
+BUILT_IN_RULES: dict[str, Callable[[], SignificanceRule]] = {
+    "intervals": IntervalRule,
+    "difference": DifferenceRule,
+    "difference-paired": functools.partial(DifferenceRule, paired=True),
+}
+"""The built-in rules by name; each value is called without arguments."""
+
+
+def check_signs(signs: object, shape: tuple[int, ...], rule: SignificanceRule) -> IntArray:
+    """Return what a rule answered as integers, or raise OptionError if it is not -1, 0 or 1 in every cell."""
+    array = np.asarray(signs)
+    if array.shape != shape or not np.isin(array, (-1, 0, 1)).all():
+        raise OptionError(
+            f"rule '{rule.name}' must answer -1, 0 or 1 in an array of shape {shape}; "
+            f"it answered {array.dtype} of shape {array.shape}"
+        )
+    return array.astype(np.int64)
