@@ -1,0 +1,1 @@
+"""Ranking of entries by significant outperformance, and its presentation."""

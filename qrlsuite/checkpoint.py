@@ -72,7 +72,11 @@ def save(store: EntryStore, seeds: Sequence[int], epoch: int, arrays: Mapping[st
 def _remove_superseded(store: EntryStore, newest: Header) -> None:
     """Remove other groups' checkpoints that hold nothing but seeds of `newest`, at no later epoch."""
     for header in headers(store):
-        if header.path != newest.path and header.epoch <= newest.epoch and set(header.seeds) <= set(newest.seeds):
+        if (
+            header.path != newest.path
+            and header.epoch <= newest.epoch
+            and set(header.seeds) <= set(newest.seeds)
+        ):
             shutil.rmtree(header.path.parent, ignore_errors=True)
 
 
@@ -149,11 +153,14 @@ def load(store: EntryStore, seeds: Sequence[int]) -> tuple[int, Arrays]:
             try:
                 files[path] = load_file(path)
             except (OSError, SafetensorError) as error:
-                raise StoreError(f"{path} is damaged ({error}): delete its folder, and its seeds start again") from None
+                raise StoreError(
+                    f"{path} is damaged ({error}): delete its folder, and its seeds start again"
+                ) from None
     names = set.intersection(*(set(arrays) for arrays in files.values()))
     if any(set(arrays) != names for arrays in files.values()):
         raise StoreError(f"{store.path}: the checkpoints of its groups hold different tensors")
     positions = {seed: newest[seed].seeds.index(seed) for seed in seeds}
     return epoch, {
-        name: np.stack([files[newest[seed].path][name][positions[seed]] for seed in seeds]) for name in sorted(names)
+        name: np.stack([files[newest[seed].path][name][positions[seed]] for seed in seeds])
+        for name in sorted(names)
     }

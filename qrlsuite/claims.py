@@ -85,7 +85,9 @@ def living(store: EntryStore) -> list[Claim]:
         return []
     with tempfile.NamedTemporaryFile(dir=store.claims) as probe:
         now = os.stat(probe.name).st_mtime
-    return [claim for path in sorted(store.claims.glob("*.json")) if (claim := _read(path)) and _alive(claim, now)]
+    return [
+        claim for path in sorted(store.claims.glob("*.json")) if (claim := _read(path)) and _alive(claim, now)
+    ]
 
 
 def _read(path: Path) -> Claim | None:

@@ -17,7 +17,7 @@ State = dict[str, NDArray[Any]]
 """A checkpointed state: arrays whose first axis is the lane, without random streams (the core keeps those)."""
 
 
-class LaneEnv(VectorEnv):  # type: ignore[type-arg]
+class LaneEnv(VectorEnv[Any, Any, Any]):
     """A `gymnasium.vector.VectorEnv` with same-step autoreset and given random streams.
 
     A subclass sets `num_envs`, `single_observation_space`, `single_action_space`, `observation_space` and
@@ -62,7 +62,9 @@ class LaneEnv(VectorEnv):  # type: ignore[type-arg]
         raise NotImplementedError
 
 
-def batched_spaces(env: LaneEnv, observation: gymnasium.Space[Any], action: gymnasium.Space[Any], lanes: int) -> None:
+def batched_spaces(
+    env: LaneEnv, observation: gymnasium.Space[Any], action: gymnasium.Space[Any], lanes: int
+) -> None:
     """Set the number of lanes and the four spaces of a lane environment."""
     env.num_envs = lanes
     env.single_observation_space = observation

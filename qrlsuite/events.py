@@ -27,4 +27,10 @@ class EventSink:
                 implementation.function(*[content[argument] for argument in implementation.argnames])
             except Exception as error:
                 self._failed.add(name)
-                log.warning("tracker '%s' failed in %s and is left out: %s: %s", name, event, type(error).__name__, error)
+                log.warning(
+                    "tracker '%s' failed in %s and is left out: %s: %s",
+                    name,
+                    event,
+                    type(error).__name__,
+                    error,
+                )

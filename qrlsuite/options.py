@@ -50,7 +50,12 @@ def _values(schema: Mapping[str, Any]) -> str:
     kind = str(schema.get("type", "value"))
     bounds = [
         f"{sign} {schema[key]:g}"
-        for key, sign in (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
+        for key, sign in (
+            ("minimum", ">="),
+            ("exclusiveMinimum", ">"),
+            ("maximum", "<="),
+            ("exclusiveMaximum", "<"),
+        )
         if key in schema
     ]
     return " ".join([kind, *bounds])
@@ -74,7 +79,9 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
         Listing every unknown name (with its nearest match) and every bad value at once.
     """
     known = field_names(cls)
-    problems = [f"{where} has no option '{name}'{nearest(name, known)}" for name in values if name not in known]
+    problems = [
+        f"{where} has no option '{name}'{nearest(name, known)}" for name in values if name not in known
+    ]
     try:
         result = pydantic.TypeAdapter(cls).validate_python({k: v for k, v in values.items() if k in known})
     except pydantic.ValidationError as error:

@@ -84,7 +84,9 @@ class Registry:
             return self.entries[kind][name]
         except KeyError:
             singular = SINGULAR[kind].replace("_", " ")
-            raise UnknownNameError(f"unknown {singular} '{name}'{nearest(name, self.entries[kind])}") from None
+            raise UnknownNameError(
+                f"unknown {singular} '{name}'{nearest(name, self.entries[kind])}"
+            ) from None
 
     def add_plugin(self, plugin: Any, distribution: str) -> None:
         """Register a plugin object with the manager and collect its specs.
@@ -114,7 +116,9 @@ class Registry:
         if known is not None:
             owners = self.duplicates.setdefault((kind, spec.name), [known.distribution])
             owners.append(distribution)
-            self.problems.append(f"{SINGULAR[kind]} '{spec.name}' is registered by both {' and '.join(owners)}")
+            self.problems.append(
+                f"{SINGULAR[kind]} '{spec.name}' is registered by both {' and '.join(owners)}"
+            )
             return
         self.entries[kind][spec.name] = Registered(spec, distribution)
 
@@ -125,10 +129,14 @@ def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
     for point in metadata.entry_points(group=hookspecs.PROJECT):
         owner = point.dist.name if point.dist is not None else "unknown"
         found.setdefault((owner, point.value), point)
-    return sorted(((key[0], point) for key, point in found.items()), key=lambda p: (p[0] != "qrlsuite", p[0], p[1].name))
+    return sorted(
+        ((key[0], point) for key, point in found.items()), key=lambda p: (p[0] != "qrlsuite", p[0], p[1].name)
+    )
 
 
-def create(strict: bool = False, points: Callable[[], list[tuple[str, metadata.EntryPoint]]] = _entry_points) -> Registry:
+def create(
+    strict: bool = False, points: Callable[[], list[tuple[str, metadata.EntryPoint]]] = _entry_points
+) -> Registry:
     """Discover all plugins afresh.
 
     Parameters

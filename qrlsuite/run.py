@@ -56,7 +56,9 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
     """Build the task's environment with a number of lanes."""
     spec = entry.task.environment
     if spec.vector is None:
-        raise PluginError(f"environment '{spec.name}' has no vector form, and the generic one is not built yet")
+        raise PluginError(
+            f"environment '{spec.name}' has no vector form, and the generic one is not built yet"
+        )
     inner: LaneEnv = specs.resolve(spec.vector)(entry.task.environment_options, lanes)
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
@@ -77,7 +79,8 @@ class ModelBuilder:
         build = specs.resolve(spec.build)
         call = len(self.built)
         agents = [
-            build(self.observation_size, out_dim, given, streams.torch("init", call)) for streams in self.streams
+            build(self.observation_size, out_dim, given, streams.torch("init", call))
+            for streams in self.streams
         ]
         self.parameters.append(population.count_parameters(agents[0]))
         if spec.population is None:
@@ -198,7 +201,9 @@ class GroupRun:
         if epoch:
             self._restore(epoch, arrays)
         else:
-            self.envs.seed_lanes([s.numpy("environment", lane) for s in self.streams for lane in range(self.E)])
+            self.envs.seed_lanes(
+                [s.numpy("environment", lane) for s in self.streams for lane in range(self.E)]
+            )
             self.algorithm.start()
         self.progress.epoch = self.epoch
         origin = provenance.collect([registry.load().get("models", self.entry.model.name).distribution])
@@ -208,7 +213,12 @@ class GroupRun:
             made_with = [*old.get("provenance", [])]
             if origin not in made_with:
                 made_with.append(origin)
-            record = {**self._seed_record(seed), "status": "running", "epochs": self.epoch, "provenance": made_with}
+            record = {
+                **self._seed_record(seed),
+                "status": "running",
+                "epochs": self.epoch,
+                "provenance": made_with,
+            }
             folder.write_record(record)
             self.events.send("run_started", run=record)
 
@@ -229,7 +239,9 @@ class GroupRun:
             "interactions_per_epoch": self.entry.task.file.protocol.interactions,
         }
 
-    def _one_epoch(self) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], dict[str, int], dict[str, float]]:
+    def _one_epoch(
+        self,
+    ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], dict[str, int], dict[str, float]]:
         """Train and validate one epoch; returns metrics, scores (S, V), circuit executions and seconds."""
         before = self.models.executions()
         started = time.perf_counter()
@@ -249,7 +261,9 @@ class GroupRun:
         owners = lanes // self.E
         counts = np.bincount(owners, minlength=self.S)
         with np.errstate(invalid="ignore"):
-            means = [np.bincount(owners, weights=values, minlength=self.S) / counts for values in (returns, scores)]
+            means = [
+                np.bincount(owners, weights=values, minlength=self.S) / counts for values in (returns, scores)
+            ]
         return means[0], means[1]
 
     def _validate(self, epoch: int) -> NDArray[np.float64]:
@@ -300,7 +314,13 @@ class GroupRun:
             store.append(
                 folder.timings,
                 store.json_line(
-                    {"epoch": self.epoch, **timing, "group": self.S, "host": socket.gethostname(), "time": now}
+                    {
+                        "epoch": self.epoch,
+                        **timing,
+                        "group": self.S,
+                        "host": socket.gethostname(),
+                        "time": now,
+                    }
                 ),
             )
             self.events.send("epoch_finished", run=self._seed_record(seed), record=line)
@@ -310,7 +330,9 @@ class GroupRun:
 
     def _capture(self) -> checkpoint.Arrays:
         """Copy everything that the rest of the run depends on, seed-first."""
-        arrays = {f"algorithm.{k}": v.detach().cpu().numpy().copy() for k, v in self.algorithm.state_dict().items()}
+        arrays = {
+            f"algorithm.{k}": v.detach().cpu().numpy().copy() for k, v in self.algorithm.state_dict().items()
+        }
         for name, array in self.envs.state_dict().items():
             arrays[f"environment.{name}"] = array.reshape(self.S, self.E, *array.shape[1:]).copy()
         arrays["streams"] = pack(self.envs.inner.streams).reshape(self.S, self.E, -1)
@@ -340,7 +362,9 @@ class GroupRun:
             }
             self.algorithm.load_state_dict(state)
         except (KeyError, ValueError, RuntimeError) as error:
-            raise StoreError(f"{self.store.path}: its checkpoint does not fit this version: {error}") from error
+            raise StoreError(
+                f"{self.store.path}: its checkpoint does not fit this version: {error}"
+            ) from error
         self.epoch = epoch
         self._saved_epoch = epoch
 
@@ -364,7 +388,11 @@ class GroupRun:
             agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}
             store.write_atomically(folder.path / "final.safetensors", encode(agent))
             folder.compact()
-            record = {**(folder.record() or self._seed_record(seed)), "status": "finished", "epochs": self.epoch}
+            record = {
+                **(folder.record() or self._seed_record(seed)),
+                "status": "finished",
+                "epochs": self.epoch,
+            }
             del record["format_version"]
             folder.write_record(record)
             self.events.send("run_finished", run=record)

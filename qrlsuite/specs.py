@@ -115,7 +115,9 @@ class ModelSpec(Spec):
     def __post_init__(self) -> None:
         Spec.__post_init__(self)
         if self.family not in ("classical", "quantum"):
-            raise PluginError(f"model '{self.name}': family {self.family!r} is neither 'classical' nor 'quantum'")
+            raise PluginError(
+                f"model '{self.name}': family {self.family!r} is neither 'classical' nor 'quantum'"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,9 @@ def write_atomically(path: Path, content: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}; what was there is unchanged") from None
+        raise StoreError(
+            f"cannot write {path}: {error.strerror or error}; what was there is unchanged"
+        ) from None
 
 
 def _umask() -> int:
@@ -118,7 +120,9 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
         try:
             record = json.loads(piece)
         except ValueError:
-            raise StoreError(f"{path}, line {number}: not JSON; restore the file or delete the seed's folder") from None
+            raise StoreError(
+                f"{path}, line {number}: not JSON; restore the file or delete the seed's folder"
+            ) from None
         if not isinstance(record, dict):
             raise StoreError(f"{path}, line {number}: not a JSON object")
         records.append(record)
@@ -156,7 +160,8 @@ class SeedCurve:
     @property
     def curve(self) -> NDArray[np.float64]:
         """The learning curve V_1..V_T (T,): the mean score of every epoch's validation."""
-        return np.asarray(self.scores, np.float64).mean(axis=1)
+        means: NDArray[np.float64] = np.asarray(self.scores, np.float64).mean(axis=1)
+        return means
 
 
 class SeedStore:
@@ -255,7 +260,9 @@ def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
     for name in sorted({name for row in flat for name in row}):
         columns[name] = [row.get(name) for row in flat]
     arrays = {
-        name: pyarrow.array(values, pyarrow.list_(pyarrow.float32())) if name == "scores" else pyarrow.array(values)
+        name: pyarrow.array(values, pyarrow.list_(pyarrow.float32()))
+        if name == "scores"
+        else pyarrow.array(values)
         for name, values in columns.items()
     }
     sink = pyarrow.BufferOutputStream()
@@ -324,7 +331,9 @@ class EntryStore:
         store = cls(runs / entry.task.name / entry.name)
         if (store.path / "entry.json").exists():
             if store.record().get("hash") != entry.hash:
-                raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
+                raise StoreError(
+                    f"{store.path} belongs to another entry; choose another folder with --runs DIR"
+                )
         else:
             write_json(store.path / "entry.json", entry.record())
         return store
@@ -369,6 +378,8 @@ def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
         If there is no such folder.
     """
     if not runs.is_dir():
-        raise StoreError(f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another")
+        raise StoreError(
+            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another"
+        )
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
     return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]

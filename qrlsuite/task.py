@@ -37,8 +37,12 @@ class ProtocolSection(_Section):
         dict[str, Annotated[int, Field(ge=1)]], Field(description="epochs where an algorithm needs others")
     ] = {}
     environments: Annotated[int, Field(ge=1, description="training environments per seed")] = 10
-    interactions: Annotated[int, Field(ge=1, description="environment steps per epoch, all environments together")]
-    validation_episodes: Annotated[int, Field(ge=1, description="fresh greedy episodes after every epoch")] = 100
+    interactions: Annotated[
+        int, Field(ge=1, description="environment steps per epoch, all environments together")
+    ]
+    validation_episodes: Annotated[
+        int, Field(ge=1, description="fresh greedy episodes after every epoch")
+    ] = 100
 
     @model_validator(mode="after")
     def _whole_rounds(self) -> ProtocolSection:
@@ -59,9 +63,13 @@ class ScoreSection(_Section):
 
     source: Annotated[
         Literal["info", "return"],
-        Field(description="info: the environment's info['score']; return: the episode's return over max_return"),
+        Field(
+            description="info: the environment's info['score']; return: the episode's return over max_return"
+        ),
     ] = "info"
-    max_return: Annotated[float | None, Field(description="best possible return, for source = 'return'")] = None
+    max_return: Annotated[float | None, Field(description="best possible return, for source = 'return'")] = (
+        None
+    )
 
     @model_validator(mode="after")
     def _maximum(self) -> ScoreSection:
@@ -71,30 +79,44 @@ class ScoreSection(_Section):
 
 
 class Cell(_Section):
-    """One cell of the ranking grid."""
+    """One cell of a ranking grid: a threshold, relative (`epsilon`) or absolute, and a probability."""
 
-    epsilon: Annotated[float, Field(ge=0, lt=1)]
+    epsilon: Annotated[float | None, Field(ge=0, lt=1)] = None
+    threshold: float | None = None
     delta: Annotated[float, Field(gt=0, le=1)]
 
 
 class RankingSection(_Section):
     """On which cells entries are compared."""
 
-    epsilons: Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=1)]
+    epsilons: Annotated[
+        list[Annotated[float, Field(ge=0, lt=1)]] | None,
+        Field(min_length=1, description="thresholds 1 - epsilon on a score with maximum 1"),
+    ] = None
+    thresholds: Annotated[
+        list[float] | None,
+        Field(min_length=1, description="thresholds on the return, where no maximum is known"),
+    ] = None
     deltas: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)]
-    reference: Cell
-    horizon: Annotated[int, Field(ge=1, description="environment steps at which S_hat is capped")]
+    reference: Annotated[Cell, Field(description="the cell a leaderboard shows first")]
+    horizons: Annotated[
+        list[Annotated[int, Field(ge=1)]],
+        Field(
+            min_length=1,
+            description="environment steps at which S_hat is capped: one section of a board each",
+        ),
+    ]
 
     @model_validator(mode="after")
-    def _reference_in_grid(self) -> RankingSection:
-        if self.reference.epsilon not in self.epsilons or self.reference.delta not in self.deltas:
-            # the reference cell need not be a grid point, but must lie inside the grid's range
-            inside = (
-                min(self.epsilons) <= self.reference.epsilon <= max(self.epsilons)
-                and min(self.deltas) <= self.reference.delta <= max(self.deltas)
-            )
-            if not inside:
-                raise ValueError("the reference cell lies outside the ranking grid")
+    def _consistent(self) -> RankingSection:
+        if (self.epsilons is None) == (self.thresholds is None):
+            raise ValueError("give either epsilons (score with maximum 1) or thresholds (no known maximum)")
+        relative = self.epsilons is not None
+        if (self.reference.epsilon is not None) != relative or (
+            self.reference.threshold is not None
+        ) == relative:
+            kind = "epsilon" if relative else "threshold"
+            raise ValueError(f"the reference cell needs {kind} and delta, as the grid has {kind}s")
         return self
 
 
@@ -116,13 +138,17 @@ class TaskFile(_Section):
     default_preset: str | None = None
     presets: Annotated[
         dict[str, dict[str, dict[Family, dict[str, Any]]]],
-        Field(description="[presets.NAME.ALGORITHM.FAMILY]: algorithm options, FAMILY all, classical or quantum"),
+        Field(
+            description="[presets.NAME.ALGORITHM.FAMILY]: algorithm options, FAMILY all, classical or quantum"
+        ),
     ] = {}
 
     @model_validator(mode="after")
     def _preset_exists(self) -> TaskFile:
         if self.default_preset is not None and self.default_preset not in self.presets:
-            raise ValueError(f"default_preset '{self.default_preset}'{nearest(self.default_preset, self.presets)}")
+            raise ValueError(
+                f"default_preset '{self.default_preset}'{nearest(self.default_preset, self.presets)}"
+            )
         return self
 
 
@@ -158,6 +184,14 @@ class Task:
             "score": file.score.model_dump(mode="json"),
         }
         self.hash = digest(self.definition)
+        if (
+            file.score.source == "return"
+            and file.score.max_return is None
+            and file.ranking.thresholds is None
+        ):
+            raise TaskError(
+                f"{source}: without score.max_return, ranking.thresholds are needed instead of epsilons"
+            )
 
     def epochs(self, algorithm: str) -> int:
         """Return the epochs of a complete run of an algorithm."""
@@ -186,7 +220,9 @@ class Task:
         if chosen is None:
             return None, {}
         if chosen not in self.file.presets:
-            raise TaskError(f"task '{self.name}' has no preset '{chosen}'{nearest(chosen, self.file.presets)}")
+            raise TaskError(
+                f"task '{self.name}' has no preset '{chosen}'{nearest(chosen, self.file.presets)}"
+            )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
         return chosen, {**tables.get("all", {}), **tables.get(family, {})}
 

@@ -43,10 +43,14 @@ class Options:
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.95
     lr: Annotated[float, Field(gt=0, description="learning rate of classical parameters")] = 5e-4
     quantum_lr: Annotated[float, Field(gt=0, description="learning rate of quantum parameters")] = 1e-3
-    epsilon: Annotated[float, Field(ge=0, le=1, description="probability of a random action in training")] = 0.1
+    epsilon: Annotated[float, Field(ge=0, le=1, description="probability of a random action in training")] = (
+        0.1
+    )
     buffer: Annotated[int, Field(ge=1, description="transitions held by the replay buffer, per seed")] = 2000
     batch: Annotated[int, Field(ge=1, description="transitions per gradient step")] = 64
-    target_steps: Annotated[int, Field(ge=1, description="gradient steps between copies to the target")] = 2000
+    target_steps: Annotated[int, Field(ge=1, description="gradient steps between copies to the target")] = (
+        2000
+    )
 
 
 class DDQN:
@@ -138,7 +142,11 @@ class DDQN:
         offset = torch.arange(self.S, device=self.device)[:, None] * o.buffer
         batch = self.buffer.view(-1, self.columns)[(picked + offset).reshape(-1)].view(self.S, o.batch, -1)
         s, following = batch[..., :d].contiguous(), batch[..., d : 2 * d].contiguous()
-        action, reward, alive = batch[..., 2 * d].long()[..., None], batch[..., 2 * d + 1], batch[..., 2 * d + 2]
+        action, reward, alive = (
+            batch[..., 2 * d].long()[..., None],
+            batch[..., 2 * d + 1],
+            batch[..., 2 * d + 2],
+        )
         with torch.no_grad():
             best = self.online(following).argmax(2, keepdim=True)
             y = reward + o.gamma * alive * self.target(following).gather(2, best).squeeze(2)
@@ -149,7 +157,8 @@ class DDQN:
         self.adam.step()
         if int(self.adam.steps[0]) % o.target_steps == 0:
             self.target.load_state_dict(self.online.state_dict())
-        return losses.detach().to(torch.float64)
+        detached: Tensor = losses.detach().to(torch.float64)
+        return detached
 
     @torch.no_grad()
     def _greedy(self, observations: Tensor) -> Tensor:
@@ -163,7 +172,9 @@ class DDQN:
 
     def _tensor(self, lanes: NDArray[np.float32]) -> Tensor:
         """Reshape lane-major observations (S * E, ...) to (S, E, obs)."""
-        return torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
+        return (
+            torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
+        )
 
     def _scalars(self, lanes: NDArray[np.float64] | NDArray[np.bool_]) -> Tensor:
         return torch.from_numpy(np.asarray(lanes, np.float32)).view(self.S, self.E, 1).to(self.device)
@@ -175,7 +186,9 @@ class DDQN:
     def state_dict(self) -> dict[str, Tensor]:
         """Return networks, optimizer, replay buffer, current observations and counters, seed-first."""
         return {
-            **prefixed(online=self.online.state_dict(), target=self.target.state_dict(), adam=self.adam.state_dict()),
+            **prefixed(
+                online=self.online.state_dict(), target=self.target.state_dict(), adam=self.adam.state_dict()
+            ),
             "buffer": self.buffer,
             "observations": self.observations,
             "counters": torch.tensor([[self.stored, self.epoch]] * self.S, dtype=torch.int64),

@@ -7,8 +7,9 @@ the text's).
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -18,7 +19,11 @@ from torch import Tensor, nn
 
 from qrlsuite.population import linear
 
-ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "none": lambda x: x}
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "tanh": torch.tanh,
+    "none": lambda x: x,
+}
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -27,9 +32,9 @@ class Options:
 
     width: Annotated[int, Field(ge=1, le=4096, description="units of each hidden layer")] = 64
     depth: Annotated[int, Field(ge=1, le=16, description="number of hidden layers")] = 2
-    activation: Annotated[
-        Literal["relu", "tanh", "none"], Field(description="after each hidden layer")
-    ] = "relu"
+    activation: Annotated[Literal["relu", "tanh", "none"], Field(description="after each hidden layer")] = (
+        "relu"
+    )
     init: Annotated[
         Literal["torch", "he"],
         Field(description="torch: uniform(-1/sqrt(in), 1/sqrt(in)), as released; he: normal(0, sqrt(2/in))"),
@@ -47,7 +52,7 @@ class MLP(nn.Module):
         super().__init__()
         self.layers = len(sizes) - 1
         self.activation = options.activation
-        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:])):
+        for i, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
             weight, bias = initial_layer(fan_in, fan_out, options.init, generator)
             self.register_parameter(f"w{i}", nn.Parameter(weight))
             self.register_parameter(f"b{i}", nn.Parameter(bias))
@@ -74,9 +79,7 @@ class MLPPopulation(nn.Module):
         return _forward(x, dict(self.named_parameters()), self.layers, self.activation)
 
 
-def initial_layer(
-    fan_in: int, fan_out: int, init: str, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def initial_layer(fan_in: int, fan_out: int, init: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draw a layer's weight (fan_out, fan_in) and bias (fan_out,) as `torch.nn.Linear` or He et al. do."""
     bound = 1.0 / math.sqrt(fan_in)
     if init == "he":

@@ -62,10 +62,13 @@ GATES: dict[str, GateSignature] = {
     "CZ": GateSignature(2, 0, False),
     "SWAP": GateSignature(2, 0, False),
 }
-"""Every gate a circuit may contain. `U3(t, p, d) = [[cos t/2, -e^{id} sin t/2], [e^{ip} sin t/2, e^{i(p+d)} cos t/2]]`."""
+"""Every gate a circuit may contain, with
+`U3(t, p, d) = [[cos t/2, -e^{id} sin t/2], [e^{ip} sin t/2, e^{i(p+d)} cos t/2]]`.
+"""
 
 
-class Element(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Element:
     """One scalar of a named parameter: its name and its index in the flattened (C order) array."""
 
     parameter: str
@@ -196,7 +199,9 @@ class Circuit:
             raise OptionError(f"input {index}: this circuit has inputs 0..{self.inputs - 1}")
         return Angle(input=index)
 
-    def parameter(self, name: str, shape: tuple[int, ...], low: float = 0.0, high: float = 2 * math.pi) -> Parameter:
+    def parameter(
+        self, name: str, shape: tuple[int, ...], low: float = 0.0, high: float = 2 * math.pi
+    ) -> Parameter:
         """Declare a trainable array, initially uniform in [low, high)."""
         if not name.isidentifier():
             raise OptionError(f"parameter name {name!r} is not an identifier")
@@ -207,7 +212,9 @@ class Circuit:
         self.parameters[name] = Parameter(name, tuple(shape), low, high)
         return self.parameters[name]
 
-    def append(self, gate: str, wires: int | Sequence[int], *angles: Angle | float, control: int | None = None) -> None:
+    def append(
+        self, gate: str, wires: int | Sequence[int], *angles: Angle | float, control: int | None = None
+    ) -> None:
         """Add a gate.
 
         Parameters

@@ -46,7 +46,9 @@ def parse_seeds(text: str) -> list[int]:
         for piece in text.split(","):
             first, colon, last = piece.strip().partition(":")
             if not first.isdecimal() or (colon and not last.isdecimal()):
-                raise OptionError(f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)")
+                raise OptionError(
+                    f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)"
+                )
             seeds += range(int(first), int(last)) if colon else [int(first)]
     if not seeds or len(set(seeds)) != len(seeds) or len(seeds) > 100_000:
         raise OptionError(f"seeds '{text}': at least one seed, none twice, is needed")
@@ -63,7 +65,9 @@ def format_seeds(seeds: Sequence[int]) -> str:
         elif seed is not None and previous is not None and seed == previous + 1:
             previous = seed
         else:
-            pieces.append(f"{start}:{previous + 1}" if previous is not None and previous != start else f"{start}")
+            pieces.append(
+                f"{start}:{previous + 1}" if previous is not None and previous != start else f"{start}"
+            )
             start = previous = seed
     return ",".join(pieces)
 

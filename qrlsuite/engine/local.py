@@ -100,8 +100,8 @@ def _start(job: _Job, store: EntryStore, epochs: int, device: str) -> None:
     command = [sys.executable, "-m", "qrlsuite.engine.worker", str(store.path)]
     command += ["--seeds", format_seeds(job.group.seeds), "--epochs", str(epochs), "--device", device]
     command += ["--follow-parent"]
-    threads = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-    job.output = tempfile.TemporaryFile()
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    job.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the worker has ended
     # a session of its own: Ctrl-C reaches the workers once, from here
     job.process = subprocess.Popen(
         command,

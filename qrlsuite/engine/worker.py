@@ -83,7 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", required=True, help="0:50, or a list such as 0,3,10:12")
     parser.add_argument("--epochs", type=int, required=True)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--follow-parent", action="store_true", help="stop, saving, when the parent process ends")
+    parser.add_argument(
+        "--follow-parent", action="store_true", help="stop, saving, when the parent process ends"
+    )
     given = parser.parse_args(arguments)
     try:
         train_group(given.folder, parse_seeds(given.seeds), given.epochs, given.device, given.follow_parent)

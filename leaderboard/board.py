@@ -1,0 +1,268 @@
+"""Leaderboards: entries of a task ranked by significant outperformance, one section per horizon.
+
+Everything is computed here from raw curves. Entries that are shorter than the task's shortest horizon stand in
+a provisional section of their own length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from qrlsuite.leaderboard.collect import EntryCurves
+
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    Comparison,
+    Grid,
+    LearningCurves,
+    at_cap,
+    bootstrap_interval,
+    bootstrap_interval_at,
+    compare,
+    outperformance,
+    sample_complexity,
+    sample_complexity_at,
+    unsettled,
+    unsettled_at,
+)
+from qrlsuite.task import RankingSection
+
+
+@dataclass(frozen=True)
+class Complexity:
+    """Sample complexity at one cell: steps, its 5th to 95th percentile, and both marks."""
+
+    steps: int
+    low: int
+    high: int
+    at_cap: bool
+    unsettled: bool
+
+
+@dataclass(frozen=True)
+class Row:
+    """One entry of a section. `tier` is None for an undecided entry."""
+
+    entry: EntryCurves
+    tier: int | None
+    reference: Complexity
+    median_score: float
+    copeland: int
+    outperforms: tuple[str, ...]
+    outperformed_by: tuple[str, ...]
+    provisional: bool
+    """Fewer seeds than the task's protocol asks for."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """The ranking of a task's entries at one horizon."""
+
+    task: str
+    summary: str
+    horizon: int
+    provisional: bool
+    """Shorter than the task's own horizons."""
+    cell: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """All sections, and what was refused and why."""
+
+    sections: tuple[Section, ...]
+    refused: tuple[str, ...]
+
+
+def grid_of(ranking: RankingSection) -> Grid:
+    """Return a task's ranking grid."""
+    if ranking.epsilons is not None:
+        return Grid.relative(ranking.epsilons, ranking.deltas)
+    return Grid.absolute(ranking.thresholds or [], ranking.deltas)
+
+
+def learning_curves(entry: EntryCurves) -> LearningCurves:
+    """Return an entry's curves as the statistics take them."""
+    return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
+
+
+def build(entries: Sequence[EntryCurves], refused: Sequence[str] = ()) -> Leaderboard:
+    """Rank entries, task by task and horizon by horizon.
+
+    Entries of one task that were made under another definition of it are refused: the majority's stands.
+    """
+    sections: list[Section] = []
+    problems = list(refused)
+    for task in sorted({entry.task for entry in entries}):
+        members = [entry for entry in entries if entry.task == task]
+        hashes = [entry.task_hash for entry in members]
+        definition = max(sorted(set(hashes)), key=hashes.count)
+        good = [entry for entry in members if entry.task_hash == definition]
+        problems += [
+            f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"
+            for entry in members
+            if entry.task_hash != definition
+        ]
+        for horizon, provisional, group in _by_horizon(good):
+            try:
+                sections.append(_section(task, horizon, provisional, group))
+            except QrlSuiteError as error:
+                problems.append(f"task '{task}' at {horizon} steps: {error}")
+    return Leaderboard(tuple(sections), tuple(problems))
+
+
+def _by_horizon(entries: Sequence[EntryCurves]) -> list[tuple[int, bool, list[EntryCurves]]]:
+    """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
+    horizons = sorted(entries[0].task_file.ranking.horizons)
+    groups = []
+    for horizon in horizons:
+        members = [entry for entry in entries if _length(entry) >= horizon]
+        if members:
+            groups.append((horizon, False, members))
+    short = [entry for entry in entries if _length(entry) < horizons[0]]
+    lengths = sorted({_length(entry) for entry in short}, reverse=True)
+    return groups + [
+        (steps, True, [entry for entry in short if _length(entry) == steps]) for steps in lengths
+    ]
+
+
+def _length(entry: EntryCurves) -> int:
+    return int(entry.curves.shape[1]) * entry.steps_per_epoch
+
+
+def _section(task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves]) -> Section:
+    ranking = entries[0].task_file.ranking
+    board = outperformance([learning_curves(entry) for entry in entries], grid_of(ranking), horizon=horizon)
+    by_name = {entry.name: entry for entry in entries}
+    labels = {entry.name: entry.label for entry in entries}
+    wanted = entries[0].task_file.protocol.seeds
+    rows = []
+    for place in board.ranking.entries:
+        entry = by_name[place.name]
+        values = entry.curves[:, : horizon // entry.steps_per_epoch]
+        rows.append(
+            Row(
+                entry=entry,
+                tier=place.tier,
+                reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
+                median_score=float(np.median(values[:, -1])),
+                copeland=place.copeland,
+                outperforms=tuple(labels[name] for name in place.outperforms),
+                outperformed_by=tuple(labels[name] for name in place.outperformed_by),
+                provisional=len(entry.seeds) < wanted,
+            )
+        )
+    return Section(task, entries[0].task_file.summary, horizon, provisional, cell_text(ranking), tuple(rows))
+
+
+def cell_text(ranking: RankingSection) -> str:
+    """Return the reference cell in words."""
+    cell = ranking.reference
+    if cell.epsilon is not None:
+        return f"epsilon {cell.epsilon:g}, delta {cell.delta:g}"
+    return f"return {cell.threshold:g}, delta {cell.delta:g}"
+
+
+def complexity_at(
+    values: np.ndarray[Any, np.dtype[np.float64]], ranking: RankingSection, steps_per_epoch: int, horizon: int
+) -> Complexity:
+    """Return the sample complexity at a task's reference cell.
+
+    Parameters
+    ----------
+    values:
+        (N, T) learning curves, cut to the horizon.
+    """
+    cell = ranking.reference
+    if cell.epsilon is not None:
+        steps = sample_complexity(values, [cell.epsilon], [cell.delta], steps_per_epoch)
+        interval = bootstrap_interval(values, [cell.epsilon], [cell.delta], steps_per_epoch)
+        open_end = unsettled(values, [cell.epsilon], [cell.delta])
+    else:
+        steps = sample_complexity_at(values, [cell.threshold], [cell.delta], steps_per_epoch)
+        interval = bootstrap_interval_at(values, [cell.threshold], [cell.delta], steps_per_epoch)
+        open_end = unsettled_at(values, [cell.threshold], [cell.delta])
+    low, high = (round(float(v)) for v in interval[0, 0])
+    capped = bool(at_cap(interval, horizon)[0, 0])
+    return Complexity(int(steps[0, 0]), low, high, capped, bool(open_end[0, 0]))
+
+
+def compare_entries(first: EntryCurves, second: EntryCurves) -> Comparison:
+    """Compare two entries of one task on its ranking grid.
+
+    Raises
+    ------
+    QrlSuiteError
+        If they belong to different tasks, or their lengths have no common horizon.
+    """
+    if first.task_hash != second.task_hash:
+        raise QrlSuiteError(
+            f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
+            f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
+        )
+    return compare(learning_curves(first), learning_curves(second), grid_of(first.task_file.ranking))
+
+
+def undecided_reason(row: Row) -> str:
+    """Say why an entry has no tier."""
+    if len(row.entry.seeds) < MIN_RUNS:
+        return f"undecided: fewer than {MIN_RUNS} seeds"
+    return "undecided: nothing to compare with"
+
+
+def steps_text(steps: int) -> str:
+    """Write steps in thousands where that is exact: 44000 as 44k."""
+    return f"{steps // 1000}k" if steps % 1000 == 0 else str(steps)
+
+
+def complexity_text(complexity: Complexity) -> str:
+    """Write a sample complexity with interval and marks: `>= 64k (52k to 200k, at cap)`."""
+    sign = ">= " if complexity.unsettled else ""
+    mark = ", at cap" if complexity.at_cap else ""
+    low, high = steps_text(complexity.low), steps_text(complexity.high)
+    return f"{sign}{steps_text(complexity.steps)} ({low} to {high}{mark})"
+
+
+def as_dict(board: Leaderboard) -> dict[str, Any]:
+    """Return a leaderboard as plain values, for JSON."""
+    return {
+        "sections": [
+            {
+                "task": section.task,
+                "horizon": section.horizon,
+                "provisional": section.provisional,
+                "cell": section.cell,
+                "rows": [_row_dict(row) for row in section.rows],
+            }
+            for section in board.sections
+        ],
+        "refused": list(board.refused),
+    }
+
+
+def _row_dict(row: Row) -> dict[str, Any]:
+    entry = row.entry
+    return {
+        "tier": row.tier,
+        "verdict": "ranked" if row.tier is not None else undecided_reason(row),
+        "entry": entry.name,
+        "label": entry.label,
+        "parameters": {"classical": entry.parameters[0], "quantum": entry.parameters[1]},
+        "seeds": len(entry.seeds),
+        "unfinished_seeds": len(entry.left_out),
+        "provisional": row.provisional,
+        "sample_complexity": row.reference.steps,
+        "interval": [row.reference.low, row.reference.high],
+        "at_cap": row.reference.at_cap,
+        "unsettled": row.reference.unsettled,
+        "median_score": row.median_score,
+        "copeland": row.copeland,
+        "outperforms": list(row.outperforms),
+        "outperformed_by": list(row.outperformed_by),
+        "core_hours": entry.hours,
+    }

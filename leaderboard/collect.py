@@ -1,0 +1,147 @@
+"""Reading entries for ranking: every number of a leaderboard is computed from raw curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.store import EntryStore, SeedCurve, entries, read_lines
+from qrlsuite.task import TaskFile
+
+
+@dataclass(frozen=True)
+class EntryCurves:
+    """An entry with the learning curves of its complete runs.
+
+    Attributes
+    ----------
+    curves:
+        (N, T) float64: mean validation score per run and epoch.
+    seeds:
+        The N seeds.
+    left_out:
+        Seeds whose runs have fewer than T epochs yet.
+    hours:
+        Core-hours spent on the N runs.
+    """
+
+    name: str
+    label: str
+    task: str
+    task_hash: str
+    task_file: TaskFile
+    algorithm: str
+    model: str
+    parameters: tuple[int, int]
+    curves: NDArray[np.float64]
+    seeds: tuple[int, ...]
+    left_out: tuple[int, ...]
+    hours: float
+    folder: Path
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Environment steps per epoch of one run."""
+        return self.task_file.protocol.interactions
+
+
+def collect(runs: Path, task: str | None = None) -> tuple[list[EntryCurves], list[str]]:
+    """Read every entry below a results folder.
+
+    Returns
+    -------
+    tuple
+        The entries that have at least one epoch, and one line for each folder that was refused and why.
+    """
+    good, refused = [], []
+    for store in entries(runs, task):
+        try:
+            entry = read_entry(store)
+        except QrlSuiteError as error:
+            refused.append(str(error))
+            continue
+        if entry is not None:
+            good.append(entry)
+    return good, refused
+
+
+def find(runs: Path, name: str) -> EntryCurves:
+    """Read the one entry whose name, label or hash begins with `name`, or whose folder it is.
+
+    Raises
+    ------
+    UnknownNameError
+        If none or several match; the message lists them.
+    """
+    if (Path(name) / "entry.json").exists():
+        found = [read_entry(EntryStore(Path(name)))]
+    else:
+        everything, _ = collect(runs)
+        exact = [e for e in everything if name in (e.name, e.label)]
+        found = list(exact or [e for e in everything if _matches(e, name)])
+        if not found:
+            known = [e.name for e in everything]
+            raise UnknownNameError(f"no entry '{name}' in {runs}{nearest(name, known)}")
+    if len(found) > 1:
+        names = ", ".join(e.name for e in found if e)
+        raise UnknownNameError(f"'{name}' may be any of {names}: write more of the name")
+    if found[0] is None:
+        raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
+    return found[0]
+
+
+def _matches(entry: EntryCurves, name: str) -> bool:
+    parts = (entry.name, entry.label, entry.label.partition(" ")[2], entry.name.rpartition("-")[2])
+    return any(part.startswith(name) for part in parts)
+
+
+def read_entry(store: EntryStore) -> EntryCurves | None:
+    """Read one entry; None where no run has finished an epoch.
+
+    Raises
+    ------
+    StoreError
+        If a file is damaged.
+    """
+    record = store.record()
+    runs = [store.seed(seed) for seed in store.seeds()]
+    curves = [run.curve() for run in runs]
+    curves = [curve for curve in curves if len(curve.scores)]
+    if not curves:
+        return None
+    length = _common_length(curves)
+    kept = [curve for curve in curves if len(curve.scores) >= length]
+    first = store.seed(kept[0].seed).record() or {}
+    parameters = first.get("parameters", {})
+    identity = record["identity"]
+    return EntryCurves(
+        name=record["name"],
+        label=record["label"],
+        task=record["task_name"],
+        task_hash=record["task_hash"],
+        task_file=TaskFile.model_validate(record["task_file"]),
+        algorithm=identity["algorithm"],
+        model=identity["model"],
+        parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
+        curves=np.stack([curve.curve[:length] for curve in kept]),
+        seeds=tuple(curve.seed for curve in kept),
+        left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
+        hours=sum(_seconds(read_lines(store.seed(curve.seed).timings)) for curve in kept) / 3600,
+        folder=store.path,
+    )
+
+
+def _common_length(curves: Iterable[SeedCurve]) -> int:
+    """Return the epochs that finished runs have; before any finished, the fewest that any run has."""
+    lengths = [len(curve.scores) for curve in curves if curve.finished]
+    return max(lengths) if lengths else min(len(curve.scores) for curve in curves)
+
+
+def _seconds(lines: list[dict[str, Any]]) -> float:
+    return sum(float(line.get("train", 0.0)) + float(line.get("validate", 0.0)) for line in lines)

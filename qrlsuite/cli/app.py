@@ -1,0 +1,53 @@
+"""The Typer application and the options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RunsOption = Annotated[
+    Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+def build() -> typer.Typer:
+    """Return the application with every built-in and plugin command."""
+    from qrlsuite.cli import compare, leaderboard, listing, plot, run, show
+
+    app = typer.Typer(
+        name="qrlsuite",
+        help=(
+            "Does a quantum model really beat a classical one at reinforcement learning, or did five lucky seeds "
+            "say so? Train many seeds, estimate sample complexity with confidence intervals, and rank by "
+            "significant outperformance.\n\n"
+            "Start with:  qrlsuite run --task beam6g --model mlp --quick"
+        ),
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    app.command("run")(run.run)
+    app.command("leaderboard")(leaderboard.leaderboard)
+    app.command("compare")(compare.compare)
+    app.command("plot")(plot.plot)
+    app.command("list")(listing.list_things)
+    app.command("show")(show.show)
+
+    @app.callback()
+    def version(
+        version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+    ) -> None:
+        if version:
+            import qrlsuite
+
+            typer.echo(f"qrlsuite {qrlsuite.__version__}")
+            raise typer.Exit
+
+    from qrlsuite import registry
+
+    registry.load().manager.hook.register_commands(app=app)
+    return app

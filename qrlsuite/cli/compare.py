@@ -1,0 +1,68 @@
+"""`qrlsuite compare`: two entries, cell by cell, and in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from qrlsuite.cli.app import JsonOption, RunsOption
+
+if TYPE_CHECKING:
+    from qrlsuite.statistics import Comparison
+
+SYMBOLS = {
+    "win": ("+", "green"),
+    "loss": ("-", "red"),
+    "tie": (".", "dim"),
+    "both-at-cap": ("^", "dim"),
+    "undecided": ("?", "yellow"),
+}
+
+
+def compare(
+    first: Annotated[str, typer.Argument(metavar="ENTRY", help="An entry's name, or the beginning of it.")],
+    second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Say whether the first entry outperforms the second, cell by cell of the task's ranking grid.
+
+    Both are compared at equal numbers of seeds and equal horizons.
+
+    Example: qrlsuite compare "mlp width=64" "mlp width=16"
+    """
+    import json
+
+    from qrlsuite.leaderboard import board, collect
+
+    one, other = collect.find(runs, first), collect.find(runs, second)
+    comparison = board.compare_entries(one, other)
+    if json_output:
+        typer.echo(json.dumps(comparison.as_dict()))
+        return
+    _matrix(comparison)
+    typer.echo(
+        f"{one.label} against {other.label}, {comparison.n_runs} seeds each, {comparison.horizon} steps:"
+    )
+    typer.echo(comparison.sentence)
+
+
+def _matrix(comparison: Comparison) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = comparison.grid
+    table = Table(
+        title=Text("+ significantly fewer samples, - more, . no difference, ^ both at cap"),
+        title_justify="left",
+    )
+    table.add_column("epsilon" if grid.epsilons is not None else "threshold")
+    for delta in grid.deltas:
+        table.add_column(f"delta {float(delta):g}", justify="center")
+    for name, verdicts in zip(grid.epsilons or grid.thresholds, comparison.verdicts):
+        cells = (Text(*SYMBOLS[str(verdict)]) for verdict in verdicts)
+        table.add_row(Text(f"{float(name):g}"), *cells)
+    Console().print(table)

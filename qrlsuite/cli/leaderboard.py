@@ -1,0 +1,137 @@
+"""`qrlsuite leaderboard`: entries ranked by significant outperformance."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from qrlsuite.cli.app import RunsOption
+
+if TYPE_CHECKING:
+    from qrlsuite.leaderboard.board import Leaderboard, Row, Section
+
+
+class Format(StrEnum):
+    """How a leaderboard is written."""
+
+    table = "table"
+    markdown = "markdown"
+    json = "json"
+
+
+def leaderboard(
+    task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
+    format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
+    runs: RunsOption = Path("runs"),
+) -> None:
+    """Rank the entries of each task by significant outperformance.
+
+    A tier is 1 + the longest chain of entries that outperform one another above it. Entries are compared at
+    equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: environment steps
+    until (and whenever) fewer than delta of the runs score 1 - epsilon, with its 5th to 95th percentile.
+
+    Example: qrlsuite leaderboard --task beam6g --format markdown
+    """
+    import json
+
+    from qrlsuite.errors import UnknownNameError
+    from qrlsuite.leaderboard import board as boards
+    from qrlsuite.leaderboard import collect
+
+    found, refused = collect.collect(runs, task)
+    board = boards.build(found, refused)
+    if format_ is Format.json:
+        typer.echo(json.dumps(boards.as_dict(board)))
+        return
+    for line in board.refused:
+        typer.echo(f"left out: {line}", err=True)
+    if not board.sections:
+        raise UnknownNameError(
+            f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run"
+        )
+    if format_ is Format.markdown:
+        typer.echo(_markdown(board))
+    else:
+        for section in board.sections:
+            _table(section)
+
+
+COLUMNS = ("tier", "entry", "parameters", "seeds", "S_hat (5%-95%)", "score", "beats", "beaten by", "hours")
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    from qrlsuite.leaderboard import board as boards
+
+    entry = row.entry
+    classical, quantum = entry.parameters
+    return (
+        str(row.tier) if row.tier is not None else "undecided",
+        entry.label,
+        f"{classical} + {quantum} q" if quantum else str(classical),
+        f"{len(entry.seeds)}" + "*" * row.provisional,
+        boards.complexity_text(row.reference),
+        f"{row.median_score:.3f}",
+        ", ".join(row.outperforms) or "-",
+        ", ".join(row.outperformed_by) or "-",
+        f"{entry.hours:.2f}",
+    )
+
+
+def _notes(section: Section) -> list[str]:
+    """Explain the marks that occur in a section."""
+    from qrlsuite.leaderboard import board as boards
+
+    notes = sorted({boards.undecided_reason(row) for row in section.rows if row.tier is None})
+    if any(row.provisional for row in section.rows):
+        wanted = section.rows[0].entry.task_file.protocol.seeds
+        notes.append(f"* provisional: the protocol asks for {wanted} seeds")
+    if any(row.reference.unsettled for row in section.rows):
+        notes.append(">= : still below delta at the last epoch; the sample complexity is at least this")
+    if any(row.entry.parameters[1] for row in section.rows):
+        notes.append("q: quantum parameters")
+    return [*notes, "score: median over seeds after the last epoch; hours: core-hours"]
+
+
+def _title(section: Section) -> str:
+    from qrlsuite.leaderboard.board import steps_text
+
+    note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
+    return f"{section.task}, {steps_text(section.horizon)} steps{note}, S_hat at {section.cell}"
+
+
+def _table(section: Section) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=Text(_title(section)),
+        title_justify="left",
+        header_style="bold",
+        box=box.SIMPLE_HEAD,
+        caption=Text("\n".join(_notes(section))),
+        caption_justify="left",
+        pad_edge=False,
+    )
+    numeric = {"parameters", "seeds", "score", "hours"}
+    for name in COLUMNS:
+        table.add_column(Text(name), justify="right" if name in numeric else "left", overflow="fold")
+    for row in section.rows:
+        table.add_row(*(Text(cell) for cell in _cells(row)))
+    console = Console()
+    Console(width=None if console.is_terminal else max(console.width, 130)).print(table)
+
+
+def _markdown(board: Leaderboard) -> str:
+    lines = []
+    for section in board.sections:
+        lines += [f"### {_title(section)}", "", f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
+        for row in section.rows:
+            cells = (cell.replace("|", "\\|").replace("<", "&lt;") for cell in _cells(row))
+            lines.append(f"| {' | '.join(cells)} |")
+        lines += ["", *(f"{note.replace('*', chr(92) + '*')}  " for note in _notes(section)), ""]
+    return "\n".join(lines)

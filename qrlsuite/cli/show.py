@@ -1,0 +1,180 @@
+"""`qrlsuite show`: everything about one thing."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from qrlsuite.cli.app import JsonOption, RunsOption
+
+
+def show(
+    name: Annotated[
+        str, typer.Argument(help="A task, model, algorithm, environment, ansatz, or an entry's folder.")
+    ],
+    second: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="With a kind first: `show ansatz iqp`.")
+    ] = None,
+    qubits: Annotated[int, typer.Option("--qubits", help="For an ansatz: the number of qubits to draw.")] = 4,
+    layers: Annotated[int, typer.Option("--layers", help="For an ansatz: the number of layers to draw.")] = 2,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="For an ansatz: an option of its own."),
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="For an ansatz: draw to this picture file.")
+    ] = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Show a thing's options with their defaults and meaning, a task's protocol, an entry's provenance.
+
+    Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4
+    """
+    import json
+
+    from qrlsuite import registry
+    from qrlsuite.errors import UnknownNameError, nearest
+
+    kind, wanted = _kind(name, second)
+    known = registry.load()
+    found = [k for k in registry.KINDS if (kind in (None, k)) and wanted in known.entries[k]]
+    if not found and kind is None:
+        folder = _entry_folder(runs, wanted)
+        if folder is not None:
+            content = _entry(folder)
+            typer.echo(json.dumps(content) if json_output else _text(content))
+            return
+    if not found:
+        names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
+        raise UnknownNameError(f"nothing called '{wanted}'{nearest(wanted, names)}")
+    if len(found) > 1:
+        singulars = " or ".join(f"`show {registry.SINGULAR[k]} {wanted}`" for k in found)
+        raise UnknownNameError(f"'{wanted}' is several things; write {singulars}")
+    content = _content(found[0], wanted)
+    if found[0] == "ansatzes":
+        content["drawing"] = _draw(wanted, qubits, layers, settings or [], figure, content)
+    typer.echo(json.dumps(content) if json_output else _text(content))
+
+
+def _kind(first: str, second: str | None) -> tuple[str | None, str]:
+    """Split `show [KIND] NAME` into the kind in the plural, or None, and the name."""
+    from qrlsuite import registry
+    from qrlsuite.errors import UnknownNameError, nearest
+
+    if second is None:
+        return None, first
+    singulars = {word: kind for kind, word in registry.SINGULAR.items()} | {
+        kind: kind for kind in registry.KINDS
+    }
+    singulars |= {word.replace("_", "-"): kind for word, kind in singulars.items()}
+    if first not in singulars:
+        raise UnknownNameError(f"unknown kind '{first}'{nearest(first, singulars)}")
+    return singulars[first], second
+
+
+def _entry_folder(runs: Path, name: str) -> Path | None:
+    """Find an entry's folder by path, or by (the beginning of) its name below the results folder."""
+    from qrlsuite.store import entries
+
+    if (Path(name) / "entry.json").exists():
+        return Path(name)
+    if not runs.is_dir():
+        return None
+    matches = [store.path for store in entries(runs) if store.path.name.startswith(name)]
+    return matches[0] if len(matches) == 1 else None
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    from qrlsuite.store import EntryStore
+
+    store = EntryStore(folder)
+    record = store.record()
+    seeds = store.seeds()
+    first = store.seed(seeds[0]).record() if seeds else None
+    return {
+        **{
+            key: record[key]
+            for key in ("label", "name", "hash", "preset", "task_name", "task_hash", "identity")
+        },
+        "seeds": len(seeds),
+        "provenance": (first or {}).get("provenance", []),
+        "parameters": (first or {}).get("parameters", {}),
+    }
+
+
+def _content(kind: str, name: str) -> dict[str, Any]:
+    """Return what there is to say about a registered thing."""
+    from qrlsuite import options, registry, specs
+
+    registered = registry.load().get(kind, name)
+    spec = registered.spec
+    content: dict[str, Any] = {
+        "kind": registry.SINGULAR[kind],
+        "name": spec.name,
+        "summary": spec.summary,
+        "distribution": registered.distribution,
+    }
+    if isinstance(spec, specs.TaskSpec):
+        from qrlsuite.task import load
+
+        task = load(name)
+        content |= {
+            "hash": task.hash,
+            "path": spec.path,
+            **task.file.model_dump(mode="json", exclude={"name", "summary"}),
+        }
+        return content
+    for field in dataclasses.fields(spec):
+        if field.name == "family":
+            content["family"] = getattr(spec, field.name)
+    reference = getattr(spec, "options", None)
+    if reference:
+        content["options"] = options.describe(specs.resolve(reference))
+    return content
+
+
+def _draw(
+    name: str, qubits: int, layers: int, words: list[str], figure: Path | None, content: dict[str, Any]
+) -> str:
+    """Draw an ansatz as text (and to a file), and add its resources to the content."""
+    from qrlsuite import circuit
+    from qrlsuite.circuit import drawing
+    from qrlsuite.options import parse_setting
+
+    chosen = {setting.name: setting.value for setting in map(parse_setting, words)}
+    drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
+    content["resources"] = drawing.resources(drawn)
+    if figure is not None:
+        drawing.draw_figure(drawn).savefig(figure, bbox_inches="tight", dpi=150)
+        content["figure"] = str(figure)
+    return str(drawing.draw_text(drawn))
+
+
+def _text(content: dict[str, Any], indent: str = "") -> str:
+    """Lay nested content out as indented lines; option tables with their descriptions."""
+    lines = []
+    for key, value in content.items():
+        if key == "options" and isinstance(value, list):
+            lines.append(f"{indent}options (change with --set NAME=VALUE)")
+            for row in value:
+                lines.append(f"{indent}  {row['name']} = {_value(row['default'])}    {row['values']}")
+                lines.append(f"{indent}      {row['description']}")
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            lines += [f"{indent}{key}", _text(dataclasses.asdict(value), indent + "  ")]
+        elif isinstance(value, dict) and value:
+            lines += [f"{indent}{key}", _text(value, indent + "  ")]
+        elif isinstance(value, str) and "\n" in value:
+            lines += [f"{indent}{key}", value]
+        else:
+            lines.append(f"{indent}{key}: {_value(value)}")
+    return "\n".join(lines)
+
+
+def _value(value: Any) -> str:
+    import json
+
+    return value if isinstance(value, str) else json.dumps(value)

@@ -1,0 +1,146 @@
+"""A run killed at any moment and resumed ends with the same bytes as one never stopped."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import checkpoint, run
+from qrlsuite.store import EntryStore
+from tests.conftest import results
+
+EPOCHS = 6
+
+
+@pytest.fixture
+def frequent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoint after every epoch."""
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+
+
+def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
+    """Raise KeyboardInterrupt, as Ctrl-C does, in the middle of an epoch's validation."""
+    original = run.GroupRun._validate
+
+    def validate(self: run.GroupRun, number: int) -> object:
+        if number == epoch:
+            raise KeyboardInterrupt
+        return original(self, number)
+
+    monkeypatch.setattr(run.GroupRun, "_validate", validate)
+
+
+@pytest.mark.parametrize("model", ["mlp", "vqc-native"])
+def test_interrupted_and_resumed_equals_undisturbed(
+    model: str, train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ("width=16",) if model == "mlp" else ("qubits=2", "layers=2")
+    straight = train("straight", [0, 1], EPOCHS, model=model, settings=settings)
+    with monkeypatch.context() as patch:
+        _interrupt_in_epoch(patch, 4)
+        with pytest.raises(KeyboardInterrupt):
+            train("stopped", [0, 1], EPOCHS, model=model, settings=settings)
+    store = EntryStore(straight.parent.parent.parent / "stopped" / straight.parent.name / straight.name)
+    assert {h.epoch for h in checkpoint.headers(store)} == {3}, (
+        "an interruption saves the last finished epoch"
+    )
+    stopped = train("stopped", [0, 1], EPOCHS, model=model, settings=settings)
+    for seed in (0, 1):
+        assert results(straight, seed) == results(stopped, seed)
+
+
+def test_groups_are_split_and_merged_on_resume(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, frequent: None
+) -> None:
+    straight = train("straight", [0, 1, 2, 3], EPOCHS)
+    train("mixed", [0, 1, 2], 2)
+    train("mixed", [3], 2)
+    train("mixed", [1, 3], 4)
+    train("mixed", [0, 2], 4)
+    mixed = train("mixed", [0, 1, 2, 3], EPOCHS)
+    for seed in range(4):
+        assert results(straight, seed) == results(mixed, seed)
+
+
+def test_more_epochs_extend_a_finished_run(train: Callable[..., Path]) -> None:
+    straight = train("straight", [0, 1], EPOCHS)
+    train("extended", [0, 1], 2)
+    extended = train("extended", [0, 1], EPOCHS)
+    for seed in (0, 1):
+        assert results(straight, seed) == results(extended, seed)
+
+
+def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    straight = train("straight", [0], EPOCHS)
+    with monkeypatch.context() as patch:
+        _interrupt_in_epoch(patch, 4)
+        with pytest.raises(KeyboardInterrupt):
+            train("torn", [0], EPOCHS)
+    folder = EntryStore(straight.parent.parent.parent / "torn" / straight.parent.name / straight.name).seed(0)
+    lines = folder.lines.read_bytes().splitlines(keepends=True)
+    folder.lines.write_bytes(
+        b"".join(lines) + lines[-1].replace(b'"epoch":3', b'"epoch":4') + b'{"epoch":5,"sco'
+    )
+    torn = train("torn", [0], EPOCHS)
+    assert results(straight, 0) == results(torn, 0)
+
+
+def test_sigkill_at_random_moments(train: Callable[..., Path], tmp_path: Path) -> None:
+    """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
+    straight = train("straight", [0, 1, 2], 12)
+    entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
+    command = [sys.executable, "-c", "from qrlsuite import run; run.CHECKPOINT_SECONDS = 0.0\n"]
+    command[-1] += "from qrlsuite.engine import worker; raise SystemExit(worker.main())"
+    command += [str(entry), "--seeds", "0:3", "--epochs", "12"]
+    dice = random.Random(1)
+    kills = 0
+    for _ in range(40):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _wait_for_claim(entry, process)
+        time.sleep(dice.uniform(0.0, 0.6))
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        if process.wait() == 0 or kills >= 6:
+            break
+    subprocess.run(command, check=True)
+    for seed in range(3):
+        assert results(straight, seed) == results(entry, seed)
+        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 13))
+
+
+def _wait_for_claim(entry: Path, process: subprocess.Popen[bytes]) -> None:
+    while process.poll() is None and not any((entry / "claims").glob("*.json")):
+        time.sleep(0.02)
+
+
+def test_sigterm_saves_and_exits_130(train: Callable[..., Path]) -> None:
+    entry = train("runs", [0, 1], 1)
+    command = [
+        sys.executable,
+        "-m",
+        "qrlsuite.engine.worker",
+        str(entry),
+        "--seeds",
+        "0:2",
+        "--epochs",
+        "100000",
+    ]
+    process = subprocess.Popen(command)
+    while len(EntryStore(entry).seed(0).epochs()) < 3:
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.terminate()
+    assert process.wait(30) == 130
+    assert checkpoint.headers(EntryStore(entry))[0].epoch >= 3
+    assert not list((entry / "claims").glob("*.json"))

@@ -1,0 +1,37 @@
+"""Each agent is the agent it would have been alone: bitwise, in any company, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import results
+
+MODELS = {
+    "mlp": ("width=16",),
+    "vqc-pennylane": ("qubits=3", "layers=2"),
+    "vqc-native": ("qubits=3", "layers=2"),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Callable[..., Path]) -> None:
+    settings = MODELS[model]
+    together = train("together", [0, 1, 2, 3], model=model, settings=settings)
+    first = train("apart", [0, 1], model=model, settings=settings)
+    second = train("apart", [2, 3], model=model, settings=settings)
+    alone = train("alone", [2], model=model, settings=settings)
+    shuffled = train("shuffled", [3, 2, 0], model=model, settings=settings)
+    assert first == second
+    for seed in range(4):
+        assert results(together, seed) == results(first, seed), f"seed {seed} depends on its company"
+    assert results(together, 2) == results(alone, 2)
+    for seed in (0, 2, 3):
+        assert results(together, seed) == results(shuffled, seed)
+
+
+def test_different_seeds_differ(train: Callable[..., Path]) -> None:
+    folder = train("runs", [0, 1])
+    assert results(folder, 0) != results(folder, 1)
