@@ -31,6 +31,7 @@ from qrlsuite.statistics.bootstrap import (
     widened_percentiles,
 )
 from qrlsuite.statistics.curves import LearningCurves
+from qrlsuite.statistics.estimator import complexity
 from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, whole
 
 Signs = NDArray[np.int8]
@@ -111,8 +112,11 @@ class Evidence:
         S_hat where `n_runs` is all the entry has; else the median of the draws, because S_hat at another
         number of runs is another quantity.
         """
-        drawn = np.empty((*self.grid.shape, 0), np.int32) if self._is_whole else self.epoch_draws
-        return central_epochs(self.entry.values, self.grid, drawn, self.n_runs) * self.steps_per_epoch
+        if self.n_runs == self.entry.n_runs:
+            return complexity(self.entry.values, self.grid, self.steps_per_epoch).astype(np.float64)
+        return (
+            central_epochs(self.entry.values, self.grid, self.epoch_draws, self.n_runs) * self.steps_per_epoch
+        )
 
     def interval(self, percentiles: tuple[float, float] = (5, 95)) -> FloatArray:
         """Return the percentile interval in steps, widened to contain `point`, shape (E, D, 2)."""
@@ -123,10 +127,6 @@ class Evidence:
             center = central_epochs(self.entry.values, self.grid, drawn, self.n_runs)
             self._intervals[key] = widened_percentiles(drawn, center, key, self.steps_per_epoch)
         return self._intervals[key]
-
-    @property
-    def _is_whole(self) -> bool:
-        return self.n_runs == self.entry.n_runs
 
     def _draw(self) -> NDArray[np.int32]:
         return draw_epochs(
@@ -141,12 +141,15 @@ class SignificanceRule(Protocol):
     A rule must be antisymmetric: `rule(a, b) == -rule(b, a)`. A rule that can judge one entry against many
     at once may also have a method `against(first, others) -> (M, E, D)`; boards use it where it exists.
 
-    >>> class MedianRule:
-    ...     name = "twice"
+    >>> class HalfRule:
+    ...     name = "half"
     ...     promise = "none: whoever needs less than half is declared the winner"
+    ...
     ...     def __call__(self, first, second):
     ...         fewer, more = 2 * first.point < second.point, 2 * second.point < first.point
     ...         return fewer.astype("int8") - more.astype("int8")
+    >>> isinstance(HalfRule(), SignificanceRule)
+    True
     """
 
     @property
