@@ -126,7 +126,8 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
         )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise OptionError(
-                f"BeamManagement6G: render_mode {render_mode!r} is none of {self.metadata['render_modes']}"
+                f"environment 'beam6g': render_mode = {render_mode!r}: Input should be "
+                f"{' or '.join(map(repr, self.metadata['render_modes']))}"
             )
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces(self.options)

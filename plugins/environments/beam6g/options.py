@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+from pydantic import ConfigDict, Field, field_validator
 from pydantic.dataclasses import dataclass
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, Name
 from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
 
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.options import build
 
 MAIN: tuple[Antenna, ...] = (
     ((1.5, 1.0), (1.0, 0.0)),
@@ -57,7 +57,7 @@ class Options:
     def _antennas(cls, antennas: tuple[Antenna, ...]) -> tuple[Antenna, ...]:
         if len(antennas) < 2:
             raise ValueError(
-                f"{len(antennas)} given, at least 2 are needed: the action is the choice of an antenna, and "
+                "at least 2 are needed: the action is the choice of an antenna, and "
                 "the observation divides its index by their number minus one"
             )
         return tuple(_checked(i, antenna) for i, antenna in enumerate(antennas))
@@ -66,13 +66,9 @@ class Options:
     @classmethod
     def _degree(cls, degree: int) -> int:
         if degree < 2:
-            raise ValueError(
-                f"{degree} given, at least 2 is needed: a path has a first and a last support point"
-            )
+            raise ValueError("at least 2 is needed: a path has a first and a last support point")
         if degree > 32:
-            raise ValueError(
-                f"{degree} given, at most 32 is allowed: hardly any random path would stay in the field"
-            )
+            raise ValueError("at most 32 is allowed: hardly any random path would stay in the field")
         return degree
 
 
@@ -91,26 +87,13 @@ def _checked(index: int, antenna: Antenna) -> Antenna:
     return ((x, y), (d_x, d_y))
 
 
-_ADAPTER = TypeAdapter(Options)
-
-
 def parse(values: Mapping[str, Any]) -> Options:
     """Return the options that `values` describe.
 
     Raises
     ------
-    OptionError
+    qrlsuite.errors.OptionError
         If a key is unknown or a value cannot be used; the message lists every problem.
     """
-    try:
-        return _ADAPTER.validate_python(dict(values))
-    except ValidationError as error:
-        problems = [_problem(item["loc"], item["type"], item["msg"]) for item in error.errors()]
-        raise OptionError("BeamManagement6G: " + "; ".join(problems)) from None
-
-
-def _problem(location: tuple[int | str, ...], kind: str, message: str) -> str:
-    where = ".".join(str(part) for part in location)
-    if kind == "unexpected_keyword_argument":
-        return f"unknown option '{where}'{nearest(where, Options.__dataclass_fields__)}"
-    return f"{where}: {message.removeprefix('Value error, ')}"
+    options: Options = build(Options, values, "environment 'beam6g'")
+    return options

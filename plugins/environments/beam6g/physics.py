@@ -158,7 +158,8 @@ def _best_beams(phases: FloatArray) -> tuple[FloatArray, BeamArray]:
     distinct: NDArray[np.intp] = np.sort(first)
 
     def leader(u: FloatArray) -> NDArray[np.intp]:
-        return distinct.take(np.argmax([_lobes(u - phases[i]) for i in distinct], axis=0))
+        best: NDArray[np.intp] = distinct.take(np.argmax([_lobes(u - phases[i]) for i in distinct], axis=0))
+        return best
 
     grid = np.linspace(-np.pi, np.pi, _SCAN)
     leaders = leader(grid)

@@ -1,0 +1,229 @@
+"""The single environment: the released code's episodes, Gymnasium's rules, and its pictures."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, register, render
+
+from qrlsuite.errors import OptionError
+from tests.conftest import golden
+from tests.environments.test_physics import antennas
+
+EPISODES = golden("beam6g")
+SMALL = {"steps": 5, "degree": 3}
+
+
+@pytest.mark.parametrize("episode", EPISODES, ids=range(len(EPISODES)))
+def test_released_episode(episode):
+    env = gymnasium.make(ID, antennas=antennas(episode), degree=episode["degree"], steps=episode["steps"])
+    observation, _ = env.reset(options={"support_points": episode["support_points"]})
+    observations, rewards, ends = [observation], [], []
+    for action in episode["actions"]:
+        observation, reward, terminated, truncated, info = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        ends.append(terminated)
+        assert not truncated
+    assert observations[0].dtype == np.float32
+    same_beam = np.array(observations)[:, 2] == np.float32(np.array(episode["observations"])[:, 2])
+    assert same_beam.mean() > 0.99  # two beams may tie to 2e-6
+    np.testing.assert_allclose(
+        np.array(observations)[:, :2], np.array(episode["observations"])[:, :2], atol=2e-6
+    )
+    np.testing.assert_allclose(rewards, episode["rewards"], rtol=0, atol=2e-6)
+    assert ends == episode["terminated"]
+    steps = episode["steps"] + 1
+    np.testing.assert_allclose(info["received"], episode["sum_selected"], rtol=0, atol=2e-6 * steps)
+    np.testing.assert_allclose(info["optimal"], episode["sum_optimal"], rtol=0, atol=2e-6 * steps)
+    np.testing.assert_allclose(info["score"], episode["ratio"], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"stack": 3, "degree": 6, "physics": "text"},
+        {"antennas": [((1, 1), (1, 0)), ((5, 5), (0, 2))], "steps": 3},
+    ],
+)
+def test_gymnasium_checker(options):
+    check_env(gymnasium.make(ID, **options).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "ansi"])
+def test_gymnasium_checker_with_render_mode(mode):
+    check_env(gymnasium.make(ID, render_mode=mode, **SMALL).unwrapped, skip_render_check=True)
+
+
+def test_best_choices_score_exactly_one():
+    env = BeamManagement6G(steps=30)
+    env.reset(seed=1)
+    for k in range(30):
+        *_, info = env.step(int(env._tables.intensity[0, :, k + 1].argmax()))
+    assert info["score"] == 1.0
+
+
+def test_first_observation_is_of_the_best_antenna_there():
+    # Straight below antenna 0, on its peak: R^2 = 2, the spike 1/R^2.
+    env = BeamManagement6G(antennas=[((5.0, 5.0), (1, 0)), ((0.0, 1.0), (1, 0))], degree=2)
+    observation, _ = env.reset(options={"support_points": [[0.0, 0.0], [6.0, 0.0]]})
+    np.testing.assert_allclose(observation, [1.0, 0.5, 0.5])
+
+
+def test_reset_term_counts_in_the_score():
+    env = BeamManagement6G(steps=2)
+    first, _ = env.reset(seed=3)
+    total = sum(env.step(0)[1] for _ in range(2))
+    assert env._received == pytest.approx(float(first[1]) + total, abs=1e-6)
+
+
+def test_stack_holds_the_last_observations_oldest_first():
+    plain, stacked = BeamManagement6G(**SMALL), BeamManagement6G(stack=3, **SMALL)
+    singles = [plain.reset(seed=2)[0]]
+    stack, _ = stacked.reset(seed=2)
+    assert stack.tolist() == np.tile(singles[0], 3).tolist()
+    for action in (0, 2, 1, 1):
+        singles.append(plain.step(action)[0])
+        stack = stacked.step(action)[0]
+    assert stack.tolist() == np.concatenate(singles[-3:]).tolist()
+
+
+def test_seeds():
+    def first(seed):
+        return BeamManagement6G().reset(seed=seed)[0].tolist()
+
+    assert first(1) == first(1)
+    assert first(1) != first(2)
+
+
+def test_an_unseeded_reset_continues_the_stream():
+    env = BeamManagement6G()
+    firsts = [env.reset(seed=1)[0].tolist(), env.reset()[0].tolist()]
+    again = BeamManagement6G()
+    assert firsts == [again.reset(seed=1)[0].tolist(), again.reset()[0].tolist()]
+    assert firsts[0] != firsts[1]
+
+
+@pytest.mark.parametrize("action", [3, -1, 0.5])
+def test_bad_action(action):
+    env = BeamManagement6G(**SMALL)
+    env.reset(seed=0)
+    with pytest.raises(InvalidAction, match=r"the action must be an integer in 0\.\.2, not"):
+        env.step(action)
+
+
+def test_step_without_an_episode():
+    env = BeamManagement6G(**SMALL)
+    with pytest.raises(ResetNeeded, match="no episode is running"):
+        env.step(0)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(0)
+    with pytest.raises(ResetNeeded, match="no episode is running"):
+        env.step(0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"support": []}, "unknown reset option 'support'; known: support_points"),
+        ({"support_points": [[0, 0], [6, 6]]}, r"must have the shape \(3, 2\), not \(2, 2\)"),
+        ({"support_points": [[0, 0], [3, 7], [6, 6]]}, "must lie in the field"),
+        ({"support_points": [[0, 0], [3, np.nan], [6, 6]]}, "must lie in the field"),
+        ({"support_points": [[1, 1]] * 3}, "must not all be the same point"),
+    ],
+)
+def test_bad_reset_options(options, message):
+    with pytest.raises(OptionError, match=message):
+        BeamManagement6G().reset(options=options)
+
+
+def test_registering_twice_does_nothing():
+    spec = gymnasium.spec(ID)
+    register()
+    assert gymnasium.spec(ID) is spec
+
+
+def test_gymnasium_finds_it_by_module_without_importing_torch():
+    code = (
+        "import sys, gymnasium;"
+        f"gymnasium.make('qrlsuite.plugins.environments.beam6g:{ID}').reset(seed=0);"
+        "assert not {'torch', 'matplotlib', 'pennylane', 'numba'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_importing_the_hook_imports_nothing_heavy():
+    code = (
+        "import sys, qrlsuite.plugins.environments;"
+        "assert not {'numpy', 'gymnasium', 'scipy', 'pydantic'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_ansi_shows_user_path_and_antennas():
+    env = BeamManagement6G(render_mode="ansi", steps=10, degree=2)
+    env.reset(options={"support_points": [[0.0, 0.0], [6.0, 0.0]]})
+    for _ in range(5):
+        env.step(1)
+    lines = env.render().splitlines()
+    assert lines[0].startswith("step 5/10  antenna 1")
+    assert lines[-2].index("@") == 25  # half of 49 columns, after the edge
+    assert lines[-2].count("*") == 5
+    assert lines[-2].count(".") == 5
+    assert all(digit in env.render() for digit in "012")
+
+
+def test_image_changes_with_the_user_only_where_something_moved():
+    env = BeamManagement6G(render_mode="rgb_array", **SMALL)
+    env.reset(seed=0)
+    first = env.render()
+    env.step(0)
+    second = env.render()
+    assert first.dtype == np.uint8
+    assert first.shape == second.shape
+    assert first.shape[2] == 3
+    assert 0.0005 < (first != second).any(axis=2).mean() < 0.5
+
+
+def test_human_without_pygame_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(DependencyNotInstalled, match="pip install pygame"):
+        BeamManagement6G(render_mode="human", **SMALL).reset(seed=0)
+
+
+def test_human_shows_a_window(monkeypatch):
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = BeamManagement6G(render_mode="human", **SMALL)
+    env.reset(seed=0)
+    env.step(0)
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
+    env.render_mode = "rgb_array"
+    assert (shown == env.render()).all()
+    env.close()
+    assert not pygame.display.get_init()
+
+
+def test_rendering_without_a_mode_warns_and_without_reset_raises():
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert BeamManagement6G().render() is None
+    with pytest.raises(ResetNeeded):
+        BeamManagement6G(render_mode="ansi").render()
+
+
+def test_ground_truth_is_the_best_antenna_at_each_place():
+    # Two antennas in a mirror at x = 3: the map is its own mirror image with the antennas exchanged.
+    options = Options(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
+    antenna, intensity = render.ground_truth(options, 40)
+    assert (antenna == 1 - antenna[:, ::-1]).mean() > 0.95  # where both are equal, the first is taken
+    np.testing.assert_allclose(intensity, intensity[:, ::-1], rtol=1e-6)
+    assert antenna[20, 3] == 0
+    assert render.ground_truth_figure(options, 20).axes[0].get_title(loc="left").startswith("Best antenna")

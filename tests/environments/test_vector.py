@@ -1,0 +1,273 @@
+"""The lanes: equal to single environments bit by bit, independent of each other, and resumable anywhere."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import InvalidAction, ResetNeeded
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, make_vector
+from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables
+
+from qrlsuite import registry, specs
+from qrlsuite.environment import LaneEnv
+from qrlsuite.errors import OptionError, StoreError
+
+STEPS = 12
+
+
+def streams(count, seed=0):
+    return [np.random.default_rng((seed, g)) for g in range(count)]
+
+
+def lanes(count, groups=None, seed=0, **options):
+    env = make_vector(Options(**{"steps": STEPS, **options}), count)
+    env.seed_lanes(streams(groups or count, seed))
+    return env
+
+
+def actions_of(count, steps, seed=9):
+    return np.random.default_rng(seed).integers(0, 3, (steps, count))
+
+
+def walk(env, actions):
+    """Step through `actions` (T, L): everything that came back, as bytes per lane."""
+    seen = []
+    for row in actions:
+        observations, rewards, terminated, truncated, infos = env.step(row)
+        parts = [observations, rewards, terminated, truncated]
+        if infos:
+            parts += [infos["final_obs"], infos["final_info"]["score"], infos["final_info"]["_score"]]
+        seen.append([b"".join(part[lane].tobytes() for part in parts) for lane in range(env.num_envs)])
+    return seen
+
+
+@pytest.mark.parametrize("options", [{}, {"degree": 6, "stack": 3}, {"physics": "text", "degree": 2}])
+def test_lanes_equal_single_environments_bit_by_bit(options):
+    count = 7
+    options = {"steps": STEPS, **options}
+    points = Simulator(Options(**options)).draw(streams(count), [1] * count)
+    env = lanes(count, **options)
+    observations, _ = env.reset(options={"support_points": points})
+    singles = [BeamManagement6G(**options) for _ in range(count)]
+    for lane, single in enumerate(singles):
+        first, _ = single.reset(options={"support_points": points[lane]})
+        assert first.tobytes() == observations[lane].tobytes()
+    for k, row in enumerate(actions_of(count, STEPS)):
+        observations, rewards, terminated, truncated, infos = env.step(row)
+        assert terminated.all() == (k == STEPS - 1)
+        assert not truncated.any()
+        for lane, single in enumerate(singles):
+            expected = single.step(row[lane])
+            last = infos["final_obs"] if infos else observations
+            assert last[lane].tobytes() == expected[0].tobytes()
+            assert rewards[lane] == expected[1]
+            for name, value in expected[4].items():
+                assert infos["final_info"][name][lane] == value
+
+
+def test_a_lane_draws_what_a_single_environment_draws():
+    env = lanes(3, degree=4)
+    observations, _ = env.reset()
+    for lane in range(3):
+        single = BeamManagement6G(steps=STEPS, degree=4)
+        single.np_random = streams(3)[lane]
+        assert single.reset()[0].tobytes() == observations[lane].tobytes()
+
+
+@pytest.mark.parametrize("degree", [3, 6])
+@pytest.mark.parametrize(("size", "offset"), [(1, 0), (1, 83), (2, 5), (17, 31), (100, 13)])
+def test_tables_do_not_depend_on_the_batch(degree, size, offset):
+    simulator = Simulator(Options(steps=STEPS, degree=degree))
+    support = simulator.draw(streams(1), [150])
+
+    def tables(part):
+        result = Tables.empty(len(part), 3, STEPS)
+        simulator.fill(result, np.arange(len(part)), part)
+        return result
+
+    whole, some = tables(support), tables(support[offset : offset + size])
+    for name in ("intensity", "beam", "optimal"):
+        assert getattr(some, name).tobytes() == getattr(whole, name)[offset : offset + size].tobytes()
+
+
+@pytest.mark.parametrize(("size", "first"), [(1, 4), (2, 1), (17, 2)])
+def test_groups_of_lanes_do_not_depend_on_other_groups(size, first):
+    # 20 groups of 2 lanes, against `size` of them alone, over more than two episodes
+    actions = actions_of(40, 2 * STEPS + 5)
+    everyone = lanes(40, groups=20)
+    everyone.reset()
+    whole = walk(everyone, actions)
+    part = slice(2 * first, 2 * (first + size))
+    some = make_vector(Options(steps=STEPS), 2 * size)
+    some.seed_lanes(streams(20)[first : first + size])
+    some.reset()
+    assert walk(some, actions[:, part]) == [row[part] for row in whole]
+
+
+def test_other_lanes_actions_change_nothing():
+    def run(actions):
+        env = lanes(4)
+        env.reset()
+        return [row[1] for row in walk(env, actions)]
+
+    actions = actions_of(4, 2 * STEPS)
+    others = actions.copy()
+    others[:, [0, 2, 3]] = 2 - others[:, [0, 2, 3]]
+    assert run(actions) == run(others)
+
+
+@pytest.mark.parametrize("stop", [0, 5, STEPS, STEPS + 7])
+@pytest.mark.parametrize("stack", [1, 3])
+def test_state_restores_the_same_continuation(stop, stack):
+    actions = actions_of(5, 3 * STEPS)
+    env = lanes(5, stack=stack, degree=4)
+    env.reset()
+    walk(env, actions[:stop])
+    state = {name: array.copy() for name, array in env.state_dict().items()}
+    random = [stream.bit_generator.state for stream in env.streams]
+    expected = walk(env, actions[stop:])
+    again = lanes(5, stack=stack, degree=4, seed=99)
+    for stream, saved in zip(again.streams, random):
+        stream.bit_generator.state = saved
+    again.load_state_dict(state)
+    assert walk(again, actions[stop:]) == expected
+
+
+def test_states_can_be_sliced_and_joined_at_different_steps():
+    actions = actions_of(4, 2 * STEPS)
+    early, late = lanes(2, seed=1), lanes(3, seed=2)
+    early.reset()
+    late.reset()
+    walk(early, actions[:3, :2])
+    walk(late, actions[:8, :3])
+    joined = make_vector(Options(steps=STEPS), 4)
+    joined.seed_lanes([*early.streams, *late.streams[1:]])
+    states = early.state_dict(), late.state_dict()
+    joined.load_state_dict(
+        {name: np.concatenate([states[0][name], states[1][name][1:]]) for name in states[0]}
+    )
+    # Both runs draw from the same generators: put back what the first has used.
+    random = [stream.bit_generator.state for stream in joined.streams]
+    together = walk(joined, actions)
+    for stream, saved in zip(joined.streams, random):
+        stream.bit_generator.state = saved
+    apart = walk(early, actions[:, :2])
+    rest = make_vector(Options(steps=STEPS), 2)
+    rest.seed_lanes(late.streams[1:])
+    rest.load_state_dict({name: array[1:] for name, array in states[1].items()})
+    apart = [a + b for a, b in zip(apart, walk(rest, actions[:, 2:]))]
+    # Where some lane's episode ends, all lanes have a report; compare what every step gives.
+    size = 3 * 4 + 8 + 2
+    assert [[cell[:size] for cell in row] for row in together] == [
+        [cell[:size] for cell in row] for row in apart
+    ]
+
+
+def test_state_holds_copies():
+    env = lanes(2)
+    env.reset()
+    state = env.state_dict()
+    before = state["received"].copy()
+    env.step(np.zeros(2, dtype=np.int64))
+    assert (state["received"] == before).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.pop("step"), "a state has observations, received, step, support_points, not"),
+        (lambda s: s.update(step=s["step"][:1]), r"'step' has the shape \(1,\), not \(2,\)"),
+        (lambda s: s.update(step=s["step"] + STEPS), "'step' must lie in 0..11"),
+    ],
+)
+def test_bad_state_changes_nothing(change, message):
+    env = lanes(2)
+    env.reset()
+    state = env.state_dict()
+    change(state)
+    with pytest.raises(StoreError, match=message):
+        env.load_state_dict(state)
+    assert env.state_dict()["step"].tolist() == [0, 0]
+
+
+def test_autoreset_in_the_same_step():
+    env = lanes(3)
+    first, _ = env.reset()
+    for row in actions_of(3, STEPS):
+        observations, _, terminated, _, infos = env.step(row)
+    assert terminated.all()
+    assert infos["_final_obs"].all()
+    assert infos["final_info"]["_score"].all()
+    assert ((infos["final_info"]["score"] > 0) & (infos["final_info"]["score"] <= 1)).all()
+    assert (observations != infos["final_obs"]).any(axis=1).all()
+    assert (observations != first).any(axis=1).all()
+    _, _, terminated, _, infos = env.step(np.zeros(3, dtype=np.int64))
+    assert not terminated.any()
+    assert infos == {}
+
+
+def test_seeds():
+    def first(**kwargs):
+        return make_vector(Options(), 3).reset(**kwargs)[0].tolist()
+
+    assert first(seed=1) == first(seed=1)
+    assert first(seed=1) != first(seed=2)
+    assert first(seed=1)[0] != first(seed=1)[1]
+
+
+def test_spaces_and_returned_arrays():
+    env = lanes(4, stack=2)
+    assert isinstance(env, LaneEnv)
+    observations, _ = env.reset()
+    assert env.observation_space.contains(observations)
+    assert env.single_observation_space.shape == (6,)
+    observations, rewards, terminated, truncated, _ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observations)
+    assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, np.bool_, np.bool_)
+    kept = observations.copy()
+    env.step(env.action_space.sample())
+    assert (observations == kept).all()  # not a view of what the environment goes on writing
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.array([0, 3]), r"must lie in 0\.\.2, not 0\.\.3"),
+        (np.array([-1, 0]), r"must lie in 0\.\.2, not -1\.\.0"),
+        (np.array([0, 1, 2]), r"must be 2 integers, not int64 of shape \(3,\)"),
+        (np.array([0.0, 1.0]), r"must be 2 integers, not float64 of shape \(2,\)"),
+    ],
+)
+def test_bad_actions(actions, message):
+    env = lanes(2)
+    env.reset()
+    with pytest.raises(InvalidAction, match=message):
+        env.step(actions)
+
+
+def test_reset_comes_first():
+    with pytest.raises(ResetNeeded, match="before step"):
+        lanes(2).step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(ResetNeeded, match="before state_dict"):
+        lanes(2).state_dict()
+
+
+def test_bad_numbers_of_lanes_and_points():
+    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
+        make_vector(Options(), 0)
+    with pytest.raises(OptionError, match=r"must have the shape \(2, 3, 2\), not \(3, 2\)"):
+        lanes(2).reset(options={"support_points": np.ones((3, 2))})
+
+
+def test_gymnasium_make_vec():
+    env = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="vector_entry_point", steps=4)
+    assert env.reset(seed=0)[0].shape == (3, 3)
+
+
+def test_registered_spec_leads_here():
+    spec = registry.environment("beam6g")
+    assert specs.resolve(spec.options) is Options
+    assert specs.resolve(spec.vector) is make_vector
+    assert specs.resolve(spec.entry_point) is BeamManagement6G
+    assert spec.gymnasium_id == ID
