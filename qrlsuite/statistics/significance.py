@@ -217,8 +217,8 @@ class DifferenceRule:
     is significant where |D| / s > q (single-step max-T; Westfall and Young 1993; studentized simultaneous
     bands). One critical value accounts for the number of cells and for their strong dependence.
 
-    s includes the rounding of S_hat to whole epochs (variance 1/12 of the coarser epoch squared), so a cell
-    whose draws never vary is not declared different for less than about one epoch.
+    S_hat is a whole number of epochs: s includes that rounding (1/12 of the coarser epoch squared), so it is
+    never zero, and a difference of less than one epoch of the coarser entry is never significant.
 
     Attributes
     ----------
@@ -281,7 +281,7 @@ class DifferenceRule:
         deviations = np.abs(difference - observed[..., None].astype(np.float32))
         largest = (deviations / spread[..., None].astype(np.float32)).max(axis=(0, 1))
         critical = float(np.quantile(largest, 1 - self.alpha))
-        significant: BoolArray = np.abs(observed) / spread > critical
+        significant: BoolArray = (np.abs(observed) / spread > critical) & (np.abs(observed) >= resolution)
         signs: Signs = np.where(significant, -np.sign(observed), 0).astype(np.int8)
         return signs
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from qrlsuite.statistics import (
     Grid,
+    LearningCurves,
     bootstrap_draws,
     bootstrap_draws_at,
     bootstrap_interval,
@@ -17,7 +18,7 @@ from qrlsuite.statistics import (
 )
 from qrlsuite.statistics.bootstrap import weighted_epochs
 from qrlsuite.statistics.estimator import epochs_below
-from tests.statistics.conftest import DELTAS, EPSILONS, LearningCurves
+from tests.statistics.conftest import DELTAS, EPSILONS
 
 
 def smooth_curves(n_runs: int, n_epochs: int, seed: int = 0) -> np.ndarray:
