@@ -46,6 +46,26 @@ def test_path_that_stops_and_turns_is_walked_evenly():
     np.testing.assert_allclose(x, [[0, 3, 6, 3, 0]], atol=1e-6)
 
 
+def test_path_that_starts_at_rest_is_walked_evenly():
+    # x(t) = 6 t^2: the speed is exactly 0 at t = 0.
+    x, _ = trajectory.positions(np.array([[[0.0, 2.0], [1.5, 2.0], [6.0, 2.0]]]), 4)
+    np.testing.assert_allclose(x, [[0, 1.5, 3, 4.5, 6]], atol=1e-9)
+
+
+def test_paths_that_turn_on_a_line_anywhere_are_walked_evenly():
+    # x(t) = b t - c t^2 rises to b^2 / 4c and comes back to b - c: a kink of the speed inside some panel.
+    generator = np.random.default_rng(0)
+    turn = generator.uniform(0.3, 0.9, 300)
+    b = 5.0 / turn * 2
+    c = b / (2 * turn)
+    ends = b - c
+    support = np.stack([np.zeros(300), b / 2 - c / 4, ends], axis=1)
+    x, _ = trajectory.positions(np.stack([support, np.full((300, 3), 2.0)], axis=2), 37)
+    top = b**2 / (4 * c)
+    walked = (2 * top - ends)[:, None] * np.arange(38) / 37
+    np.testing.assert_allclose(x, top[:, None] - np.abs(walked - top[:, None]), rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("episode", EPISODES, ids=range(len(EPISODES)))
 def test_released_positions(episode):
     x, y = trajectory.positions(np.array(episode["support_points"])[None], episode["steps"])
@@ -156,6 +176,10 @@ def test_a_stream_yields_the_same_among_others():
     trajectory.sample([streams()[0], one], [7, 2], 6)
     trajectory.sample([other], [2], 6)
     assert one.bit_generator.state == other.bit_generator.state
+
+
+def test_valid_candidates_are_taken_in_order():
+    assert sampled(1, 5).tobytes() == sampled(7, 5)[:1].tobytes()
 
 
 @pytest.mark.parametrize("degree", [3, 6])

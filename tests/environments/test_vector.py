@@ -128,6 +128,8 @@ def test_state_restores_the_same_continuation(stop, stack):
     random = [stream.bit_generator.state for stream in env.streams]
     expected = walk(env, actions[stop:])
     again = lanes(5, stack=stack, degree=4, seed=99)
+    again.reset()
+    walk(again, actions[:3])  # whatever it did before is forgotten, its tables too
     for stream, saved in zip(again.streams, random):
         stream.bit_generator.state = saved
     again.load_state_dict(state)
@@ -162,6 +164,21 @@ def test_states_can_be_sliced_and_joined_at_different_steps():
     assert [[cell[:size] for cell in row] for row in together] == [
         [cell[:size] for cell in row] for row in apart
     ]
+
+
+def test_only_the_streams_of_lanes_that_end_are_drawn_from():
+    env = lanes(4, groups=2)
+    env.reset()
+    state = env.state_dict()
+    state["step"][2:] = STEPS - 1
+    env.load_state_dict(state)
+    before = [stream.bit_generator.state for stream in env.streams]
+    observations, _, terminated, _, infos = env.step(np.zeros(4, dtype=np.int64))
+    assert terminated.tolist() == infos["_final_obs"].tolist() == [False, False, True, True]
+    assert [stream.bit_generator.state == old for stream, old in zip(env.streams, before)] == [True, False]
+    assert (infos["final_obs"][:2] == 0).all()
+    assert env.state_dict()["step"].tolist() == [1, 1, 0, 0]
+    assert (env.state_dict()["observations"] == observations).all()
 
 
 def test_state_holds_copies():
