@@ -69,7 +69,8 @@ def format_seeds(seeds: Sequence[int]) -> str:
                 f"{start}:{previous + 1}" if previous is not None and previous != start else f"{start}"
             )
             start = previous = seed
-    return ",".join(pieces)
+    text = ",".join(pieces)
+    return f"{text}:{int(text) + 1}" if text.isdecimal() else text  # a lone number would count from 0
 
 
 def plan(store: EntryStore, seeds: Sequence[int], epochs: int, workers: int) -> list[Group]:

@@ -1,0 +1,196 @@
+"""Populations: S agents in one module, each bitwise the agent it is alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from qrlsuite import population
+from qrlsuite.population import Adam, linear
+
+STACK = 101
+SLICES = [(1, 0), (1, 7), (1, 100), (2, 3), (17, 5), (100, 1)]
+WIDTHS = (16, 32, 64, 128, 256)
+MLP_LAYERS = [(3, w) for w in WIDTHS] + [(w, w) for w in WIDTHS] + [(w, o) for w in WIDTHS for o in (1, 2, 3)]
+VQC_LAYERS = [(i, n) for n in (2, 4, 6, 8, 10, 12, 14, 16, 20) for i in (3, 4)]
+VQC_LAYERS += [(n, o) for n in (2, 4, 6, 8, 10, 12, 14, 16, 20) for o in (1, 2, 3)]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), MLP_LAYERS + VQC_LAYERS)
+def test_linear_layers_do_not_depend_on_their_place_in_the_stack(inputs: int, outputs: int) -> None:
+    source = torch.Generator().manual_seed(inputs * 1000 + outputs)
+    weight = torch.randn(STACK, outputs, inputs, generator=source)
+    bias = torch.randn(STACK, outputs, generator=source)
+    hidden = inputs > 4  # only later layers pass a gradient on to their input
+    for batch in (10, 64, 80, 100):
+        x = torch.randn(STACK, batch, inputs, generator=source)
+        cotangent = torch.randn(STACK, batch, outputs, generator=source)
+
+        def run(size: int, offset: int, x: Tensor = x, cotangent: Tensor = cotangent) -> list[Tensor]:
+            part = slice(offset, offset + size)
+            w, b = weight[part].clone().requires_grad_(), bias[part].clone().requires_grad_()
+            given = x[part].clone().requires_grad_(hidden)
+            y = linear(given, w, b)
+            gradients = torch.autograd.grad(y, [w, b, *([given] if hidden else [])], cotangent[part])
+            return [y.detach(), *gradients]
+
+        whole = run(STACK, 0)
+        for size, offset in SLICES:
+            for name, one, all_ in zip(("output", "weight", "bias", "input"), run(size, offset), whole):
+                assert torch.equal(one, all_[offset : offset + size]), (
+                    f"{name}, batch {batch}, {size} at {offset}"
+                )
+
+
+def test_linear_is_the_linear_layer() -> None:
+    layer = nn.Linear(5, 7)
+    x = torch.randn(11, 5)
+    torch.testing.assert_close(linear(x[None], layer.weight[None], layer.bias[None])[0], layer(x))
+
+
+def modules(count: int) -> list[nn.Module]:
+    return [nn.Sequential(nn.Linear(3, 20), nn.Tanh(), nn.Linear(20, 2)) for _ in range(count)]
+
+
+class Branching(nn.Module):
+    """A module that cannot be vmapped: its control flow depends on the data."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.rand(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.scale if float(x.sum()) > 0 else x + self.scale
+
+
+@pytest.mark.parametrize("kind", ["vmapped", "looped"])
+def test_a_stacked_population_is_its_modules(kind: str) -> None:
+    agents = modules(5) if kind == "vmapped" else [Branching() for _ in range(5)]
+    together = population.stack(agents)
+    x = torch.randn(5, 8, 3)
+    expected = torch.stack([agent(x[s]) for s, agent in enumerate(agents)])
+    torch.testing.assert_close(together(x), expected)
+    assert [n for n, _ in together.named_parameters()] == [n for n, _ in agents[0].named_parameters()]
+    together(x).square().sum().backward()
+    for s, agent in enumerate(agents):
+        agent(x[s]).square().sum().backward()
+        for (_, mine), (_, theirs) in zip(together.named_parameters(), agent.named_parameters()):
+            assert mine.grad is not None
+            torch.testing.assert_close(mine.grad[s], theirs.grad)
+    assert isinstance(together, population.StackedPopulation)
+    assert together._vmap == (kind == "vmapped")
+
+
+def test_a_stacked_population_is_bitwise_independent_of_company() -> None:
+    agents, x = modules(17), torch.randn(17, 64, 3)
+    whole = population.stack(agents)(x)
+    for size, offset in ((1, 0), (1, 16), (2, 3), (5, 7)):
+        part = population.stack(agents[offset : offset + size])(x[offset : offset + size])
+        assert torch.equal(part, whole[offset : offset + size])
+
+
+def test_modules_of_different_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="same parameters with the same shapes"):
+        population.stack([nn.Linear(2, 3), nn.Linear(3, 2)])
+
+
+def test_adam_is_torchs_adam_for_every_agent() -> None:
+    agents = modules(4)
+    ours = population.stack(agents)
+    optimizer = Adam(ours, 1e-2, 1e-2)
+    references = [torch.optim.Adam(agent.parameters(), lr=1e-2) for agent in agents]
+    for _ in range(20):
+        x = torch.randn(4, 8, 3)
+        optimizer.zero_grad()
+        ours(x).square().mean((1, 2)).sum().backward()
+        optimizer.step()
+        for s, (agent, reference) in enumerate(zip(agents, references)):
+            reference.zero_grad()
+            agent(x[s]).square().mean().backward()
+            reference.step()
+    for s, agent in enumerate(agents):
+        for (_, mine), (_, theirs) in zip(ours.named_parameters(), agent.named_parameters()):
+            torch.testing.assert_close(mine[s], theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_a_masked_agent_stays_as_if_the_step_had_not_been() -> None:
+    source = torch.Generator().manual_seed(0)
+    gradients = [torch.randn(3, 2, 5, generator=source) for _ in range(6)]
+
+    class One(nn.Module):
+        def __init__(self, s: slice) -> None:
+            super().__init__()
+            self.w = nn.Parameter(torch.ones(3, 2, 5)[s].clone())
+
+    masked, alone = One(slice(0, 3)), One(slice(1, 2))
+    optimizers = Adam(masked, 1e-2, 1e-2), Adam(alone, 1e-2, 1e-2)
+    for i, gradient in enumerate(gradients):
+        active = torch.tensor([True, i % 2 == 0, False])
+        masked.w.grad = gradient.clone()
+        optimizers[0].step(active)
+        if i % 2 == 0:
+            alone.w.grad = gradient[1:2].clone()
+            optimizers[1].step(torch.tensor([True]))
+    assert torch.equal(masked.w[1:2], alone.w)
+    assert torch.equal(masked.w[2], torch.ones(2, 5))
+    assert optimizers[0].steps.tolist() == [6, 3, 0]
+
+
+def test_adam_does_not_depend_on_place_in_the_stack() -> None:
+    source = torch.Generator().manual_seed(0)
+    for shape in ((3,), (10, 3), (17, 5), (64, 64)):
+        values = torch.randn(STACK, *shape, generator=source)
+        gradients = [torch.randn(STACK, *shape, generator=source) for _ in range(3)]
+
+        def run(
+            size: int, offset: int, values: Tensor = values, gradients: list[Tensor] = gradients
+        ) -> Tensor:
+            part = slice(offset, offset + size)
+            module = nn.Module()
+            module.w = nn.Parameter(values[part].clone())
+            optimizer = Adam(module, 1e-3, 1e-3)
+            for gradient in gradients:
+                module.w.grad = gradient[part].clone()
+                optimizer.step()
+            return module.w.detach()
+
+        whole = run(STACK, 0)
+        for size, offset in SLICES:
+            assert torch.equal(run(size, offset), whole[offset : offset + size])
+
+
+def test_quantum_parameters_get_their_own_rate_and_count() -> None:
+    class Hybrid(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.a, self.q = nn.Parameter(torch.zeros(1, 2)), nn.Parameter(torch.zeros(1, 3))
+
+        def quantum_parameters(self) -> set[str]:
+            return {"q"}
+
+    module = Hybrid()
+    assert population.count_parameters(module) == (2, 3)
+    optimizer = Adam(module, classical_lr=0.1, quantum_lr=0.5)
+    module.a.grad, module.q.grad = torch.ones(1, 2), torch.ones(1, 3)
+    optimizer.step()
+    torch.testing.assert_close(module.a.detach(), torch.full((1, 2), -0.1))
+    torch.testing.assert_close(module.q.detach(), torch.full((1, 3), -0.5))
+
+
+def test_state_round_trip() -> None:
+    one = population.stack(modules(3))
+    first, second = Adam(one, 1e-2, 1e-2), Adam(one, 1e-2, 1e-2)
+    one(torch.randn(3, 4, 3)).sum().backward()
+    first.step()
+    second.load_state_dict({name: value.clone() for name, value in first.state_dict().items()})
+    for (a, x), (b, y) in zip(first.state_dict().items(), second.state_dict().items()):
+        assert a == b
+        assert torch.equal(x, y)
+    merged = population.prefixed(x=first.state_dict(), y=second.state_dict())
+    assert set(population.part(merged, "x")) == set(first.state_dict())

@@ -1,0 +1,154 @@
+"""The results on disk: damage is named, never repaired silently, and nothing is lost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qrlsuite import checkpoint, store
+from qrlsuite.claims import SeedsClaimedError, acquire, living
+from qrlsuite.engine.groups import format_seeds, parse_seeds, plan
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+
+
+def test_a_torn_last_line_is_dropped_and_a_broken_one_named(tmp_path: Path) -> None:
+    path = tmp_path / "epochs.jsonl"
+    path.write_bytes(b'{"epoch":1}\n{"epoch":2}\n{"epo')
+    assert [row["epoch"] for row in store.read_lines(path)] == [1, 2]
+    path.write_bytes(b'{"epoch":1}\n{"ep\n{"epoch":3}\n')
+    with pytest.raises(StoreError, match="line 2: not JSON"):
+        store.read_lines(path)
+
+
+def test_float32_scores_survive_every_round_trip(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).random(1000, dtype=np.float32)
+    rows = [
+        {
+            "epoch": 1,
+            "scores": store.shortest(values),
+            "loss": 0.1,
+            "executions": {"forward": 3},
+            "nothing": None,
+        }
+    ]
+    path = tmp_path / "t.parquet"
+    path.write_bytes(store.table_bytes(rows))
+    back = store.read_table(path)
+    assert back == rows
+    assert (np.array(back[0]["scores"], np.float32) == values).all()
+
+
+def test_the_table_is_what_the_lines_were(train: Callable[..., Path]) -> None:
+    folder = store.EntryStore(train("runs", [0])).seed(0)
+    rows = folder.epochs()
+    assert not folder.lines.exists()
+    assert [row["epoch"] for row in rows] == [1, 2, 3]
+    assert len(rows[0]["scores"]) == 5
+    folder.cut(2)
+    assert [row["epoch"] for row in folder.epochs()] == [1, 2]
+    assert folder.epochs() == rows[:2]
+
+
+def test_another_format_version_is_refused(train: Callable[..., Path]) -> None:
+    entry = train("runs", [0])
+    content = json.loads((entry / "entry.json").read_text())
+    (entry / "entry.json").write_text(json.dumps({**content, "format_version": 2}))
+    with pytest.raises(StoreError, match="has format version 2, this suite reads 1"):
+        train("runs", [0])
+
+
+def test_a_missing_epoch_is_an_error(train: Callable[..., Path]) -> None:
+    folder = store.EntryStore(train("runs", [0])).seed(0)
+    rows = folder.epochs()
+    folder.table.unlink()
+    folder.lines.write_bytes(b"".join(store.json_line(row) for row in (rows[0], rows[2])))
+    with pytest.raises(StoreError, match="epoch 2 is missing"):
+        folder.curve()
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"not parquet at all", b"\0" * 100])
+def test_a_truncated_table_is_named(train: Callable[..., Path], content: bytes) -> None:
+    folder = store.EntryStore(train("runs", [0])).seed(0)
+    folder.table.write_bytes(content)
+    with pytest.raises(StoreError, match=r"epochs\.parquet is not a readable parquet file"):
+        folder.curve()
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 20, b"\x10\0\0\0\0\0\0\0{}              "])
+def test_a_damaged_checkpoint_is_named(train: Callable[..., Path], content: bytes) -> None:
+    entry = store.EntryStore(train("runs", [0]))
+    next(entry.groups.glob("*/checkpoint.safetensors")).write_bytes(content)
+    with pytest.raises(StoreError, match="is damaged"):
+        checkpoint.headers(entry)
+
+
+def test_a_finished_run_without_checkpoint_is_not_started_again(train: Callable[..., Path]) -> None:
+    entry = store.EntryStore(train("runs", [0]))
+    before = entry.seed(0).table.read_bytes()
+    for path in entry.groups.glob("*/checkpoint.safetensors"):
+        path.unlink()
+    with pytest.raises(StoreError, match="its checkpoint is gone: it cannot be extended"):
+        train("runs", [0], 6)
+    assert entry.seed(0).table.read_bytes() == before
+
+
+def test_two_workers_never_share_a_seed(train: Callable[..., Path]) -> None:
+    entry = store.EntryStore(train("runs", [0, 1]))
+    claim = acquire(entry, [1, 2])
+    with pytest.raises(SeedsClaimedError, match=r"1 of these seeds \(from 2\) are being trained by process"):
+        acquire(entry, [2, 3])
+    acquire(entry, [3, 4]).release()
+    claim.release()
+    assert living(entry) == []
+    acquire(entry, [2, 3]).release()
+
+
+def test_the_claim_of_a_dead_process_is_taken_over(train: Callable[..., Path]) -> None:
+    entry = store.EntryStore(train("runs", [0]))
+    claim = acquire(entry, [0])
+    content = json.loads(claim.path.read_text())
+    claim.path.write_text(json.dumps({**content, "started": "another process of the same number"}))
+    assert living(entry) == []
+    acquire(entry, [0]).release()
+    assert not claim.refresh(), "a holder whose claim was taken over finds out"
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3", [0, 1, 2]), ("2:4", [2, 3]), ("0,3,10:12", [0, 3, 10, 11]), ("5,1", [1, 5])]
+)
+def test_seeds_are_parsed(text: str, seeds: list[int]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "x", "-1", "3:1", "1,1", "1:", "0", "2.5"])
+def test_seeds_that_are_none(text: str) -> None:
+    with pytest.raises(OptionError, match="seed"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize("seeds", [[0], [7], [0, 1, 2], [0, 2, 3, 9], [5, 6, 8, 9, 10]])
+def test_format_seeds_is_the_inverse_of_parse_seeds(seeds: list[int]) -> None:
+    assert parse_seeds(format_seeds(seeds)) == seeds
+
+
+def test_groups_are_even_and_keep_epochs_apart(train: Callable[..., Path]) -> None:
+    entry = store.EntryStore(train("runs", [0, 1], 2))
+    groups = plan(entry, range(10), 5, workers=2)
+    assert [(g.seeds, g.epoch) for g in groups] == [((2, 3, 4, 5), 0), ((6, 7, 8, 9), 0), ((0, 1), 2)]
+    assert plan(entry, [0, 1], 2, workers=2) == []
+
+
+def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(StoreError, match=r"cannot write .*: Not a directory; what was there is unchanged"):
+        store.write_atomically(blocker / "x.json", b"{}")
+
+
+def test_no_results_folder(tmp_path: Path) -> None:
+    with pytest.raises(QrlSuiteError, match="there is no results folder"):
+        store.entries(tmp_path / "none")

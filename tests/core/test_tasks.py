@@ -1,0 +1,94 @@
+"""Task files: every one loads, and every mistake is named with its path and the nearest match."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qrlsuite import registry, task
+from qrlsuite.errors import QrlSuiteError, TaskError
+from tests.conftest import TINY
+
+
+@pytest.mark.parametrize("name", registry.load().names("tasks"))
+def test_every_registered_task_loads_under_its_own_name(name: str) -> None:
+    loaded = task.load(name)
+    assert loaded.name == name
+    assert loaded.file.protocol.rounds >= 1
+
+
+def test_the_hash_covers_the_definition_and_nothing_else() -> None:
+    base = task.parse(TINY, "t")
+    assert task.parse(TINY.replace("A beam", "Another beam"), "t").hash == base.hash
+    assert task.parse(TINY.replace("epochs = 3", "epochs = 7"), "t").hash == base.hash
+    assert task.parse(TINY.replace("degree = 3", "degree = 4"), "t").hash != base.hash
+    assert task.parse(TINY.replace("episodes = 5", "episodes = 6"), "t").hash != base.hash
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("epochs = 3", "epoch = 3", r"t.toml: unknown key 'epoch' in \[protocol\]; did you mean 'epochs'"),
+        ("[protocol]", "[protocoll]", "unknown key 'protocoll'; did you mean 'protocol'"),
+        ("interactions = 60", "", "missing key 'protocol.interactions'"),
+        ("interactions = 60", "interactions = 61", "interactions = 61 is not a multiple of environments = 4"),
+        ("seeds = 4", "seeds = 'four'", "protocol.seeds = 'four'"),
+        ('name = "beam6g"', 'name = "beam6h"', "unknown environment 'beam6h'; did you mean 'beam6g'"),
+        ("degree = 3", "degre = 3", "no option 'degre'; did you mean 'degree'"),
+        ("deltas = [0.5, 0.75]", "deltas = [0.5, 1.5]", "ranking.deltas.1 = 1.5"),
+        ("epsilons = [0.6, 0.8]", "", "give either epsilons"),
+        ("epsilon = 0.6, delta", "threshold = 0.6, delta", "the reference cell needs epsilon and delta"),
+        ("format_version = 1", "format_version = 2", "format_version = 2"),
+        ("steps = 20", "steps = 20 = 3", "not valid TOML"),
+        (
+            'default_algorithm = "ddqn"',
+            'default_preset = "relesed"',
+            "default_preset 'relesed'; none is registered",
+        ),
+    ],
+)
+def test_mistakes_are_named(old: str, new: str, message: str) -> None:
+    assert old in TINY
+    with pytest.raises(QrlSuiteError, match=message):
+        task.parse(TINY.replace(old, new), "t.toml")
+
+
+def test_all_mistakes_are_named_at_once() -> None:
+    text = (
+        TINY.replace("epochs = 3", "epoch = 3")
+        .replace("seeds = 4", "seeds = 0")
+        .replace("interactions = 60", "")
+    )
+    with pytest.raises(TaskError) as caught:
+        task.parse(text, "t.toml")
+    for part in ("'epoch'", "protocol.seeds = 0", "protocol.interactions"):
+        assert part in str(caught.value)
+
+
+def test_a_file_that_is_not_there() -> None:
+    with pytest.raises(TaskError, match="cannot be read"):
+        task.load("nowhere/at-all.toml")
+
+
+@given(st.text(max_size=200))
+def test_no_text_gives_a_traceback(text: str) -> None:
+    with pytest.raises(QrlSuiteError):
+        task.parse(text, "t.toml")
+
+
+@given(st.integers(0, len(TINY) - 1), st.characters(codec="utf-8"))
+def test_no_changed_character_gives_a_traceback(position: int, character: str) -> None:
+    with contextlib.suppress(QrlSuiteError):
+        task.parse(TINY[:position] + character + TINY[position + 1 :], "t.toml")
+
+
+def test_other_environment_options_make_another_task(tmp_path: Path) -> None:
+    base = task.parse(TINY, "t")
+    other = base.with_environment({"degree": 4})
+    assert other.hash != base.hash
+    assert other.name == f"tiny+{other.hash[:8]}"
+    assert base.with_environment({"degree": 3}).name == "tiny"
