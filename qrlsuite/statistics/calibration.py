@@ -84,7 +84,9 @@ class SmoothedRuns:
         count, available = whole(n_runs, "n_runs", at_least=1), self.entry.n_runs
         chosen = self._centered[generator.integers(0, available, size=count)]
         mixture = generator.standard_normal((count, available)) / np.sqrt(available)
-        curves = self._mean + (chosen + self.jitter * (mixture @ self._centered)) / np.hypot(1, self.jitter)
+        # einsum and not BLAS: the same sum on every machine and number of threads
+        jitter = self.jitter * np.einsum("ij,jt->it", mixture, self._centered)
+        curves = self._mean + (chosen + jitter) / np.hypot(1, self.jitter)
         if self.bounds is not None:
             curves = np.clip(curves, *self.bounds)
         return LearningCurves(curves, self.entry.steps_per_epoch, self.entry.name)
