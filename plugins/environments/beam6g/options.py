@@ -68,7 +68,7 @@ class Options:
         if degree < 2:
             raise ValueError("at least 2 is needed: a path has a first and a last support point")
         if degree > 32:
-            raise ValueError("at most 32 is allowed: hardly any random path would stay in the field")
+            raise ValueError("at most 32 is allowed: there only 2 percent of random paths stay in the field")
         return degree
 
 
