@@ -1,0 +1,23 @@
+"""Circuits written once, run on every backend: `ansatz`, `expectations`, and what circuits are made of.
+
+Importing this package imports numpy and nothing heavier; registry, torch and simulators load when called.
+"""
+
+from __future__ import annotations
+
+from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend, expectations
+from qrlsuite.circuit.description import GATES, MAX_QUBITS, Angle, Circuit, Element, Operation, Parameter
+
+__all__ = [
+    "GATES",
+    "MAX_QUBITS",
+    "Angle",
+    "Circuit",
+    "CircuitBackend",
+    "Element",
+    "Operation",
+    "Parameter",
+    "ansatz",
+    "create_backend",
+    "expectations",
+]

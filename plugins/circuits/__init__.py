@@ -1,0 +1,43 @@
+"""The built-in ansaetze, and the backends that compute a circuit's expectation values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from qrlsuite.hookspecs import hookimpl
+from qrlsuite.specs import AnsatzSpec, CircuitBackendSpec
+
+_HERE = "qrlsuite.plugins.circuits"
+
+
+@hookimpl
+def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
+    """Register `iqp`, `cx`, `cz` and `skolik`."""
+    for name, summary, options in (
+        ("iqp", "Closed ring of controlled gates between layers of Hadamards; option: gate", "GateOptions"),
+        ("cx", "A gate on every qubit, then a ring of CNOTs; option: gate", "GateOptions"),
+        ("cz", "A gate on every qubit, then a ring of CZs; option: gate", "GateOptions"),
+        ("skolik", "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs", "NoOptions"),
+    ):
+        register(AnsatzSpec(name, summary, f"{_HERE}.ansatz:{options}", f"{_HERE}.ansatz:{name}"))
+
+
+@hookimpl
+def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) -> None:
+    """Register the backends."""
+    register(
+        CircuitBackendSpec(
+            name="pennylane",
+            summary="Any PennyLane device by name; options: device, diff_method, shots",
+            options=f"{_HERE}.options:PennyLaneOptions",
+            factory=f"{_HERE}.pennylane:PennyLaneBackend",
+        )
+    )
+    register(
+        CircuitBackendSpec(
+            name="qiskit",
+            summary="EstimatorQNN over a V2 primitive; options: estimator, gradient, shots, noise_model",
+            options=f"{_HERE}.options:QiskitOptions",
+            factory=f"{_HERE}.qiskit:QiskitBackend",
+        )
+    )

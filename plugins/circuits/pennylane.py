@@ -1,0 +1,296 @@
+"""Circuits on any PennyLane device.
+
+Angles are computed in torch for all operations at once (`qrlsuite.circuit.angles`) and enter one QNode on
+PennyLane's broadcast axis, seeds and batch together (lane = s * B + b). `default.qubit` simulates the whole axis
+in one pass and is differentiated by backpropagation, as in the paper; devices that do not broadcast get
+PennyLane's own expansion into single circuits.
+
+With a finite number of shots every seed is executed by itself, on a device seeded for it, and differentiated by
+the parameter-shift rule. PennyLane's rule refuses broadcast circuits, so the shifted angles are put on the
+broadcast axis here: one execution for the gradient of all angles of all samples.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pennylane as qml
+import torch
+from qrlsuite.plugins.circuits.options import PennyLaneOptions as Options
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from qrlsuite.circuit.angles import AngleTable
+from qrlsuite.circuit.description import Circuit, Operation
+from qrlsuite.circuit.shifts import shifted_angles, vector_jacobian
+from qrlsuite.errors import OptionError, nearest
+
+BROADCASTING = "default.qubit"
+"""The device that simulates the broadcast axis in one pass, and through which torch can differentiate.
+`default.mixed` broadcasts too, but copies angles on the way (PennyLane 0.45), which cuts off their gradient."""
+
+MEMORY = 2**30
+"""Bytes that the states of one differentiated pass may take; more seeds are recomputed in the backward pass."""
+
+LANES = 16
+"""Every seed's lanes are padded to a multiple of this. torch multiplies complex numbers with fused operations in
+vectors and without them in what is left over at the end, so that a lane's bits would depend on its place."""
+
+PACKAGES = {
+    "braket": "amazon-braket-pennylane-plugin",
+    "cirq": "pennylane-cirq",
+    "ionq": "pennylane-ionq",
+    "lightning.gpu": "pennylane-lightning-gpu",
+    "lightning.kokkos": "pennylane-lightning-kokkos",
+    "qiskit": "pennylane-qiskit",
+    "qulacs": "pennylane-qulacs",
+}
+
+GATES: dict[tuple[str, bool], Callable[..., Any]] = {
+    ("RX", True): qml.CRX,
+    ("RY", True): qml.CRY,
+    ("RZ", True): qml.CRZ,
+    ("Rot", True): qml.CRot,
+    ("H", False): qml.Hadamard,
+    ("X", False): qml.PauliX,
+    ("Y", False): qml.PauliY,
+    ("Z", False): qml.PauliZ,
+}
+"""Gates by name and whether they are controlled, where PennyLane's class of that name is not it."""
+
+
+class PennyLaneBackend:
+    """A circuit on a PennyLane device, see `qrlsuite.circuit.CircuitBackend`.
+
+    Raises
+    ------
+    OptionError
+        If the device is unknown or its package is missing, if it lacks a gate of the circuit, or if it cannot
+        differentiate as asked.
+    """
+
+    def __init__(self, circuit: Circuit, options: Options) -> None:
+        self.circuit = circuit
+        self.options = options
+        self.shots: int | None = options.shots
+        self.table = AngleTable(circuit)
+        self.diff_method = _diff_method(options)
+        self._device = _device(options, circuit.qubits, None)
+        self._qnode = self._compile()
+
+    def __call__(
+        self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None = None
+    ) -> Tensor:
+        """Return expectation values (S, B, observables), see `qrlsuite.circuit.CircuitBackend`."""
+        # PennyLane's states are complex128 whatever the angles are, so float64 angles cost nothing.
+        exact = {name: value.double() for name, value in parameters.items()}
+        return self._evaluate(self.table(inputs.double(), exact), seeds).to(inputs.dtype)
+
+    def _evaluate(self, angles: Tensor, seeds: Sequence[int] | None) -> Tensor:
+        """Return expectation values (S, B, observables) from angles (A, S, B)."""
+        S, B = angles.shape[1:]
+        if self.shots is not None:
+            entropy = [None] * S if seeds is None else seeds
+            results = [self._sampled(angles[:, s], seed, B) for s, seed in enumerate(entropy)]
+            return torch.stack(results)
+        if self.diff_method == "parameter-shift":
+            return torch.stack([_Shift.apply(angles[:, s], self, None, B) for s in range(S)])
+        step = self._seeds_per_pass(S, B, angles.requires_grad)
+        if step >= S:
+            return self._pass(angles)
+        passes = []
+        for start in range(0, S, step):
+            some = angles[:, start : start + step]
+            if angles.requires_grad:
+                passes.append(checkpoint(self._pass, some, use_reentrant=False, preserve_rng_state=False))
+            else:
+                passes.append(self._pass(some))
+        return torch.cat(passes)
+
+    def execute(self, angles: Tensor, lanes: int, seed: int | None = None) -> Tensor:
+        """Run the circuit once per lane: angles (A, lanes) to expectation values (lanes, observables).
+
+        Parameters
+        ----------
+        angles:
+            Radians; differentiable as the device differentiates.
+        lanes:
+            Number of lanes, needed where no angle is variable.
+        seed:
+            Seed of the device's sampling; None draws fresh entropy.
+        """
+        qnode = self._qnode
+        if self.shots is not None and "seed" in self._device_arguments():
+            qnode = self._build(_device(self.options, self.circuit.qubits, _entropy(seed)))
+        with _float64():
+            values = [torch.as_tensor(value).to(angles.dtype) for value in qnode(angles)]
+        return torch.stack([value.expand(lanes) for value in values], dim=1)
+
+    def _pass(self, angles: Tensor) -> Tensor:
+        """Return (S, B, observables) from angles (A, S, B) in one execution."""
+        count, S, B = angles.shape
+        if self.diff_method == "adjoint":
+            lanes: Tensor = _DeviceGradient.apply(angles.reshape(count, S * B), self, S * B)
+            return lanes.reshape(S, B, -1)
+        padded = torch.nn.functional.pad(angles, (0, -B % LANES))
+        width = padded.shape[2]
+        return self.execute(padded.reshape(count, S * width), S * width).reshape(S, width, -1)[:, :B]
+
+    def _sampled(self, angles: Tensor, seed: int | None, lanes: int) -> Tensor:
+        """Return one seed's sampled values (B, observables) from its angles (A, B)."""
+        result: Tensor = _Shift.apply(angles, self, _entropy(seed), lanes)
+        return result
+
+    def _seeds_per_pass(self, S: int, B: int, differentiated: bool) -> int:
+        """Return how many seeds one execution takes, so that its states fit in memory."""
+        states = 2 * len(self.circuit) if differentiated and self.diff_method == "backprop" else 4
+        return max(1, MEMORY // (states * B * 16 * 2**self.circuit.qubits))
+
+    def _build(self, device: Any) -> Any:
+        """Return the QNode of the circuit on a device."""
+
+        def measure(angles: Tensor) -> list[Any]:
+            rows = list(angles) if self.table.count else []
+            for operation, indices in zip(self.circuit, self.table.rows):
+                _apply(operation, [rows[i] if isinstance(i, int) else i for i in indices])
+            return [qml.expval(qml.PauliZ(q)) for q in self.circuit.observables]
+
+        # The shift rule is applied outside, so that the QNode need not be differentiable.
+        method = None if self.diff_method == "parameter-shift" else self.diff_method
+        qnode = qml.QNode(measure, device, interface="torch", diff_method=method, shots=self.shots)
+        return qnode if self.options.device == BROADCASTING else qml.transforms.broadcast_expand(qnode)
+
+    def _device_arguments(self) -> set[str]:
+        return set(inspect.signature(type(self._device)).parameters)
+
+    def _compile(self) -> Any:
+        """Return the QNode, tried on the device, which finds gates and gradients that it lacks."""
+        angles = torch.zeros(self.table.count, 2, dtype=torch.float64)
+        angles.requires_grad_(self.table.count > 0)
+        try:
+            qnode = self._build(self._device)
+            qml.workflow.construct_batch(qnode, level="device")(angles)
+        except Exception as error:
+            raise OptionError(
+                f"device = {self.options.device!r} with diff_method = {self.diff_method!r} cannot run this "
+                f"circuit: {_one_line(error)}"
+            ) from error
+        return qnode
+
+
+class _Shift(torch.autograd.Function):
+    """Values of all lanes, and their gradient by the parameter-shift rule."""
+
+    @staticmethod
+    def forward(ctx: Any, angles: Tensor, backend: PennyLaneBackend, seed: int | None, lanes: int) -> Tensor:
+        ctx.save_for_backward(angles)
+        ctx.backend, ctx.seed, ctx.lanes = backend, seed, lanes
+        return backend.execute(angles.detach(), lanes, seed)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
+        (angles,) = ctx.saved_tensors
+        backend, (grad,) = ctx.backend, grads
+        shifted, plan = shifted_angles(angles, backend.table.controlled)
+        seed = None if ctx.seed is None else _entropy(ctx.seed, 1)
+        with torch.no_grad():
+            values = backend.execute(shifted, shifted.shape[1], seed)
+        return vector_jacobian(values, grad, plan), None, None, None
+
+
+class _DeviceGradient(torch.autograd.Function):
+    """Values of all lanes, and their gradient as PennyLane and the device compute it, both in float64."""
+
+    @staticmethod
+    def forward(ctx: Any, angles: Tensor, backend: PennyLaneBackend, lanes: int) -> Tensor:
+        ctx.angles = angles.detach().requires_grad_(angles.requires_grad)
+        with torch.set_grad_enabled(angles.requires_grad):
+            ctx.values = backend.execute(ctx.angles, lanes)
+        return ctx.values.detach()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        with _float64():
+            (result,) = torch.autograd.grad(ctx.values, ctx.angles, grads)
+        return result, None, None
+
+
+@contextlib.contextmanager
+def _float64() -> Iterator[None]:
+    """Let torch read a device's Python floats as float64; PennyLane converts them by torch's default type."""
+    previous = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(previous)
+
+
+def _apply(operation: Operation, angles: list[Any]) -> None:
+    """Queue one gate."""
+    gate, wires, control = operation.gate, list(operation.wires), operation.control
+    factory = GATES.get((gate, control is not None))
+    if control is None:
+        (factory or getattr(qml, gate))(*angles, wires=wires)
+    elif factory is not None:
+        factory(*angles, wires=[control, *wires])
+    else:
+        qml.ctrl(getattr(qml, gate), control=control)(*angles, wires=wires)
+
+
+def _diff_method(options: Options) -> str:
+    """Choose how to differentiate, or say why it cannot be done."""
+    broadcasting = options.device == BROADCASTING
+    if options.diff_method == "auto":
+        if options.shots is not None:
+            return "parameter-shift"
+        return (
+            "backprop"
+            if broadcasting
+            else "adjoint"
+            if options.device.startswith("lightning.")
+            else "parameter-shift"
+        )
+    if options.shots is not None and options.diff_method != "parameter-shift":
+        raise OptionError(
+            f"diff_method = '{options.diff_method}' needs exact states; with shots = {options.shots} "
+            "use 'parameter-shift' or 'auto'"
+        )
+    if options.diff_method == "backprop" and not broadcasting:
+        raise OptionError(
+            f"diff_method = 'backprop' is not possible on device '{options.device}', only on '{BROADCASTING}'; "
+            "use 'adjoint', 'parameter-shift' or 'auto'"
+        )
+    return options.diff_method
+
+
+def _device(options: Options, qubits: int, seed: int | None) -> Any:
+    """Open a device by name."""
+    seeded = {} if seed is None else {"seed": seed}
+    try:
+        return qml.device(options.device, wires=qubits, **seeded)
+    except Exception as error:
+        known = sorted(qml.plugin_devices)
+        message = f"device = {options.device!r} cannot be opened"
+        if options.device in known:
+            raise OptionError(f"{message} with {qubits} qubits: {_one_line(error)}") from error
+        for prefix, package in PACKAGES.items():
+            if options.device == prefix or options.device.startswith(f"{prefix}."):
+                raise OptionError(f"{message}: its package is missing; pip install {package}") from error
+        raise OptionError(
+            f"{message}: PennyLane knows no such device{nearest(options.device, known)}"
+        ) from error
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _entropy(seed: int | None, *path: int) -> int:
+    """Return 63 bits derived from a seed and a path of integers; fresh ones where the seed is None."""
+    state = np.random.SeedSequence(None if seed is None else [seed, *path])
+    return int(state.generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -1,0 +1,305 @@
+"""Hybrid variational quantum circuit: linear layer, circuit, linear layer, on any circuit backend.
+
+Source: the paper's quantum models (section 'Experimental Setup'): Linear(obs -> n), a data re-uploading circuit
+whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3 inputs and 3 outputs these are
+6 L n + 7 n + 3 parameters on n qubits with L layers. Quantum parameters start uniform in [0, 2 pi), linear
+layers as `torch.nn.Linear` does.
+
+One module serves all backends; the three models differ in which backend computes the circuit.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import field, fields
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from qrlsuite.plugins.circuits.options import PennyLaneOptions as PennyLaneBackendOptions
+from qrlsuite.plugins.circuits.options import QiskitOptions as QiskitBackendOptions
+from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
+from torch import Tensor, nn
+
+from qrlsuite import registry, specs
+from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
+from qrlsuite.errors import OptionError
+from qrlsuite.options import field_names
+from qrlsuite.population import linear
+
+Activation = Literal["none", "relu", "tanh"]
+OptionValue = bool | int | float | str
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class VQCOptions:
+    """Options of every hybrid circuit model."""
+
+    backend: ClassVar[str]
+
+    qubits: Annotated[int, Field(ge=1, le=20, description="qubits of the circuit")] = 10
+    layers: Annotated[int, Field(ge=1, le=256, description="layers of the circuit")] = 4
+    ansatz: Annotated[str, Field(description="circuit family: iqp, cx, cz, skolik, or a plugin's")] = "iqp"
+    gate: Annotated[
+        Literal["rot", "xyz", "u3"], Field(description="variational gate, for the ansaetze that offer it")
+    ] = "rot"
+    ansatz_options: Annotated[
+        dict[str, OptionValue], Field(description="further options of the ansatz, as a TOML table")
+    ] = field(default_factory=dict)
+    activation_in: Annotated[Activation, Field(description="between linear layer and circuit")] = "none"
+    activation_out: Annotated[Activation, Field(description="between circuit and linear layer")] = "none"
+    dtype: Annotated[
+        Literal["float32", "float64"], Field(description="precision of parameters and circuit values")
+    ] = "float32"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PennyLaneOptions(PennyLaneBackendOptions, VQCOptions):
+    """Options of `vqc-pennylane`."""
+
+    backend: ClassVar[str] = "pennylane"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class QiskitOptions(QiskitBackendOptions, VQCOptions):
+    """Options of `vqc-qiskit`."""
+
+    backend: ClassVar[str] = "qiskit"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class NativeOptions(VQCOptions):
+    """Options of `vqc-native`."""
+
+    backend: ClassVar[str] = "native"
+
+
+class ExecutionCounter:
+    """Circuit executions of each agent; the agents of a population do the same number.
+
+    Deep copies of a model (target networks) share their original's counter.
+
+    Attributes
+    ----------
+    forward:
+        Circuits executed in forward passes: one per input.
+    gradient:
+        Circuits that the parameter-shift rule would need for the gradients taken, as on hardware: per input two for
+        every variable angle of an uncontrolled rotation, four for one of a controlled rotation. Exact simulators
+        differentiate otherwise; the number makes entries comparable.
+    """
+
+    def __init__(self, shots: int | None, shift_evaluations: int) -> None:
+        self.shots = shots
+        self.shift_evaluations = shift_evaluations
+        self.forward = 0
+        self.gradient = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """Return the counts: `forward`, `parameter_shift`, and with finite shots the `shots` of both together."""
+        counts = {"forward": self.forward, "parameter_shift": self.gradient}
+        if self.shots is not None:
+            counts["shots"] = self.shots * (self.forward + self.gradient)
+        return counts
+
+    def _backward(self, inputs: int) -> None:
+        self.gradient += inputs * self.shift_evaluations
+
+
+class _Runner:
+    """A circuit, its backend and its counter: what the deep copies of a model share."""
+
+    def __init__(self, options: VQCOptions) -> None:
+        self.options = options
+        self.circuit = build_circuit(options)
+        shots: int | None = getattr(options, "shots", None)
+        self.executions = ExecutionCounter(shots, shift_evaluations(self.circuit))
+        self._backend: CircuitBackend | None = None
+
+    @property
+    def backend(self) -> CircuitBackend:
+        """The backend, prepared when it is first needed."""
+        if self._backend is None:
+            self._backend = create_backend(
+                self.options.backend, self.circuit, **_backend_options(self.options)
+            )
+        return self._backend
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Runner:
+        return self
+
+
+class _Affine(nn.Module):
+    """Holds `weight` (S, out, in) and `bias` (S, out), or without S in one agent's module."""
+
+    def __init__(self, weight: Tensor, bias: Tensor) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(weight)
+        self.bias = nn.Parameter(bias)
+
+
+class _Hybrid(nn.Module):
+    """What one agent's module and a population have in common; parameters `input.*, circuit.*, output.*`."""
+
+    shot_key: Tensor
+    shot_count: Tensor
+
+    def __init__(self, runner: _Runner, state: dict[str, Tensor]) -> None:
+        super().__init__()
+        self._runner = runner
+        self._copies = 0
+        self.input = _Affine(state["input.weight"], state["input.bias"])
+        self.circuit = nn.ParameterDict(
+            {name: nn.Parameter(state[f"circuit.{name}"]) for name in runner.circuit.parameters}
+        )
+        self.output = _Affine(state["output.weight"], state["output.bias"])
+        self.register_buffer("shot_key", state["shot_key"])
+        self.register_buffer("shot_count", state["shot_count"])
+
+    @property
+    def executions(self) -> ExecutionCounter:
+        """Circuit executions of each agent so far, shared with deep copies."""
+        return self._runner.executions
+
+    def quantum_parameters(self) -> set[str]:
+        """Return the names of the circuit's parameters."""
+        return {f"circuit.{name}" for name in self._runner.circuit.parameters}
+
+    def _stacked(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
+        """Map (S, B, in) to (S, B, out) with parameters (S, ...)."""
+        runner, options = self._runner, self._runner.options
+        inner = x.to(state["input.weight"].dtype)
+        inner = ACTIVATIONS[options.activation_in](linear(inner, state["input.weight"], state["input.bias"]))
+        parameters = {name: state[f"circuit.{name}"] for name in runner.circuit.parameters}
+        values = runner.backend(inner, parameters, self._shot_seeds())
+        executions, inputs = runner.executions, x.shape[1]
+        executions.forward += inputs
+        if values.requires_grad:
+            values.register_hook(lambda grad: executions._backward(inputs))
+        values = ACTIVATIONS[options.activation_out](values)
+        return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
+
+    def _shot_seeds(self) -> list[int] | None:
+        """Return this pass's sampling seed of every agent, from its key and the number of its passes so far."""
+        if self._runner.executions.shots is None:
+            return None
+        keys, counts = self.shot_key.reshape(-1).tolist(), self.shot_count.reshape(-1).tolist()
+        self.shot_count += 1
+        return [_derived(key, count, self._copies) for key, count in zip(keys, counts)]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Hybrid:
+        copied = type(self).__new__(type(self))
+        memo[id(self)] = copied
+        copied.__dict__.update({name: copy.deepcopy(value, memo) for name, value in self.__dict__.items()})
+        # A target network follows its original's shot count, but must not draw the same samples.
+        copied._copies = self._copies + 1
+        return copied
+
+
+class VQC(_Hybrid):
+    """One agent's hybrid model: (B, in) -> (B, out)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, in) to (B, out)."""
+        return self._stacked(x[None], {name: p[None] for name, p in self.named_parameters()})[0]
+
+
+class VQCPopulation(_Hybrid):
+    """S hybrid models: (S, B, in) -> (S, B, out); parameters and buffers as in `VQC` with a leading axis S.
+
+    Raises
+    ------
+    OptionError
+        If the backend cannot run the circuit.
+    """
+
+    def __init__(self, modules: Sequence[VQC], options: VQCOptions) -> None:
+        runner = _Runner(options)
+        _ = runner.backend  # prepared now, so that what it cannot do is known before training
+        states = [{**dict(m.named_parameters()), **dict(m.named_buffers())} for m in modules]
+        super().__init__(
+            runner, {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (S, B, in) to (S, B, out)."""
+        return self._stacked(x, dict(self.named_parameters()))
+
+
+def build_circuit(options: VQCOptions) -> Circuit:
+    """Build the circuit that the options describe.
+
+    Raises
+    ------
+    OptionError
+        If the ansatz has no such option or size.
+    """
+    given: dict[str, Any] = dict(options.ansatz_options)
+    if "gate" in field_names(specs.resolve(registry.ansatz(options.ansatz).options)):
+        given.setdefault("gate", options.gate)
+    elif options.gate != "rot":
+        raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")
+    return ansatz(options.ansatz, options.qubits, options.layers, **given)
+
+
+def shift_evaluations(circuit: Circuit) -> int:
+    """Return how many circuit executions the parameter-shift rule takes for the gradient at one input."""
+    variable = [
+        4 if operation.control is not None else 2
+        for operation in circuit
+        for angle in operation.angles
+        if angle.input is not None or angle.weight is not None
+    ]
+    return sum(variable)
+
+
+def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Generator) -> VQC:
+    """Build one agent's model with every random number drawn from `generator`.
+
+    Parameters
+    ----------
+    obs_dim, out_dim:
+        Numbers of inputs and outputs.
+    options:
+        Options of one of the `vqc-*` models; their class says which backend runs the circuit.
+    generator:
+        Source of the initial parameters and of the key of shot noise.
+
+    Raises
+    ------
+    OptionError
+        If the ansatz cannot be built with these options.
+    """
+    runner = _Runner(options)
+    circuit = runner.circuit
+    state: dict[str, Tensor] = {}
+    state["input.weight"], state["input.bias"] = initial_layer(obs_dim, circuit.inputs, "torch", generator)
+    for name, parameter in circuit.parameters.items():
+        uniform = torch.rand(parameter.shape, generator=generator)
+        state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
+    state["output.weight"], state["output.bias"] = initial_layer(
+        len(circuit.observables), out_dim, "torch", generator
+    )
+    state = {name: value.to(getattr(torch, options.dtype)) for name, value in state.items()}
+    state["shot_key"] = torch.randint(2**63 - 1, (), generator=generator)
+    state["shot_count"] = torch.zeros((), dtype=torch.int64)
+    return VQC(runner, state)
+
+
+def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:
+    """Stack built models."""
+    return VQCPopulation(modules, options)
+
+
+def _backend_options(options: VQCOptions) -> dict[str, Any]:
+    """Return the options that are the backend's, not the model's."""
+    own = {option.name for option in fields(VQCOptions)}
+    return {name: getattr(options, name) for name in field_names(type(options)) if name not in own}
+
+
+def _derived(*path: int) -> int:
+    """Return 63 bits derived from integers."""
+    return int(np.random.SeedSequence(path).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -1,0 +1,215 @@
+"""Circuits by name: `ansatz` builds one, `expectations` runs it on any registered backend.
+
+    >>> from qrlsuite.circuit import ansatz, expectations
+    >>> circuit = ansatz("cz", qubits=3, layers=2, gate="xyz")
+    >>> zeros = {name: np.zeros(p.shape) for name, p in circuit.parameters.items()}
+    >>> expectations(circuit, np.zeros((5, 3)), zeros).shape
+    torch.Size([5, 3])
+
+Registry, torch and simulators are imported when a function is called, not before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from qrlsuite.circuit.description import MAX_QUBITS, Circuit
+from qrlsuite.errors import OptionError, nearest
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import ArrayLike
+
+
+class CircuitBackend(Protocol):
+    """What `factory(circuit, options)` of a `CircuitBackendSpec` returns.
+
+    A backend evaluates one circuit for S seeds (agents with their own parameters) and B inputs each. Seeds
+    must not influence each other: slice s of the result depends on slice s of the arguments alone, bitwise.
+    It has no state that a call changes; deep copies of a model share it.
+
+    Attributes
+    ----------
+    shots:
+        Circuit repetitions per expectation value; None means exact.
+    """
+
+    shots: int | None
+
+    def __call__(
+        self,
+        inputs: torch.Tensor,
+        parameters: Mapping[str, torch.Tensor],
+        seeds: Sequence[int] | None = None,
+    ) -> torch.Tensor:
+        """Return expectation values, differentiable in torch by inputs and parameters.
+
+        Parameters
+        ----------
+        inputs:
+            (S, B, circuit.inputs), float32 or float64, radians before scaling.
+        parameters:
+            Every declared parameter by name, (S, *shape), of the inputs' dtype.
+        seeds:
+            S non-negative integers below 2^63, used where `shots` is finite: the sampling of seed s, in the
+            backward pass too, depends on `seeds[s]` alone. None draws fresh entropy.
+
+        Returns
+        -------
+        Tensor
+            (S, B, len(circuit.observables)), in [-1, 1], of the inputs' dtype.
+        """
+        ...
+
+
+def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
+    """Build a registered ansatz.
+
+    Parameters
+    ----------
+    name:
+        Name of the ansatz: `qrlsuite list ansatzes`.
+    qubits, layers:
+        Size of the circuit: 1 to 20 qubits, 1 layer or more.
+    options:
+        Options of the ansatz, such as `gate="rot"`.
+
+    Raises
+    ------
+    UnknownNameError
+        If no ansatz has that name.
+    OptionError
+        For a number of qubits or layers, or an option, that the ansatz cannot have.
+    """
+    from qrlsuite import options as option_values
+    from qrlsuite import registry, specs
+
+    if isinstance(qubits, bool) or not isinstance(qubits, int) or not 1 <= qubits <= MAX_QUBITS:
+        raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
+    if isinstance(layers, bool) or not isinstance(layers, int) or layers < 1:
+        raise OptionError(f"layers = {layers!r}: a circuit has 1 layer or more")
+    spec = registry.ansatz(name)
+    chosen = option_values.build(specs.resolve(spec.options), options, f"ansatz '{name}'")
+    circuit: Circuit = specs.resolve(spec.build)(qubits, layers, chosen)
+    return circuit
+
+
+def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBackend:
+    """Prepare a registered backend for a circuit.
+
+    Raises
+    ------
+    UnknownNameError
+        If no backend has that name.
+    OptionError
+        For an option that it cannot have, a circuit that it cannot run, or a missing optional package.
+    """
+    from qrlsuite import options as option_values
+    from qrlsuite import registry, specs
+
+    spec = registry.circuit_backend(name)
+    chosen = option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
+    backend: CircuitBackend = specs.resolve(spec.factory)(circuit, chosen)
+    return backend
+
+
+def expectations(
+    circuit: Circuit,
+    inputs: ArrayLike | torch.Tensor,
+    parameters: Mapping[str, ArrayLike | torch.Tensor],
+    backend: str | None = None,
+    dtype: torch.dtype | str | None = None,
+    seed: int | None = None,
+    **backend_options: Any,
+) -> torch.Tensor:
+    """Compute a circuit's expectation values for a batch of inputs.
+
+    Parameters
+    ----------
+    circuit:
+        What to run.
+    inputs:
+        (B, circuit.inputs), finite.
+    parameters:
+        Every declared parameter by name, of its declared shape, finite. Tensors keep their gradient.
+    backend:
+        Name of a registered circuit backend; by default `native` where it is registered, else `pennylane`.
+    dtype:
+        float32 or float64; by default that of `inputs` if it is one of them, else float64.
+    seed:
+        Seed of the sampling where the options ask for a finite number of shots; None draws fresh entropy.
+    backend_options:
+        Options of the backend, such as `device="lightning.qubit"` or `shots=1000`.
+
+    Returns
+    -------
+    Tensor
+        (B, len(circuit.observables)): the expectation values of Pauli Z, in [-1, 1].
+
+    Raises
+    ------
+    UnknownNameError
+        If no backend has that name.
+    OptionError
+        For inputs or parameters that are missing, not finite or of a wrong shape; for wrong options.
+    """
+    from qrlsuite import registry
+
+    if backend is None:
+        backend = "native" if "native" in registry.load().names("circuit_backends") else "pennylane"
+    exact = _dtype(inputs, dtype)
+    x = _tensor(inputs, "inputs", exact)
+    if x.dim() != 2 or x.shape[1] != circuit.inputs or x.shape[0] < 1:
+        raise OptionError(
+            f"inputs have shape {tuple(x.shape)}: this circuit needs (batch, {circuit.inputs}), one row per sample"
+        )
+    unknown = [name for name in parameters if name not in circuit.parameters]
+    if unknown:
+        raise OptionError(
+            f"this circuit has no parameter '{unknown[0]}'{nearest(unknown[0], circuit.parameters)}"
+        )
+    state: dict[str, torch.Tensor] = {}
+    for name, parameter in circuit.parameters.items():
+        if name not in parameters:
+            raise OptionError(f"parameter '{name}' of shape {parameter.shape} is missing")
+        value = _tensor(parameters[name], f"parameter '{name}'", exact)
+        if tuple(value.shape) != parameter.shape:
+            raise OptionError(
+                f"parameter '{name}' has shape {tuple(value.shape)}, declared is {parameter.shape}"
+            )
+        state[name] = value[None]
+    run = create_backend(backend, circuit, **backend_options)
+    return run(x[None], state, None if seed is None else [seed])[0]
+
+
+def _dtype(inputs: Any, dtype: torch.dtype | str | None) -> torch.dtype:
+    """Return the precision to compute in."""
+    import torch
+
+    known = {"float32": torch.float32, "float64": torch.float64}
+    if dtype is None:
+        given = str(getattr(inputs, "dtype", "float64")).removeprefix("torch.")
+        return known.get(given, torch.float64)
+    name = str(dtype).removeprefix("torch.")
+    if name not in known:
+        raise OptionError(f"dtype = {name}: circuits are computed in float32 or float64")
+    return known[name]
+
+
+def _tensor(value: Any, what: str, dtype: torch.dtype) -> torch.Tensor:
+    """Convert to a finite tensor of a precision, keeping the gradient of one that has it."""
+    import torch
+
+    try:
+        tensor = (
+            value if isinstance(value, torch.Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
+        )
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"{what} are not an array of numbers: {error}") from error
+    tensor = tensor.to(dtype)
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        raise OptionError(f"{what}: every number must be finite, found nan or infinity")
+    return tensor
