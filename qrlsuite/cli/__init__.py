@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from typing import Any
 
 from qrlsuite.errors import QrlSuiteError
 
@@ -13,21 +14,22 @@ def main() -> None:
     from qrlsuite.cli.app import build
     from qrlsuite.registry import PluginWarning
 
-    def one_line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-        print(f"qrlsuite: warning: {message}", file=sys.stderr)
+    with warnings.catch_warnings():
+        original = warnings.showwarning
 
-    warnings.simplefilter("always", PluginWarning)
-    original = warnings.showwarning
-    warnings.showwarning = lambda message, category, *rest, **more: (
-        one_line(message, category)
-        if issubclass(category, PluginWarning)
-        else original(message, category, *rest, **more)
-    )
-    try:
-        build()()
-    except QrlSuiteError as error:
-        print(f"qrlsuite: {error}", file=sys.stderr)
-        sys.exit(2)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader (head, less) has gone
-        sys.exit(0)
+        def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            if issubclass(category, PluginWarning):
+                print(f"qrlsuite: warning: {message}", file=sys.stderr)
+            else:
+                original(message, category, *rest, **more)
+
+        warnings.simplefilter("always", PluginWarning)
+        warnings.showwarning = show
+        try:
+            build()()
+        except QrlSuiteError as error:
+            print(f"qrlsuite: {error}", file=sys.stderr)
+            sys.exit(2)
+        except BrokenPipeError:
+            sys.stderr.close()  # the reader (head, less) has gone
+            sys.exit(0)

@@ -38,16 +38,22 @@ def build() -> typer.Typer:
     app.command("show")(show.show)
 
     @app.callback()
-    def version(
-        version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+    def common(
+        version: Annotated[
+            bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
+        ] = False,
     ) -> None:
-        if version:
-            import qrlsuite
-
-            typer.echo(f"qrlsuite {qrlsuite.__version__}")
-            raise typer.Exit
+        pass
 
     from qrlsuite import registry
 
     registry.load().manager.hook.register_commands(app=app)
     return app
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        import qrlsuite
+
+        typer.echo(f"qrlsuite {qrlsuite.__version__}")
+        raise typer.Exit

@@ -1,0 +1,35 @@
+# `make quickstart` trains a small classical and a small quantum model and compares them; `make test` checks the suite.
+PYTHON ?= python3
+VENV ?= .venv
+RUNS ?= runs
+BIN := $(VENV)/bin
+TORCH ?= 2.13.0
+
+.PHONY: quickstart test install install-dev
+
+quickstart: install
+	$(BIN)/qrlsuite run --task beam6g --model mlp --quick --runs $(RUNS)
+	$(BIN)/qrlsuite run --task beam6g --model vqc-pennylane --quick --runs $(RUNS)
+	$(BIN)/qrlsuite plot curves --task beam6g --runs $(RUNS)
+	$(BIN)/qrlsuite leaderboard --task beam6g --runs $(RUNS)
+
+test: install-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	cd $(VENV) && bin/mypy --config-file ../pyproject.toml -p qrlsuite
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+install: $(BIN)/python
+	$(BIN)/pip install --quiet .
+
+# Strict mode lays the four folders out as one package, which type checkers can follow.
+install-dev: $(BIN)/python
+	$(BIN)/pip install --quiet --editable '.[dev]' --config-settings editable_mode=strict
+
+# The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,
+# install the torch of your choice into $(VENV) before anything else; it is kept.
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet 'torch==$(TORCH)+cpu' 2>/dev/null \
+	  || $(BIN)/pip install --quiet torch --index-url https://download.pytorch.org/whl/cpu \
+	  || $(BIN)/pip install --quiet torch

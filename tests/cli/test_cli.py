@@ -1,0 +1,180 @@
+"""The command line as a user meets it: a real process, its output, its exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from qrlsuite.cli import main
+from qrlsuite.store import EntryStore
+from tests.conftest import TINY, results
+
+
+def qrlsuite(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300, check=False)
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> str:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return str(path)
+
+
+def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    for width in ("16", "8"):
+        done = qrlsuite("run", "--task", task, "--model", "mlp", "--set", f"width={width}", "--runs", runs)
+        assert done.returncode == 0, done.stderr
+        assert "4 seeds complete" in done.stderr
+    again = qrlsuite("run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs, "--json")
+    assert json.loads(again.stdout)["seeds"] == 4
+
+    table = qrlsuite("leaderboard", "--runs", runs)
+    assert "undecided: fewer than 20 seeds" in table.stdout
+    board = json.loads(qrlsuite("leaderboard", "--runs", runs, "--format", "json").stdout)
+    (section,) = board["sections"]
+    assert {row["label"] for row in section["rows"]} == {"ddqn mlp width=16", "ddqn mlp width=8"}
+    assert all(row["tier"] is None and row["seeds"] == 4 for row in section["rows"])
+    markdown = qrlsuite("leaderboard", "--runs", runs, "--format", "markdown").stdout
+    assert "| undecided | ddqn mlp width=8 |" in markdown
+
+    compared = qrlsuite("compare", "mlp width=16", "mlp width=8", "--runs", runs)
+    assert "undecided: fewer than 20 seeds" in compared.stdout
+    drawn = qrlsuite("plot", "curves", "--runs", runs, "--out", str(tmp_path / "c.svg"))
+    assert drawn.returncode == 0, drawn.stderr
+    assert (tmp_path / "c.svg").read_text().startswith("<?xml")
+
+
+def test_more_seeds_widen_an_entry(task: str, tmp_path: Path) -> None:
+    words = ("run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", str(tmp_path / "runs"))
+    qrlsuite(*words, "--seeds", "0:2")
+    entry = next((tmp_path / "runs" / "tiny").iterdir())
+    before = results(entry, 0)
+    wider = qrlsuite(*words, "--seeds", "3")
+    assert "1 seeds to epoch 3" in wider.stderr
+    assert "2 seeds are already there" in wider.stderr
+    assert results(entry, 0) == before
+    assert EntryStore(entry).seeds() == [0, 1, 2]
+
+
+def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path) -> None:
+    def words(runs: str) -> list[str]:
+        run = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "3", "--epochs", "60"]
+        return [*run, "--runs", str(tmp_path / runs), "--workers", "2"]
+
+    assert qrlsuite(*words("straight")).returncode == 0
+    straight = next((tmp_path / "straight" / "tiny").iterdir())
+    stopped = tmp_path / "stopped" / "tiny" / straight.name
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qrlsuite", *words("stopped")], stderr=subprocess.PIPE, text=True
+    )
+    while not (stopped / "seed-0000" / "epochs.jsonl").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGINT)
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "every finished epoch is saved. The same command continues" in message
+    assert not (stopped / "seed-0000" / "epochs.parquet").exists(), "it was too fast to be interrupted"
+    assert qrlsuite(*words("stopped")).returncode == 0
+    for seed in range(3):
+        assert results(straight, seed) == results(stopped, seed)
+
+
+def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs]
+    endless = subprocess.Popen(
+        [sys.executable, "-m", "qrlsuite", *words, "--seeds", "0:2", "--epochs", "100000", "--workers", "1"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not list((tmp_path / "runs").glob("*/*/claims/*.json")):
+            assert endless.poll() is None
+            time.sleep(0.05)
+        other = qrlsuite(*words, "--seeds", "3", "--epochs", "2")
+        assert other.returncode == 0, other.stderr
+        assert "2 of the seeds are being trained by another process and are left to it" in other.stderr
+    finally:
+        endless.send_signal(signal.SIGINT)
+        assert endless.wait(60) == 130
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "--task", "beam6h", "--model", "mlp"], "unknown task 'beam6h'; did you mean 'beam6g'"),
+        (["run", "--task", "beam6g", "--model", "mpl"], "unknown model 'mpl'; did you mean 'mlp'"),
+        (["run", "--task", "beam6g", "--model", "mlp", "--algorithm", "dqn"], "did you mean 'ddqn'"),
+        (["run", "--task", "beam6g", "--model", "mlp", "--set", "widht=1"], "did you mean 'width'"),
+        (["run", "--task", "beam6g", "--model", "mlp", "--set", "width=wide"], "width = 'wide'"),
+        (["run", "--task", "beam6g", "--model", "mlp", "--preset", "relesed"], "did you mean 'released'"),
+        (
+            ["run", "--task", "beam6g", "--model", "mlp", "--seeds", "a:b"],
+            "write a number (100), a range (0:20)",
+        ),
+        (["run", "--task", "no/such.toml", "--model", "mlp"], "cannot be read"),
+        (
+            ["run", "--task", "beam6g", "--model", "mlp", "--set", "environment.antennas=[[[1,1],[1,0]]]"],
+            "antennas",
+        ),
+        (["run", "--task", "beam6g", "--model", "mlp", "--set", "degree=1"], "degree = 1"),
+        (
+            ["run", "--task", "beam6g", "--model", "mlp", "--set", "antennas=[[[1,1],[1,0]],[[9,1],[1,0]]]"],
+            "antennas",
+        ),
+        (
+            ["run", "--task", "beam6g", "--model", "mlp", "--set", "antennas=[[[1,1],[1,0]],[[3,1],[0,0]]]"],
+            "orientation",
+        ),
+        (["list", "modles"], "did you mean 'models'"),
+        (["show", "mpl"], "did you mean 'mlp'"),
+        (["leaderboard", "--runs", "nowhere"], "there is no results folder nowhere"),
+        (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),
+    ],
+)
+def test_wrong_input_gives_one_clear_line_and_exit_code_2(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["qrlsuite", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    printed = capsys.readouterr()
+    assert stopped.value.code == 2
+    assert message in printed.err
+    assert len(printed.err.strip().splitlines()) == 1, printed.err
+    assert printed.out == ""
+    assert list(tmp_path.iterdir()) == [], "wrong input leaves nothing behind"
+
+
+def test_list_and_show_answer_for_everything() -> None:
+    rows = json.loads(qrlsuite("list", "--json").stdout)
+    assert {"environments", "models", "algorithms", "tasks"} <= {row["kind"] for row in rows}
+    assert all(row["distribution"] for row in rows)
+    shown = qrlsuite("show", "mlp").stdout
+    assert "width = 64" in shown
+    assert "units of each hidden layer" in shown
+    protocol = json.loads(qrlsuite("show", "task", "beam6g", "--json").stdout)["protocol"]
+    assert protocol["interactions"] == 2000
+    hooks = qrlsuite("list", "hooks").stdout
+    assert "register_environments" in hooks
+
+
+def test_version_and_help() -> None:
+    assert qrlsuite("--version").stdout.startswith("qrlsuite ")
+    for command in ("run", "leaderboard", "compare", "plot", "list", "show"):
+        assert "Example" in qrlsuite(command, "--help").stdout
