@@ -25,6 +25,7 @@ from qrlsuite.statistics import (
     bootstrap_interval,
     false_winners,
     power,
+    sample_complexity,
 )
 
 CURVES = Path(__file__).parents[1] / "tests" / "golden" / "statistics.json.gz"
@@ -54,6 +55,19 @@ def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, 
     return found / pairs
 
 
+def print_bias(entry: LearningCurves, jitter: float, draws: int) -> None:
+    """Print the mean S_hat of entries of few and many runs, in thousands of steps."""
+    model, generator = SmoothedRuns(entry, jitter), np.random.default_rng(0)
+    deltas = [0.5, 0.75, 0.9]
+    for n_runs in (5, 10, 20, 50, 100, 1000):
+        found = [
+            sample_complexity(model.draw(n_runs, generator).values, [0.2], deltas, entry.steps_per_epoch)[0]
+            for _ in range(draws)
+        ]
+        means = " | ".join(f"{value / 1000:.1f}" for value in np.mean(found, axis=0))
+        print(f"| {entry.name} | {n_runs} | {means} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--pairs", type=int, default=1000)
@@ -65,7 +79,11 @@ def main() -> None:
     grid = Grid.relative(cases[0]["epsilons"], cases[0]["deltas"])
     entries = [LearningCurves(np.array(c["curves"]), c["steps_per_epoch"], c["name"]) for c in cases]
 
-    print("| network | runs | rule | a cell, mean | a cell, worst | any cell | a winner |")
+    print("| network | runs | delta .5 | delta .75 | delta .9 |\n|---|---|---|---|---|")
+    for entry in entries:
+        print_bias(entry, arguments.jitter, arguments.pairs)
+
+    print("\n| network | runs | rule | a cell, mean | a cell, worst | any cell | a winner |")
     print("|---|---|---|---|---|---|---|")
     for entry in entries:
         model = SmoothedRuns(entry, arguments.jitter)

@@ -212,10 +212,14 @@ class IntervalRule:
 class DifferenceRule:
     """Significant where the difference of sample complexities exceeds one critical value for the whole grid.
 
-    With D the difference of both estimates in a cell, D* its bootstrap draws and s their standard deviation,
-    the critical value q is the (1 - alpha) quantile over the draws of max over cells |D* - D| / s, and a cell
-    is significant where |D| / s > q (single-step max-T; Westfall and Young 1993; studentized simultaneous
-    bands). One critical value accounts for the number of cells and for their strong dependence.
+    With D the difference of both estimates in a cell, D* its bootstrap draws, m their mean and s their standard
+    deviation, the critical value q is the (1 - alpha) quantile over the draws of max over cells |D* - m| / s,
+    and a cell is significant where |D| / s > q (single-step max-T; Westfall and Young 1993; studentized
+    simultaneous bands). One critical value accounts for the number of cells and for their strong dependence.
+
+    The draws are centered on their own mean, and not on D: resampling shifts S_hat (it is biased at few runs),
+    and between equal entries that shift cancels. Centered on D, the simulated error rate was 1 to 2 percent
+    for alpha = 5 percent, at the cost of power; centered on m it is about alpha (docs/statistics.md).
 
     S_hat is a whole number of epochs: s includes that rounding (1/12 of the coarser epoch squared), so it is
     never zero, and a difference of less than one epoch of the coarser entry is never significant.
@@ -269,16 +273,17 @@ class DifferenceRule:
                 raise OptionError(f"{names} cannot be paired: run i of both must belong together")
         else:
             # One seed resamples both entries, so draw r of one goes with draw R-1-r of the other, which is
-            # independent of it. An involution: swapping the entries changes the signs and nothing else. With
-            # R odd, the middle draw would meet itself, and is left out.
-            even = own.shape[2] // 2 * 2
-            own, theirs = own[..., :even], theirs[..., :even][..., ::-1]
+            # independent of it (but for the middle one of an odd number). The order is an involution: swapping
+            # the entries changes the signs and nothing else.
+            theirs = theirs[..., ::-1]
         resolution = max(first.steps_per_epoch, second.steps_per_epoch)
         # float32 halves the time; steps are whole numbers, exact up to 2^24 and good to 1e-7 beyond
-        difference = own * np.float32(first.steps_per_epoch) - theirs * np.float32(second.steps_per_epoch)
+        difference = own.astype(np.float32) * np.float32(first.steps_per_epoch)
+        difference -= theirs.astype(np.float32) * np.float32(second.steps_per_epoch)
         observed = first.point - second.point
         spread = np.sqrt(difference.var(axis=2, dtype=np.float64) + resolution**2 / 12)
-        deviations = np.abs(difference - observed[..., None].astype(np.float32))
+        center = difference.mean(axis=2, dtype=np.float64)
+        deviations = np.abs(difference - center[..., None].astype(np.float32))
         largest = (deviations / spread[..., None].astype(np.float32)).max(axis=(0, 1))
         critical = float(np.quantile(largest, 1 - self.alpha))
         significant: BoolArray = (np.abs(observed) / spread > critical) & (np.abs(observed) >= resolution)
