@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import gymnasium
 import numpy as np
+
 from qrlsuite.plugins.environments.beam6g import ID, Options, make_vector
 
 GROUP = 100

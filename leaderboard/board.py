@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from qrlsuite.leaderboard.collect import EntryCurves
 
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.leaderboard.collect import EntryCurves
 from qrlsuite.statistics import (
     MIN_RUNS,
     Comparison,

@@ -1,9 +1,17 @@
 """Honest and fast benchmarks of quantum and classical reinforcement learning.
 
-Importing this package is cheap: torch, PennyLane and Qiskit are imported only by what needs them.
+Importing this package is cheap: torch, PennyLane and Qiskit are imported only by what needs them. Where
+Gymnasium was imported before it, every environment of the suite and its plugins becomes known to
+`gymnasium.make`; `register_environments()` does the same at any time.
 """
 
+from __future__ import annotations
+
+import sys
+
 __version__ = "0.1.0"
+
+__all__ = ["__version__", "hookimpl", "register_environments"]
 
 
 def __getattr__(name: str) -> object:
@@ -12,3 +20,21 @@ def __getattr__(name: str) -> object:
 
         return hookimpl
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def register_environments() -> None:
+    """Make every registered environment known to `gymnasium.make` under its Gymnasium id; again does nothing."""
+    import gymnasium
+
+    from qrlsuite import registry, specs
+
+    for registered in registry.load().entries["environments"].values():
+        spec = registered.spec
+        if not isinstance(spec, specs.EnvironmentSpec) or spec.entry_point is None:
+            continue
+        if spec.gymnasium_id not in gymnasium.registry:
+            gymnasium.register(spec.gymnasium_id, entry_point=spec.entry_point)
+
+
+if "gymnasium" in sys.modules:
+    register_environments()

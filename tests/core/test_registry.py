@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -103,3 +104,11 @@ def test_every_registered_reference_resolves(kind: str, name: str) -> None:
         reference = getattr(spec, field, None)
         if reference is not None:
             assert callable(specs.resolve(reference))
+
+
+@pytest.mark.parametrize(
+    "order", ["import gymnasium, qrlsuite", "import qrlsuite, gymnasium; qrlsuite.register_environments()"]
+)
+def test_environments_are_known_to_gymnasium(order: str) -> None:
+    program = f"{order}; env = gymnasium.make('qrlsuite/BeamManagement6G-v1', degree=4); env.reset(seed=0)"
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, register, render
 
 from qrlsuite.errors import OptionError
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, register, render
 from tests.conftest import golden
 from tests.environments.test_physics import antennas
 

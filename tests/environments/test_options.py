@@ -8,11 +8,11 @@ import re
 import gymnasium
 import numpy as np
 import pytest
-from qrlsuite.plugins.environments.beam6g import ID
-from qrlsuite.plugins.environments.beam6g.options import MAIN, Options, parse
 
 from qrlsuite.errors import OptionError
 from qrlsuite.options import describe, plain
+from qrlsuite.plugins.environments.beam6g import ID
+from qrlsuite.plugins.environments.beam6g.options import MAIN, Options, parse
 
 HERE = ((1.0, 1.0), (1.0, 0.0))
 

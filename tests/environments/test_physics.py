@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from qrlsuite.plugins.environments.beam6g import physics
 
+from qrlsuite.plugins.environments.beam6g import physics
 from tests.conftest import golden
 
 EPISODES = golden("beam6g")

@@ -7,6 +7,7 @@ import math
 import tomllib
 
 import pytest
+
 from qrlsuite.plugins.environments.beam6g import placements
 from qrlsuite.plugins.environments.beam6g.options import parse
 

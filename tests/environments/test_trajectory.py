@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from qrlsuite.plugins.environments.beam6g import trajectory
 from scipy.integrate import quad
 from scipy.interpolate import UnivariateSpline, make_interp_spline
 
+from qrlsuite.plugins.environments.beam6g import trajectory
 from tests.conftest import golden
 
 EPISODES = golden("beam6g")

@@ -6,12 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
-from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, make_vector
-from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables
 
 from qrlsuite import registry, specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, make_vector
+from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables
 
 STEPS = 12
 

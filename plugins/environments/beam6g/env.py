@@ -8,6 +8,8 @@ import gymnasium
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 from numpy.typing import NDArray
+
+from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables, reset_options
 from qrlsuite.plugins.environments.beam6g.options import MAIN, parse
@@ -15,8 +17,6 @@ from qrlsuite.plugins.environments.beam6g.physics import Antenna, Name
 from qrlsuite.plugins.environments.beam6g.render import Moment, Picture, Window, as_text
 from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
 from qrlsuite.plugins.environments.beam6g.vector import spaces
-
-from qrlsuite.errors import OptionError
 
 ID = "qrlsuite/BeamManagement6G-v1"
 
@@ -258,7 +258,9 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
 
 def register() -> None:
     """Register `qrlsuite/BeamManagement6G-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
+    known = gymnasium.registry.get(ID)
+    if known is None or known.vector_entry_point is None:
+        gymnasium.registry.pop(ID, None)  # `import qrlsuite` registers the single form alone
         package = "qrlsuite.plugins.environments.beam6g"
         gymnasium.register(
             ID,

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.beam6g import physics, trajectory
 from qrlsuite.plugins.environments.beam6g.options import Options
 from qrlsuite.plugins.environments.beam6g.physics import BEAMS, FIELD, BeamArray, FloatArray
-
-from qrlsuite.errors import OptionError
 
 _BLOCK = 128
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.dataclasses import dataclass
-from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, Name
-from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
 
 from qrlsuite.options import build
+from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, Name
+from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
 
 MAIN: tuple[Antenna, ...] = (
     ((1.5, 1.0), (1.0, 0.0)),

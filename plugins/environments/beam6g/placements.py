@@ -14,6 +14,7 @@ import itertools
 import math
 
 import numpy as np
+
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna
 
 SEED = 2025

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
+
 from qrlsuite.plugins.environments.beam6g import physics
 from qrlsuite.plugins.environments.beam6g.options import Options
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, FloatArray

@@ -25,6 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, FloatArray
 
 Rejection = Literal["tolerant", "released"]

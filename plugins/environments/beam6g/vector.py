@@ -9,11 +9,11 @@ import gymnasium
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 from numpy.typing import NDArray
-from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables, reset_options
-from qrlsuite.plugins.environments.beam6g.options import Options, parse
 
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import StoreError
+from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables, reset_options
+from qrlsuite.plugins.environments.beam6g.options import Options, parse
 
 
 class BeamLanes(LaneEnv):
