@@ -126,6 +126,11 @@ def test_outcomes_in_words(cells: tuple[int, ...], outcome: Outcome, sentence: s
     assert result.count(Verdict.WIN) == cells.count(1)
 
 
+@pytest.mark.parametrize(("first", "second"), [(10, 4), (4, 10)])
+def test_one_entry_at_the_cap_is_a_tie_where_nothing_is_significant(first: int, second: int) -> None:
+    assert compare(learner(first), learner(second), CELL, signs_of(0)).verdicts == ((Verdict.TIE,),)
+
+
 def test_a_comparison_is_plain_values_for_json(wide: LearningCurves, narrow: LearningCurves) -> None:
     content = json.loads(json.dumps(compare(wide, narrow, SURFACE).as_dict()))
     assert content["deltas"] == DELTAS
