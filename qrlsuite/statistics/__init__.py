@@ -43,6 +43,7 @@ from qrlsuite.statistics.significance import (
     IntervalRule,
     Resampling,
     SignificanceRule,
+    paired_difference_rule,
 )
 
 __all__ = [
@@ -73,6 +74,7 @@ __all__ = [
     "compare",
     "false_winners",
     "outperformance",
+    "paired_difference_rule",
     "power",
     "printed",
     "rank",

@@ -291,10 +291,15 @@ class DifferenceRule:
         return signs
 
 
+def paired_difference_rule() -> DifferenceRule:
+    """Return `DifferenceRule(paired=True)`, as a factory that a registration can refer to by name."""
+    return DifferenceRule(paired=True)
+
+
 BUILT_IN_RULES: dict[str, Callable[[], SignificanceRule]] = {
     "intervals": IntervalRule,
     "difference": DifferenceRule,
-    "difference-paired": functools.partial(DifferenceRule, paired=True),
+    "difference-paired": paired_difference_rule,
 }
 """The built-in rules by name; each value is called without arguments."""
 
