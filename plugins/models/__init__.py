@@ -7,6 +7,12 @@ from collections.abc import Callable
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import ModelSpec
 
+CIRCUITS = {
+    "native": "in the suite's own batched simulator; the fast one",
+    "pennylane": "on any PennyLane device",
+    "qiskit": "on Qiskit primitives: exact, with shots, or with noise",
+}
+
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
@@ -21,3 +27,17 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             population="qrlsuite.plugins.models.mlp:population",
         )
     )
+    for backend, summary in CIRCUITS.items():
+        options = {"native": "NativeOptions", "pennylane": "PennyLaneOptions", "qiskit": "QiskitOptions"}[
+            backend
+        ]
+        register(
+            ModelSpec(
+                name=f"vqc-{backend}",
+                summary=f"Hybrid variational quantum circuit {summary}",
+                family="quantum",
+                options=f"qrlsuite.plugins.models.vqc:{options}",
+                build="qrlsuite.plugins.models.vqc:build",
+                population="qrlsuite.plugins.models.vqc:population",
+            )
+        )
