@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,7 +53,26 @@ def run(
         ),
     ] = False,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Processes, or array tasks; default: one per core, or 10 tasks."
+        ),
+    ] = None,
+    engine: Annotated[
+        str, typer.Option("--engine", help="Where the work is done (see `qrlsuite list engines`).")
+    ] = "local",
+    partition: Annotated[
+        str | None, typer.Option("--partition", help="For --engine slurm: the partition.")
+    ] = None,
+    time: Annotated[
+        str | None,
+        typer.Option(
+            "--time", help="For --engine slurm: the time limit, 90 (minutes), 2:00:00 or 1-12:00:00."
+        ),
+    ] = None,
+    engine_options: Annotated[
+        list[str] | None,
+        typer.Option("--engine-set", metavar="NAME=VALUE", help="A further option of the engine."),
     ] = None,
     device: Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda.")] = "cpu",
     runs: RunsOption = Path("runs"),
@@ -67,11 +85,13 @@ def run(
 
     Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
     """
+    import json
+
     from qrlsuite import entry as entries
     from qrlsuite import options
     from qrlsuite.claims import living
     from qrlsuite.cli.display import RunDisplay
-    from qrlsuite.engine import groups, local
+    from qrlsuite.engine import api, groups
     from qrlsuite.store import EntryStore
 
     words = [options.parse_setting(word) for word in settings or []]
@@ -81,26 +101,32 @@ def run(
     protocol = entry.task.file.protocol
     wanted = groups.parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
     last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))
-    count = workers or len(os.sched_getaffinity(0))
+    given = {setting.name: setting.value for setting in map(options.parse_setting, engine_options or [])}
+    place = api.create(engine, {"partition": partition, "time": time, **given})
+    count = place.workers(workers)
 
     store = EntryStore.create(runs, entry)
-    busy = {seed for claim in living(store) for seed in claim.seeds} & set(wanted)
+    busy = {seed for claim in living(store) for seed in claim.seeds} | place.queued(store)
+    busy &= set(wanted)
     missing = groups.plan(store, sorted(set(wanted) - busy), last, count)
     display = RunDisplay(entry, store, wanted, last, missing, count, quiet=json_output)
     display.begin(busy)
     if missing:
         try:
-            outcome = local.run_groups(store, missing, last, count, device, display.update)
+            outcome = place.run(api.Work(store, missing, last, count, device), display.update)
         except KeyboardInterrupt:
             display.interrupted()
             raise typer.Exit(130) from None
         finally:
             display.close()
-        local.raise_failures(outcome)
+        api.raise_failures(outcome)
+        for message in outcome.taken.values():
+            display.console.print(f"left out: {message}")
+        if outcome.submitted is not None:
+            typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
+            return
     summary = summarize(entry, store, wanted, last)
     if json_output:
-        import json
-
         typer.echo(json.dumps(summary))
     else:
         display.finished(summary)

@@ -8,12 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from qrlsuite import checkpoint
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.run import Progress
 from qrlsuite.store import EntryStore, write_atomically
+
+if TYPE_CHECKING:
+    from qrlsuite.run import Progress  # torch, which a supervisor can do without
 
 LARGEST_GROUP = 100
 

@@ -8,23 +8,21 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import IO, Any
+from typing import IO
 
-from qrlsuite.engine.groups import Group, ProgressFile, format_seeds
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.engine.api import Outcome, Show, Work, worker_command
+from qrlsuite.engine.groups import Group, ProgressFile
 from qrlsuite.store import EntryStore
 
 ATTEMPTS = 3
 """Deaths of a group's worker, without a finished epoch between them, after which it is given up."""
 
-Snapshot = dict[str, dict[str, Any]]
-"""Progress by group id."""
+IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
+"""Signals with which a cluster warns its jobs: they reach every process, and a worker is told by its supervisor."""
 
 
 @dataclass
@@ -37,127 +35,108 @@ class _Job:
     output: IO[bytes] | None = field(default=None, repr=False)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How the groups ended: `failed` maps group ids to messages."""
+class LocalEngine:
+    """Supervises worker processes on this machine."""
 
-    failed: dict[str, str]
+    def __init__(self, options: None = None) -> None:
+        self._running: list[_Job] = []
+
+    def workers(self, asked: int | None) -> int:
+        """Return the number asked for, else one per core that this process may use."""
+        return asked or len(os.sched_getaffinity(0))
+
+    def queued(self, store: EntryStore) -> set[int]:
+        """Return nothing: what waits for a local process waits in that process."""
+        return set()
+
+    def run(self, work: Work, show: Show) -> Outcome:
+        """Train groups in worker processes until all have finished or failed.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, when every worker has saved and ended.
+        """
+        jobs = [_Job(group, ProgressFile(work.store, group.id)) for group in work.groups]
+        waiting = deque(jobs)
+        outcome = Outcome()
+        for job in jobs:
+            job.progress.clear()
+        try:
+            while waiting or self._running:
+                while waiting and len(self._running) < work.workers:
+                    job = waiting.popleft()
+                    self._running.append(job)
+                    _start(job, work)
+                time.sleep(0.2)
+                for job in list(self._running):
+                    code = job.process.poll() if job.process else None
+                    if code is None:
+                        continue
+                    self._running.remove(job)
+                    if _ended(job, code, outcome):
+                        waiting.append(job)
+                show({job.group.id: job.progress.read() for job in jobs})
+        except BaseException:
+            self.stop()
+            raise
+        return outcome
+
+    def stop(self, patience: float = 60.0) -> None:
+        """Ask every worker to save and end; after `patience` seconds, end them."""
+        processes = [job.process for job in self._running if job.process is not None]
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + patience
+        for process in processes:
+            try:
+                process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
-def run_groups(
-    store: EntryStore,
-    groups: Sequence[Group],
-    epochs: int,
-    workers: int,
-    device: str,
-    show: Callable[[Snapshot], None],
-) -> Outcome:
-    """Train groups in worker processes until all have finished or failed.
-
-    Parameters
-    ----------
-    show:
-        Called several times a second with every group's progress.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C, when every worker has saved and ended.
-    """
-    jobs = [_Job(group, ProgressFile(store, group.id)) for group in groups]
-    waiting = deque(jobs)
-    running: list[_Job] = []
-    failed: dict[str, str] = {}
-    for job in jobs:
-        job.progress.clear()
-    try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                job = waiting.popleft()
-                _start(job, store, epochs, device)
-                running.append(job)
-            time.sleep(0.2)
-            for job in list(running):
-                code = job.process.poll() if job.process else None
-                if code is None:
-                    continue
-                running.remove(job)
-                message = _ended(job, code)
-                if message is None:
-                    continue
-                if message == "":
-                    waiting.append(job)
-                else:
-                    failed[job.group.id] = message
-            show({job.group.id: job.progress.read() for job in jobs})
-    except BaseException:
-        _stop(running)
-        raise
-    return Outcome(failed)
-
-
-def _start(job: _Job, store: EntryStore, epochs: int, device: str) -> None:
-    command = [sys.executable, "-m", "qrlsuite.engine.worker", str(store.path)]
-    command += ["--seeds", format_seeds(job.group.seeds), "--epochs", str(epochs), "--device", device]
-    command += ["--follow-parent"]
+def _start(job: _Job, work: Work) -> None:
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     job.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the worker has ended
     # a session of its own: Ctrl-C reaches the workers once, from here
     job.process = subprocess.Popen(
-        command,
+        [*worker_command(work, job.group), "--follow-parent", str(os.getpid())],
         env={**os.environ, **threads},
         stdin=subprocess.DEVNULL,
         stdout=job.output,
         stderr=job.output,
         start_new_session=True,
+        preexec_fn=_ignore_warnings,  # this process has one thread
     )
 
 
-def _ended(job: _Job, code: int) -> str | None:
-    """Judge an ended worker: None finished, empty text to try again, else the message of its failure."""
+def _ignore_warnings() -> None:
+    for number in IGNORED:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _ended(job: _Job, code: int, outcome: Outcome) -> bool:
+    """Judge an ended worker; returns whether to try again, else enters what became of it in the outcome."""
     text = ""
     if job.output is not None:
         job.output.seek(0)
         text = job.output.read().decode(errors="replace").strip()
         job.output.close()
     if code == 0:
-        return None
+        return False
     progress = job.progress.read()
     if code in (2, 3):
-        return str(progress.get("error") or text or "failed").removeprefix("qrlsuite: ")
-    epoch = int(progress.get("epoch", 0))
+        message = str(progress.get("error") or text or "failed").removeprefix("qrlsuite: ")
+        (outcome.failed if code == 2 else outcome.taken)[job.group.id] = message
+        return False
+    epoch = int(progress.get("epoch") or 0)
     job.deaths = 1 if epoch > job.epoch_at_death else job.deaths + 1
     job.epoch_at_death = epoch
     if job.deaths < ATTEMPTS:
-        return ""
+        return True
     reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
     last = f": {text.splitlines()[-1]}" if text else ""
-    return f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
-
-
-def _stop(running: Sequence[_Job], patience: float = 60.0) -> None:
-    """Ask every worker to save and end; after `patience` seconds, end them."""
-    processes = [job.process for job in running if job.process is not None]
-    for process in processes:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-    deadline = time.monotonic() + patience
-    for process in processes:
-        try:
-            process.wait(max(0.1, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def raise_failures(outcome: Outcome) -> None:
-    """Turn failed groups into one error.
-
-    Raises
-    ------
-    QrlSuiteError
-        Naming every group that failed and why.
-    """
-    if outcome.failed:
-        lines = [f"group {name}: {message}" for name, message in sorted(outcome.failed.items())]
-        raise QrlSuiteError(f"{len(lines)} group(s) failed, finished epochs are kept: " + "; ".join(lines))
+    outcome.failed[job.group.id] = f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
+    return False

@@ -1,13 +1,17 @@
 """The process that trains one group: `python -m qrlsuite.engine.worker FOLDER --seeds 0:50 --epochs 100`.
 
-Every engine starts this. It claims its seeds, trains them, and leaves everything in the entry's folder. Exit
-codes: 0 finished, 2 wrong input or a failing environment (the message is in `progress.json`), 3 the seeds
-belong to another worker, 130 interrupted with everything saved.
+Every engine starts this. It claims its seeds, trains those that have not finished, and leaves everything in the
+entry's folder: to start it again is never wrong. Exit codes: 0 finished, 2 wrong input or a failing environment
+(the message is in `progress.json`), 3 the seeds belong to another worker, 130 interrupted with everything saved.
+
+The environment variable `QRLSUITE_CHECKPOINT_SECONDS` replaces the minute between two checkpoints.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
 import os
 import signal
 import sys
@@ -15,22 +19,22 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from qrlsuite.claims import Claim, SeedsClaimedError, acquire
-from qrlsuite.engine.groups import ProgressFile, parse_seeds
-from qrlsuite.errors import QrlSuiteError
-from qrlsuite.run import GroupRun, Progress
+from qrlsuite.checkpoint import group_id
+from qrlsuite.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
+from qrlsuite.engine.groups import ProgressFile, parse_seeds, plan
+from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.store import EntryStore
 
-HEARTBEAT = 5.0
+_PR_SET_PDEATHSIG = 1
 
 
 class Heart(threading.Thread):
-    """Refreshes the claim; interrupts this process when the claim or the parent process is lost."""
+    """Refreshes the claim; interrupts this process when the claim or the parent process `parent` is lost."""
 
-    def __init__(self, claim: Claim, follow_parent: bool) -> None:
+    def __init__(self, claim: Claim, parent: int | None) -> None:
         super().__init__(daemon=True)
         self.claim = claim
-        self.parent = os.getppid() if follow_parent else None
+        self.parent = parent
         self.stopped = threading.Event()
 
     def run(self) -> None:
@@ -43,9 +47,17 @@ class Heart(threading.Thread):
 
 
 def train_group(
-    folder: Path, seeds: Sequence[int], epochs: int, device: str = "cpu", follow_parent: bool = False
+    folder: Path, seeds: Sequence[int], epochs: int, device: str = "cpu", parent: int | None = None
 ) -> None:
-    """Claim and train a group in this process.
+    """Claim seeds and train those of them that have not finished, in this process.
+
+    Usually they are at the same epoch and make one group; those that another worker trained meanwhile are trained
+    apart.
+
+    Parameters
+    ----------
+    parent:
+        The process without which this one shall not go on.
 
     Raises
     ------
@@ -56,24 +68,60 @@ def train_group(
     KeyboardInterrupt
         After an interruption, with everything saved.
     """
-    store = EntryStore(folder)
-    from qrlsuite.checkpoint import group_id
+    from qrlsuite.run import GroupRun, Progress
 
+    store = EntryStore(folder)
     progress = ProgressFile(store, group_id(seeds))
     claim = acquire(store, seeds)
-    heart = Heart(claim, follow_parent)
+    heart = Heart(claim, parent)
     heart.start()
-    run = None
+    state = Progress(epochs=epochs)
     try:
-        run = GroupRun(store.entry(), store, seeds, epochs, device, progress.write)
-        run.run()
-        progress.write(run.progress, force=True)
+        entry = store.entry()
+        for group in plan(store, seeds, epochs, workers=1):
+            run = GroupRun(entry, store, group.seeds, epochs, device, progress.write)
+            state = run.progress
+            run.run()
+        state.phase, state.epoch = "finished", epochs
+        progress.write(state, force=True)
     except QrlSuiteError as error:
-        progress.write(run.progress if run else Progress(epochs=epochs), error=str(error), force=True)
+        with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
+            progress.write(state, error=str(error), force=True)
         raise
     finally:
         heart.stopped.set()
         claim.release()
+
+
+def _end_with(parent: int) -> bool:
+    """Have SIGTERM sent to this process when its parent ends; returns False where it has ended already."""
+    with contextlib.suppress(
+        OSError, AttributeError
+    ):  # elsewhere than on Linux, the heart looks now and then
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    return os.getppid() == parent
+
+
+def _checkpoint_seconds() -> None:
+    """Set the time between checkpoints from the environment.
+
+    Raises
+    ------
+    StoreError
+        If it is not a number of seconds.
+    """
+    from qrlsuite import run
+
+    text = os.environ.get("QRLSUITE_CHECKPOINT_SECONDS")
+    if text is None:
+        return
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not seconds >= 0:
+        raise StoreError(f"QRLSUITE_CHECKPOINT_SECONDS={text} is not a number of seconds")
+    run.CHECKPOINT_SECONDS = seconds
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,10 +132,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--epochs", type=int, required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument(
-        "--follow-parent", action="store_true", help="stop, saving, when the parent process ends"
+        "--follow-parent", type=int, metavar="PID", help="stop, saving, when this parent process ends"
     )
     given = parser.parse_args(arguments)
+    if given.follow_parent is not None and not _end_with(given.follow_parent):
+        return 130
     try:
+        _checkpoint_seconds()
         train_group(given.folder, parse_seeds(given.seeds), given.epochs, given.device, given.follow_parent)
     except SeedsClaimedError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)

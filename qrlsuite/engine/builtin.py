@@ -1,0 +1,29 @@
+"""The engines of the suite itself; they enter by the same door as anyone's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from qrlsuite.hookspecs import hookimpl
+from qrlsuite.specs import EngineSpec
+
+
+@hookimpl
+def register_engines(register: Callable[[EngineSpec], None]) -> None:
+    """Register `local` and `slurm`."""
+    register(
+        EngineSpec(
+            name="local",
+            summary="Processes on this machine, one per core, restarted when they die",
+            factory="qrlsuite.engine.local:LocalEngine",
+        )
+    )
+    register(
+        EngineSpec(
+            name="slurm",
+            summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite status`",
+            factory="qrlsuite.engine.slurm:SlurmEngine",
+            options="qrlsuite.engine.slurm:Options",
+            extras={"submitit": "pip install 'qrlsuite[slurm]'"},
+        )
+    )

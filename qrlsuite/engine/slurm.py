@@ -1,0 +1,272 @@
+"""SLURM: every group a task of a job array. Submit and leave; the entry's folder says how far it is.
+
+A task supervises one worker just as `local` does. Some time before its limit SLURM warns it; it then has the worker
+save and end, and puts itself back into the queue, where it continues from the checkpoint. The same happens when the
+cluster takes the node away. A task that was canceled or killed is submitted again by the same `qrlsuite run`.
+
+The folder `<entry>/slurm/` holds submitit's own files and logs, and `submitted.json`, which says which job waits
+with which seeds. The results folder must be one that every node sees.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import pydantic
+from pydantic.dataclasses import dataclass
+
+from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.groups import Group
+from qrlsuite.engine.local import LocalEngine
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.store import EntryStore, read_json, write_json
+
+TASKS = 10
+"""Array tasks, where no number of workers was asked for."""
+
+REQUEUES = 1000
+"""How often a task may reach its time limit."""
+
+_TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
+
+
+def minutes(text: Any) -> int:
+    """Read a time limit as SLURM writes it: minutes, `mm:ss`, `hh:mm:ss`, `d-hh`, `d-hh:mm`, `d-hh:mm:ss`.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these, or less than a minute.
+    """
+    match = _TIME.fullmatch(str(text).strip())
+    if match is None:
+        raise ValueError("write minutes (90), hh:mm:ss (2:00:00) or d-hh:mm:ss (1-12:00:00)")
+    days, *rest = match.groups()
+    numbers = [int(number) for number in rest if number is not None]
+    units = (3600, 60, 1) if days is not None or len(numbers) == 3 else (60, 1, 0)
+    seconds = int(days or 0) * 86400 + sum(n * unit for n, unit in zip(numbers, units))
+    if seconds < 60:
+        raise ValueError("a task needs at least one minute")
+    return -(-seconds // 60)
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class Options:
+    """Options of the engine `slurm`.
+
+    Attributes
+    ----------
+    partition, account, qos, constraint:
+        As for `sbatch`; None leaves the cluster's default.
+    time:
+        Time limit of a task in minutes. Tasks that need longer go back into the queue.
+    memory:
+        Memory of a task in GB; None leaves the cluster's default.
+    grace:
+        Seconds before the time limit at which a task saves and goes back into the queue.
+    setup:
+        Shell lines before the task, such as `module load`.
+    """
+
+    partition: str | None = None
+    time: Annotated[int, pydantic.BeforeValidator(minutes)] = 240
+    memory: Annotated[float, pydantic.Field(gt=0)] | None = None
+    account: str | None = None
+    qos: str | None = None
+    constraint: str | None = None
+    grace: Annotated[int, pydantic.Field(ge=10)] = 120
+    setup: tuple[str, ...] = ()
+
+
+class Task:
+    """What a task of the array does; submitit pickles it for its own job, by reference to this class."""
+
+    def __init__(self, folder: str, seeds: tuple[int, ...], epochs: int, device: str) -> None:
+        self.folder, self.seeds, self.epochs, self.device = folder, seeds, epochs, device
+        self._engine: LocalEngine | None = None
+
+    def __call__(self) -> None:
+        """Supervise the group's worker until it has finished.
+
+        Raises
+        ------
+        QrlSuiteError
+            If it failed; SLURM then shows the task as failed, and its log has the message.
+        """
+        from qrlsuite.engine.api import raise_failures
+
+        signal.signal(signal.SIGTERM, _canceled)
+        self._engine = LocalEngine()
+        group = Group(self.seeds, 0)
+        work = Work(EntryStore(Path(self.folder)), [group], self.epochs, 1, self.device)
+        outcome = self._engine.run(work, lambda snapshot: None)
+        raise_failures(outcome)
+        for message in outcome.taken.values():
+            print(f"left out: {message}")
+
+    def checkpoint(self) -> Any:
+        """Have the worker save and end; returns the task for submitit to put back into the queue."""
+        import submitit
+
+        if self._engine is not None:
+            self._engine.stop()
+        return submitit.helpers.DelayedSubmission(Task(self.folder, self.seeds, self.epochs, self.device))
+
+
+def _canceled(number: int, frame: FrameType | None) -> None:
+    """End the supervision on `scancel`: the worker, which SLURM told too, saves and is waited for."""
+    raise KeyboardInterrupt
+
+
+class SlurmEngine:
+    """Submits job arrays."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+
+    def workers(self, asked: int | None) -> int:
+        """Return the number of array tasks asked for, else `TASKS`."""
+        return asked or TASKS
+
+    def queued(self, store: EntryStore) -> set[int]:
+        """Return the seeds whose tasks SLURM still knows as waiting or running.
+
+        Raises
+        ------
+        QrlSuiteError
+            If there are submitted tasks and `squeue` does not answer.
+        """
+        tasks = submitted(store)
+        if not tasks:
+            return set()
+        waiting = _waiting()
+        return {seed for task in tasks if task["job"] in waiting for seed in task["seeds"]}
+
+    def run(self, work: Work, show: Show) -> Outcome:
+        """Submit the groups as one job array and return.
+
+        Raises
+        ------
+        QrlSuiteError
+            If there is no SLURM here, or it refuses the job; the message has SLURM's own.
+        """
+        import submitit
+
+        folder = work.store.path.absolute() / "slurm"
+        options = self.options
+        parameters = {
+            "partition": options.partition,
+            "time": options.time,
+            "mem": None if options.memory is None else f"{round(options.memory * 1024)}MB",
+            "account": options.account,
+            "qos": options.qos,
+            "constraint": options.constraint,
+            "setup": list(options.setup) or None,
+            "signal_delay_s": min(options.grace, options.time * 30),
+            "array_parallelism": work.workers,
+            "cpus_per_task": 1,
+            "job_name": f"qrlsuite-{work.store.path.name}",
+            "additional_parameters": {"requeue": True},
+        }
+        tasks = [
+            Task(str(work.store.path.absolute()), g.seeds, work.epochs, work.device) for g in work.groups
+        ]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)
+            executor.update_parameters(**{k: v for k, v in parameters.items() if v is not None})
+            with executor.batch():
+                jobs = [executor.submit(task) for task in tasks]
+        except OSError as error:
+            raise StoreError(f"cannot write {folder}: {error.strerror or error}") from None
+        except submitit.core.utils.FailedJobError as error:
+            raise QrlSuiteError(f"SLURM refused the job: {_last_line(str(error))}") from None
+        except RuntimeError as error:
+            raise QrlSuiteError(
+                f"there is no SLURM on this machine ({error}); --engine local needs none"
+            ) from None
+        ids = [str(job.job_id) for job in jobs]
+        _remember(work.store, ids, work.groups, work.epochs)
+        array = ids[0].partition("_")[0]
+        plural = "s" * (len(ids) > 1)
+        return Outcome(
+            submitted=f"submitted {len(ids)} task{plural} as SLURM job {array}; `qrlsuite status` shows how far they "
+            f"are, `scancel {array}` stops them with everything saved, the same command submits what is missing then"
+        )
+
+
+def submitted(store: EntryStore) -> list[dict[str, Any]]:
+    """Return the tasks that were submitted and remembered: `job` (SLURM's id), `seeds`, `epochs`.
+
+    Raises
+    ------
+    StoreError
+        If `submitted.json` is damaged.
+    """
+    path = store.path / "slurm" / "submitted.json"
+    if not path.exists():
+        return []
+    tasks = read_json(path).get("tasks")
+    if not isinstance(tasks, list) or not all(_is_task(task) for task in tasks):
+        raise StoreError(f"{path} is damaged: delete it; seeds that still wait may then be submitted twice")
+    return tasks
+
+
+def _is_task(task: Any) -> bool:
+    return (
+        isinstance(task, dict)
+        and isinstance(task.get("job"), str)
+        and isinstance(task.get("seeds"), list)
+        and all(isinstance(seed, int) for seed in task["seeds"])
+    )
+
+
+def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[Group], epochs: int) -> None:
+    """Add tasks to `submitted.json`, and forget those that SLURM no longer knows."""
+    try:
+        waiting = _waiting()
+    except QrlSuiteError:
+        waiting = None
+    old = [task for task in submitted(store) if waiting is None or task["job"] in waiting]
+    new = [
+        {"job": job, "seeds": list(g.seeds), "epochs": epochs, "time": int(time.time())}
+        for job, g in zip(ids, groups)
+    ]
+    write_json(store.path / "slurm" / "submitted.json", {"tasks": old + new})
+
+
+def _waiting() -> set[str]:
+    """Return the ids of this user's jobs that wait or run, array tasks as `123_4`.
+
+    Raises
+    ------
+    QrlSuiteError
+        If `squeue` is missing or does not answer.
+    """
+    user = os.environ.get("USER") or getpass.getuser()
+    command = ["squeue", "--noheader", "--array", "--user", user, "--format", "%i"]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    except FileNotFoundError:
+        raise QrlSuiteError(
+            "there is no SLURM on this machine (squeue is not found); --engine local needs none"
+        ) from None
+    except subprocess.CalledProcessError as error:
+        raise QrlSuiteError(f"squeue does not answer: {_last_line(error.stderr)}") from None
+    except (OSError, subprocess.SubprocessError) as error:
+        raise QrlSuiteError(f"squeue does not answer: {error}") from None
+    return set(result.stdout.split())
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "no message"
