@@ -20,6 +20,7 @@ from qrlsuite.statistics import (
     Grid,
     IntervalRule,
     LearningCurves,
+    Resampling,
     SmoothedRuns,
     board_false_winners,
     bootstrap_interval,
@@ -110,6 +111,14 @@ def main() -> None:
             for rule in RULES:
                 rate = board_false_winners(model, [100] * size, grid, rule, arguments.boards)
                 print(f"| {entry.name} | {size} entries of 100 runs | {rule.name} | {rate:.1%} |", flush=True)
+
+    print(
+        "\nten entries of 100 runs, rule difference with alpha = .05 / 45 pairs, 10,000 resamples, 40 boards:"
+    )
+    for entry in entries:
+        model, strict = SmoothedRuns(entry, arguments.jitter), DifferenceRule(alpha=0.05 / 45)
+        rate = board_false_winners(model, [100] * 10, grid, strict, 40, resampling=Resampling(10_000))
+        print(f"{entry.name}: {rate:.1%}", flush=True)
 
     print("\n| network | slower by | runs | rule | found |\n|---|---|---|---|---|")
     for entry in entries:
