@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import pennylane as qml
 import torch
-from qrlsuite.plugins.circuits.options import PennyLaneOptions as Options
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -28,6 +27,7 @@ from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit, Operation
 from qrlsuite.circuit.shifts import shifted_angles, vector_jacobian
 from qrlsuite.errors import OptionError, nearest
+from qrlsuite.plugins.circuits.options import PennyLaneOptions as Options
 
 BROADCASTING = "default.qubit"
 """The device that simulates the broadcast axis in one pass, and through which torch can differentiate.
@@ -95,10 +95,10 @@ class PennyLaneBackend:
         S, B = angles.shape[1:]
         if self.shots is not None:
             entropy = [None] * S if seeds is None else seeds
-            results = [self._sampled(angles[:, s], seed, B) for s, seed in enumerate(entropy)]
+            results = [self._shifted(angles[:, s], _entropy(seed), B) for s, seed in enumerate(entropy)]
             return torch.stack(results)
         if self.diff_method == "parameter-shift":
-            return torch.stack([_Shift.apply(angles[:, s], self, None, B) for s in range(S)])
+            return torch.stack([self._shifted(angles[:, s], None, B) for s in range(S)])
         step = self._seeds_per_pass(S, B, angles.requires_grad)
         if step >= S:
             return self._pass(angles)
@@ -134,21 +134,22 @@ class PennyLaneBackend:
         """Return (S, B, observables) from angles (A, S, B) in one execution."""
         count, S, B = angles.shape
         if self.diff_method == "adjoint":
-            lanes: Tensor = _DeviceGradient.apply(angles.reshape(count, S * B), self, S * B)
+            flat = angles.reshape(count, S * B)
+            lanes: Tensor = _DeviceGradient.apply(flat, self, S * B)  # type: ignore[no-untyped-call]
             return lanes.reshape(S, B, -1)
         padded = torch.nn.functional.pad(angles, (0, -B % LANES))
         width = padded.shape[2]
         return self.execute(padded.reshape(count, S * width), S * width).reshape(S, width, -1)[:, :B]
 
-    def _sampled(self, angles: Tensor, seed: int | None, lanes: int) -> Tensor:
-        """Return one seed's sampled values (B, observables) from its angles (A, B)."""
-        result: Tensor = _Shift.apply(angles, self, _entropy(seed), lanes)
+    def _shifted(self, angles: Tensor, seed: int | None, lanes: int) -> Tensor:
+        """Return one seed's values (B, observables) from its angles (A, B), differentiated by shifts."""
+        result: Tensor = _Shift.apply(angles, self, seed, lanes)  # type: ignore[no-untyped-call]
         return result
 
     def _seeds_per_pass(self, S: int, B: int, differentiated: bool) -> int:
         """Return how many seeds one execution takes, so that its states fit in memory."""
         states = 2 * len(self.circuit) if differentiated and self.diff_method == "backprop" else 4
-        return max(1, MEMORY // (states * B * 16 * 2**self.circuit.qubits))
+        return max(1, MEMORY // (states * B * 16 * (1 << self.circuit.qubits)))
 
     def _build(self, device: Any) -> Any:
         """Return the QNode of the circuit on a device."""
@@ -209,8 +210,9 @@ class _DeviceGradient(torch.autograd.Function):
     def forward(ctx: Any, angles: Tensor, backend: PennyLaneBackend, lanes: int) -> Tensor:
         ctx.angles = angles.detach().requires_grad_(angles.requires_grad)
         with torch.set_grad_enabled(angles.requires_grad):
-            ctx.values = backend.execute(ctx.angles, lanes)
-        return ctx.values.detach()
+            values = backend.execute(ctx.angles, lanes)
+        ctx.values = values
+        return values.detach()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:

@@ -19,15 +19,16 @@ import numpy as np
 import torch
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from qrlsuite.plugins.circuits.options import PennyLaneOptions as PennyLaneBackendOptions
-from qrlsuite.plugins.circuits.options import QiskitOptions as QiskitBackendOptions
-from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
+from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError
 from qrlsuite.options import field_names
+from qrlsuite.plugins.circuits.options import PennyLaneOptions as PennyLaneBackendOptions
+from qrlsuite.plugins.circuits.options import QiskitOptions as QiskitBackendOptions
+from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
 Activation = Literal["none", "relu", "tanh"]
@@ -178,7 +179,7 @@ class _Hybrid(nn.Module):
         executions, inputs = runner.executions, x.shape[1]
         executions.forward += inputs
         if values.requires_grad:
-            values.register_hook(lambda grad: executions._backward(inputs))
+            values.register_hook(lambda grad: executions._backward(inputs))  # type: ignore[no-untyped-call]
         values = ACTIVATIONS[options.activation_out](values)
         return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
 
@@ -243,17 +244,6 @@ def build_circuit(options: VQCOptions) -> Circuit:
     elif options.gate != "rot":
         raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")
     return ansatz(options.ansatz, options.qubits, options.layers, **given)
-
-
-def shift_evaluations(circuit: Circuit) -> int:
-    """Return how many circuit executions the parameter-shift rule takes for the gradient at one input."""
-    variable = [
-        4 if operation.control is not None else 2
-        for operation in circuit
-        for angle in operation.angles
-        if angle.input is not None or angle.weight is not None
-    ]
-    return sum(variable)
 
 
 def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Generator) -> VQC:

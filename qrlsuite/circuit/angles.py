@@ -67,15 +67,6 @@ class AngleTable:
         self._constant = torch.tensor(constant, dtype=torch.float64)
         self._has_constant = any(constant)
 
-    @property
-    def shift_evaluations(self) -> int:
-        """Circuit evaluations that the parameter-shift rule needs for the gradient at one input.
-
-        Two per angle of an uncontrolled rotation, four per angle of a controlled one (Wierichs et al. 2022,
-        Quantum 6, 677); none for constants.
-        """
-        return sum(4 if controlled else 2 for controlled in self.controlled)
-
     def __call__(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the angles in radians, (A, S, B), from inputs (S, B, in) and parameters (S, *shape).
 

@@ -27,11 +27,11 @@ FOUR_TERM = (
 
 
 class ShiftPlan(NamedTuple):
-    """Of every evaluation, in order: the angle that is shifted (K,) and its coefficient (K,)."""
+    """Of every evaluation, in order: the angle that is shifted (K,) and its coefficient (K,); and A angles in all."""
 
     angle: Tensor
     coefficient: Tensor
-    count: int
+    angles: int
 
 
 def shifted_angles(angles: Tensor, controlled: Sequence[bool]) -> tuple[Tensor, ShiftPlan]:
@@ -64,4 +64,4 @@ def vector_jacobian(values: Tensor, grad: Tensor, plan: ShiftPlan) -> Tensor:
     """Combine evaluations (K * B, O) and a cotangent (B, O) to the gradient of the angles (A, B)."""
     lanes = grad.shape[0]
     weighted = (values.reshape(-1, lanes, grad.shape[1]) * grad).sum(2) * plan.coefficient[:, None]
-    return torch.zeros(plan.count, lanes, dtype=values.dtype).index_add_(0, plan.angle, weighted)
+    return torch.zeros(plan.angles, lanes, dtype=values.dtype).index_add_(0, plan.angle, weighted)

@@ -1,0 +1,84 @@
+"""What circuits take: gates, depths, and executions for gradients on hardware."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from qrlsuite.circuit.description import Circuit, Operation
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a circuit takes, in the gates of its definition.
+
+    Attributes
+    ----------
+    qubits, inputs, parameters:
+        Numbers of qubits, input features and trainable scalars.
+    gates:
+        Number of gates by name; a controlled one has a `C` in front (`CRot`).
+    two_qubit_gates:
+        Number of gates on two qubits.
+    two_qubit_depth:
+        Two-qubit gates on the longest path through the circuit: gates on disjoint qubits count as one step.
+    depth:
+        Gates on the longest path through the circuit.
+    shift_evaluations:
+        Circuit executions that the parameter-shift rule takes for the gradient at one input: two for every
+        variable angle of an uncontrolled rotation, four for one of a controlled rotation.
+    """
+
+    qubits: int
+    inputs: int
+    parameters: int
+    gates: dict[str, int]
+    two_qubit_gates: int
+    two_qubit_depth: int
+    depth: int
+    shift_evaluations: int
+
+
+def resources(circuit: Circuit) -> Resources:
+    """Count what a circuit takes."""
+    operations = circuit.operations
+    return Resources(
+        qubits=circuit.qubits,
+        inputs=circuit.inputs,
+        parameters=circuit.parameter_count,
+        gates=dict(Counter(gate_name(operation) for operation in operations)),
+        two_qubit_gates=sum(len(operation.qubits) == 2 for operation in operations),
+        two_qubit_depth=_depth(circuit, weight=lambda operation: len(operation.qubits) == 2),
+        depth=_depth(circuit, weight=lambda operation: True),
+        shift_evaluations=shift_evaluations(circuit),
+    )
+
+
+def shift_evaluations(circuit: Circuit) -> int:
+    """Return how many circuit executions the parameter-shift rule takes for the gradient at one input.
+
+    Two per variable angle of an uncontrolled rotation, four of a controlled one (Wierichs et al. 2022, Quantum 6,
+    677), none for constants.
+    """
+    return sum(
+        4 if operation.control is not None else 2
+        for operation in circuit
+        for angle in operation.angles
+        if angle.input is not None or angle.weight is not None
+    )
+
+
+def gate_name(operation: Operation) -> str:
+    """Return the name of a gate, with a `C` in front where it has an extra control."""
+    return operation.gate if operation.control is None else f"C{operation.gate}"
+
+
+def _depth(circuit: Circuit, weight: Callable[[Operation], bool]) -> int:
+    """Return the largest sum of weights along a path through the circuit."""
+    reached = [0] * circuit.qubits
+    for operation in circuit:
+        level = max(reached[q] for q in operation.qubits) + int(weight(operation))
+        for q in operation.qubits:
+            reached[q] = level
+    return max(reached)
