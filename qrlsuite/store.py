@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.entry import Entry, from_record
 from qrlsuite.errors import StoreError
+from qrlsuite.task import TaskFile
 
 FORMAT_VERSION = 1
 _SEED_FOLDER = re.compile(r"seed-(\d{4,})")
@@ -79,7 +80,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):
         raise StoreError(f"{path} does not hold a JSON object")
@@ -121,7 +122,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     for number, piece in enumerate(pieces[:-1], start=1):  # what follows the last newline is torn, or empty
         try:
             record = json.loads(piece)
-        except ValueError:
+        except (ValueError, RecursionError):
             raise StoreError(
                 f"{path}, line {number}: not JSON; restore the file or delete the seed's folder"
             ) from None
@@ -177,9 +178,29 @@ class SeedStore:
         self.timings = path / "timings.jsonl"
 
     def record(self) -> dict[str, Any] | None:
-        """Return `run.json`, or None where the run never began."""
+        """Return `run.json`, or None where the run never began.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged.
+        """
         path = self.path / "run.json"
-        return read_json(path) if path.exists() else None
+        if not path.exists():
+            return None
+        record = read_json(path)
+        epochs, parameters = record.get("epochs"), record.get("parameters", {})
+        made_with = record.get("provenance", [])
+        if not (
+            record.get("status") in ("running", "finished")
+            and _is_count(epochs)
+            and isinstance(parameters, dict)
+            and all(_is_count(count) for count in parameters.values())
+            and isinstance(made_with, list)
+            and all(isinstance(origin, dict) for origin in made_with)
+        ):
+            raise StoreError(f"{path} is not a run's record; restore the file or delete the seed's folder")
+        return record
 
     def write_record(self, content: Mapping[str, Any]) -> None:
         """Replace `run.json`."""
@@ -194,7 +215,7 @@ class SeedStore:
             If a file is damaged or an epoch is missing.
         """
         rows = read_table(self.table) if self.table.exists() else []
-        last = int(rows[-1]["epoch"]) if rows else 0
+        last = _epoch(rows[-1], self.table) if rows else 0
         rows += [line for line in read_lines(self.lines) if _epoch(line, self.lines) > last]
         for expected, row in enumerate(rows, start=1):
             if _epoch(row, self.path) != expected:
@@ -236,13 +257,18 @@ class SeedStore:
         """
         rows = self.epochs()
         try:
-            scores = np.array([row["scores"] for row in rows], dtype=np.float32)
-        except (KeyError, TypeError, ValueError):
+            with np.errstate(over="ignore"):
+                scores = np.array([row["scores"] for row in rows], dtype=np.float32)
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise StoreError(f"{self.path}: an epoch has no list of validation scores") from None
         if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):
             raise StoreError(f"{self.path}: validation scores must be finite and equally many in every epoch")
         record = self.record() or {}
         return SeedCurve(self.seed, scores.reshape(len(rows), -1), record.get("status") == "finished")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _epoch(row: Mapping[str, Any], path: Path) -> int:
@@ -313,6 +339,10 @@ def read_table(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
 class EntryStore:
     """The folder of one entry."""
 
@@ -341,11 +371,43 @@ class EntryStore:
         return store
 
     def record(self) -> dict[str, Any]:
-        """Return `entry.json`."""
-        return read_json(self.path / "entry.json")
+        """Return `entry.json`.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged.
+        """
+        path = self.path / "entry.json"
+        record = read_json(path)
+        identity = record.get("identity")
+        try:
+            if not isinstance(identity, dict):
+                raise ValueError("it has no identity")
+            named = {
+                **{name: record.get(name) for name in ("name", "hash", "label", "task_name", "task_hash")}
+            }
+            named |= {f"identity.{name}": identity.get(name) for name in ("algorithm", "model")}
+            for name, value in named.items():
+                if not isinstance(value, str):
+                    raise ValueError(f"{name} is not text")
+            TaskFile.model_validate(record.get("task_file"))
+        except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
+            raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None
+        return {"preset": None, **record}
 
     def entry(self) -> Entry:
-        """Build the entry that the folder belongs to."""
+        """Build the entry that the folder belongs to.
+
+        Raises
+        ------
+        StoreError
+            If its record is damaged, means something else by now, or it was imported.
+        """
+        if self.record().get("imported"):
+            raise StoreError(
+                f"{self.path} was imported from other files: it can be compared, not trained further"
+            )
         return from_record(self.record(), str(self.path / "entry.json"))
 
     def seed(self, seed: int) -> SeedStore:

@@ -15,7 +15,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
-    from qrlsuite.cli import compare, leaderboard, listing, plot, run, show
+    from qrlsuite.cli import compare, import_, leaderboard, listing, plot, run, runs, show, status
 
     app = typer.Typer(
         name="qrlsuite",
@@ -31,9 +31,12 @@ def build() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.command("run")(run.run)
+    app.command("status")(status.status)
+    app.command("runs")(runs.runs)
     app.command("leaderboard")(leaderboard.leaderboard)
     app.command("compare")(compare.compare)
     app.command("plot")(plot.plot)
+    app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
 

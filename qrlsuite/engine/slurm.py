@@ -24,11 +24,12 @@ from typing import Annotated, Any
 import pydantic
 from pydantic.dataclasses import dataclass
 
+from qrlsuite import survey
 from qrlsuite.engine.api import Outcome, Show, Work
 from qrlsuite.engine.groups import Group
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.store import EntryStore, read_json, write_json
+from qrlsuite.store import EntryStore, write_json
 
 TASKS = 10
 """Array tasks, where no number of workers was asked for."""
@@ -212,22 +213,11 @@ def submitted(store: EntryStore) -> list[dict[str, Any]]:
     StoreError
         If `submitted.json` is damaged.
     """
-    path = store.path / "slurm" / "submitted.json"
-    if not path.exists():
-        return []
-    tasks = read_json(path).get("tasks")
-    if not isinstance(tasks, list) or not all(_is_task(task) for task in tasks):
-        raise StoreError(f"{path} is damaged: delete it; seeds that still wait may then be submitted twice")
+    problems: list[str] = []
+    tasks = survey.waiting(store, problems)
+    if problems:
+        raise StoreError(problems[0])
     return tasks
-
-
-def _is_task(task: Any) -> bool:
-    return (
-        isinstance(task, dict)
-        and isinstance(task.get("job"), str)
-        and isinstance(task.get("seeds"), list)
-        and all(isinstance(seed, int) for seed in task["seeds"])
-    )
 
 
 def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[Group], epochs: int) -> None:

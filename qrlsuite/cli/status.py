@@ -1,0 +1,84 @@
+"""`qrlsuite status`: how far everything that has not finished is, wherever it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from qrlsuite.cli.app import JsonOption, RunsOption
+
+if TYPE_CHECKING:
+    from qrlsuite.survey import GroupStatus
+
+
+def status(
+    task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Show what is running, waiting and stopped, from any machine that sees the results folder.
+
+    Reads the results folder only: it asks no queue and disturbs no worker.
+
+    Example: qrlsuite status --task beam6g
+    """
+    import json
+
+    from qrlsuite.store import entries
+    from qrlsuite.survey import groups, look
+
+    shown: list[dict[str, Any]] = []
+    for store in entries(runs, task):
+        entry = look(store)
+        shown.append(
+            {
+                "task": entry.task,
+                "entry": entry.name,
+                "label": entry.label,
+                "seeds": dict(entry.seeds),
+                "problems": list(entry.problems),
+                "groups": [_plain(group) for group in groups(store)],
+            }
+        )
+    if json_output:
+        typer.echo(json.dumps(shown))
+        return
+    for row in shown:
+        _print(row)
+    if not shown:
+        typer.echo(f"{runs} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
+
+
+def _plain(group: GroupStatus) -> dict[str, Any]:
+    return {
+        "seeds": list(group.seeds),
+        "state": group.state,
+        "where": group.where,
+        "seconds_left": group.seconds_left,
+        **{key: group.progress.get(key) for key in ("phase", "epoch", "epochs", "median_score", "error")},
+    }
+
+
+def _print(row: dict[str, Any]) -> None:
+    from qrlsuite.cli.display import duration
+    from qrlsuite.cli.runs import printable
+    from qrlsuite.engine.groups import format_seeds
+
+    seeds = ", ".join(f"{count} {status}" for status, count in row["seeds"].items()) or "none"
+    typer.echo(printable(f"{row['task']}  {row['label']}  ({row['entry']}): {seeds}"))
+    for problem in row["problems"]:
+        typer.echo(f"  damaged: {printable(problem)}")
+    for group in row["groups"]:
+        words = [f"  {group['state']:<9}"]
+        words += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
+        words += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
+        words += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
+        if isinstance(group["median_score"], int | float):
+            words.append(f"median score {group['median_score']:.3f}")
+        if group["seconds_left"] is not None and group["state"] == "running":
+            words.append(f"{duration(group['seconds_left'])} left")
+        words += [group["where"]] if group["state"] != "stopped" else ["continued by the same `qrlsuite run`"]
+        words += [str(group["error"])] if group["error"] else []
+        typer.echo(printable("  ".join(words)))
