@@ -5,10 +5,11 @@ reverse gradients refuse them and Aer 0.18 with run-time parameters gives wrong 
 rotation angle is an input parameter of the QNN, and a fixed linear map in torch leads from the circuit's angles
 to them; that is twice as fast as parameter expressions inside the circuit.
 
-`TorchConnector` hands values and gradients over in float32, so they are exact to about 1e-7 of their size in
-float64 too. Exact values and gradients do not depend on anything but their own sample. With shots every seed gets
-primitives of its own, seeded by it. The statevector primitive does not sample: it adds Gaussian noise of standard
-deviation 1/sqrt(shots), the most that sampling can have (qiskit.primitives.StatevectorEstimator); `aer` samples.
+`TorchConnector` hands values and gradients over in float32 whatever it is given (qiskit-machine-learning 0.9), so
+it serves float32 models; in float64 the same network is connected by a function of our own. Exact values and
+gradients depend on nothing but their own sample. With shots every seed gets primitives of its own, seeded by it.
+The statevector primitive does not sample: it adds Gaussian noise of standard deviation 1/sqrt(shots), the most that
+sampling can have (qiskit.primitives.StatevectorEstimator); `aer` samples.
 """
 
 from __future__ import annotations
@@ -160,26 +161,40 @@ class QiskitBackend:
         exact = {name: value.double() for name, value in parameters.items()}
         angles = self.table(inputs.double(), exact)
         if self.shots is None:
-            values = self._exact(self.rotations(angles.reshape(-1, S * B))).reshape(S, B, -1)
+            values = self._run(self._exact, self.rotations(angles.reshape(-1, S * B)), inputs.dtype)
+            values = values.reshape(S, B, -1)
         else:
             entropy: Sequence[int | None] = [None] * S if seeds is None else seeds
             values = torch.stack(
-                [self._network(seed)(self.rotations(angles[:, s])) for s, seed in enumerate(entropy)]
+                [
+                    self._run(self._network(seed), self.rotations(angles[:, s]), inputs.dtype)
+                    for s, seed in enumerate(entropy)
+                ]
             )
         result: Tensor = values.to(inputs.dtype)
         return result
 
+    @staticmethod
+    def _run(network: EstimatorQNN, rotations: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return expectation values (lanes, observables) from rotation angles (lanes, R)."""
+        values: Tensor
+        if dtype == torch.float32:
+            values = TorchConnector(network, initial_weights=np.zeros(0))(rotations)
+        else:
+            values = _Float64Connector.apply(rotations, network)  # type: ignore[no-untyped-call]
+        return values
+
     @functools.cached_property
-    def _exact(self) -> Any:
+    def _exact(self) -> EstimatorQNN:
         """The network without sampling; it has no state, so that one serves every call."""
         return self._network(None)
 
-    def _network(self, seed: int | None) -> Any:
-        """Return a `TorchConnector` whose primitives and gradient draw from one seed."""
+    def _network(self, seed: int | None) -> EstimatorQNN:
+        """Return a network whose primitives and gradient draw from one seed."""
         sequence = np.random.SeedSequence(seed)
         precision = 0.0 if self.shots is None else 1.0 / math.sqrt(self.shots)
         primitives = [self._estimator(precision, child) for child in sequence.spawn(2)]
-        network = EstimatorQNN(
+        return EstimatorQNN(
             circuit=self._circuit,
             estimator=primitives[0],
             observables=self.observables,
@@ -189,7 +204,6 @@ class QiskitBackend:
             input_gradients=True,
             default_precision=precision,
         )
-        return TorchConnector(network, initial_weights=np.zeros(0))
 
     def _estimator(self, precision: float, seed: np.random.SeedSequence) -> Any:
         """Return a V2 estimator primitive."""
@@ -214,6 +228,22 @@ class QiskitBackend:
         if self.gradient == "spsa":
             return SPSAEstimatorGradient(estimator, epsilon=0.01, seed=int(sequence.generate_state(1)[0]))
         return ParamShiftEstimatorGradient(estimator)
+
+
+class _Float64Connector(torch.autograd.Function):
+    """What `TorchConnector` does, in float64, for a network without weights."""
+
+    @staticmethod
+    def forward(ctx: Any, rotations: Tensor, network: EstimatorQNN) -> Tensor:
+        ctx.save_for_backward(rotations)
+        ctx.network = network
+        return torch.from_numpy(network.forward(rotations.detach().numpy(), []))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (rotations,) = ctx.saved_tensors
+        jacobian, _ = ctx.network.backward(rotations.numpy(), [])
+        return torch.einsum("bo,bor->br", grads[0], torch.from_numpy(jacobian)), None
 
 
 def _gradient(options: Options) -> str:

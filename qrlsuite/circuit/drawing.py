@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Resources", "angle_text", "draw_figure", "draw_text", "gate_name", "resources"]
 
+# The drawer writes into the options that it is given, hence a copy for each call.
 INK = {"color": "black"}
 BOX = {"facecolor": "white", "edgecolor": "black"}
 
@@ -59,20 +60,22 @@ def draw_figure(circuit: Circuit) -> Figure:
     figure = Figure()
     FigureCanvasAgg(figure)  # the drawer measures its texts with the canvas's renderer
     drawer = MPLDrawer(
-        max(columns, default=0) + 1, {q: q for q in range(circuit.qubits)}, fig=figure, wire_options=INK
+        max(columns, default=0) + 1, {q: q for q in range(circuit.qubits)}, fig=figure, wire_options=dict(INK)
     )
     drawer.label([f"q{q}" for q in range(circuit.qubits)])
     for column, operation in zip(columns, circuit):
         if operation.gate == "CNOT":
-            drawer.CNOT(column, operation.wires, options=INK)
+            drawer.CNOT(column, operation.wires, options=dict(INK))
         elif operation.gate == "CZ":
-            drawer.ctrl(column, list(operation.wires), options=INK)
+            drawer.ctrl(column, list(operation.wires), options=dict(INK))
         elif operation.gate == "SWAP":
-            drawer.SWAP(column, operation.wires, options=INK)
+            drawer.SWAP(column, operation.wires, options=dict(INK))
         else:
             if operation.control is not None:
-                drawer.ctrl(column, [operation.control], wires_target=list(operation.wires), options=INK)
-            drawer.box_gate(column, list(operation.wires), text=operation.gate, box_options=BOX)
+                drawer.ctrl(
+                    column, [operation.control], wires_target=list(operation.wires), options=dict(INK)
+                )
+            drawer.box_gate(column, list(operation.wires), text=operation.gate, box_options=dict(BOX))
     return figure
 
 

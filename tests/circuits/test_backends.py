@@ -1,0 +1,417 @@
+"""What every circuit backend must do, run on every registered ansatz and backend."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from qrlsuite import registry, specs
+from qrlsuite.circuit import GATES, Circuit, ansatz, create_backend, expectations
+from qrlsuite.errors import OptionError
+from qrlsuite.options import field_names
+
+BACKENDS = registry.load().names("circuit_backends")
+SLOW = {"qiskit"}
+VARIANTS = [
+    (name, gate)
+    for name in registry.load().names("ansatzes")
+    for gate in (
+        ("rot", "xyz", "u3")
+        if "gate" in field_names(specs.resolve(registry.ansatz(name).options))
+        else (None,)
+    )
+]
+
+
+def draw(circuit, seeds, batch, seed=0):
+    """Inputs (S, B, in), parameters (S, ...) and a cotangent (S, B, out), float64."""
+    generator = torch.Generator().manual_seed(seed)
+    options = {"generator": generator, "dtype": torch.float64}
+    inputs = torch.randn(seeds, batch, circuit.inputs, **options)
+    parameters = {name: 6 * torch.rand(seeds, *p.shape, **options) for name, p in circuit.parameters.items()}
+    return inputs, parameters, torch.randn(seeds, batch, len(circuit.observables), **options)
+
+
+def evaluate(backend, inputs, parameters, cotangent, **options):
+    """Values and all gradients."""
+    inputs = inputs.clone().requires_grad_()
+    parameters = {name: value.clone().requires_grad_() for name, value in parameters.items()}
+    values = backend(inputs, parameters, **options)
+    values.backward(cotangent)
+    return [values.detach(), inputs.grad, *[value.grad for value in parameters.values()]]
+
+
+def assert_close(got, expected, tolerance):
+    for a, b in zip(got, expected, strict=True):
+        assert a.shape == b.shape
+        assert float((a - b).abs().max()) < tolerance
+
+
+@functools.cache
+def reference(name, gate, qubits):
+    circuit = ansatz(name, qubits, 2, **({} if gate is None else {"gate": gate}))
+    given = draw(circuit, 2, 1)
+    return circuit, given, evaluate(create_backend("pennylane", circuit), *given)
+
+
+CONFORMANCE = [
+    (backend, name, gate, qubits)
+    for backend in BACKENDS
+    for name, gate in VARIANTS
+    for qubits in (2, 3, 5)
+    # Slow backends take seconds beyond two qubits.
+    if backend not in SLOW or qubits == 2 or (name, gate, qubits) == ("iqp", "u3", 3)
+]
+
+
+@pytest.mark.parametrize(
+    ("backend", "name", "gate", "qubits"), [c for c in CONFORMANCE if c[0] != "pennylane"]
+)
+def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate, qubits):
+    circuit, given, expected = reference(name, gate, qubits)
+    got = evaluate(create_backend(backend, circuit), *given)
+    assert_close(got, expected, 1e-10)
+
+
+# An independent simulation: dense matrices, a few lines.
+
+
+def rotation(pauli, angle):
+    return np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
+
+
+X, Y, Z = np.array([[0, 1], [1, 0]]), np.array([[0, -1j], [1j, 0]]), np.diag([1, -1])
+FIXED = {
+    "H": (X + Z) / np.sqrt(2), "X": X, "Y": Y, "Z": Z, "S": np.diag([1, 1j]), "T": np.diag([1, np.exp(0.25j * np.pi)]),
+    "CNOT": np.eye(4)[[0, 1, 3, 2]], "CZ": np.diag([1, 1, 1, -1]), "SWAP": np.eye(4)[[0, 2, 1, 3]],
+}  # fmt: skip
+
+
+def matrix(gate, angles):
+    if gate in FIXED:
+        return FIXED[gate]
+    if gate == "Rot":
+        return rotation(Z, angles[2]) @ rotation(Y, angles[1]) @ rotation(Z, angles[0])
+    if gate == "U3":
+        t, p, d = angles
+        phases = np.exp(1j * np.array([[0, d], [p, p + d]]))
+        return phases * [[np.cos(t / 2), -np.sin(t / 2)], [np.sin(t / 2), np.cos(t / 2)]]
+    return rotation({"RX": X, "RY": Y, "RZ": Z}[gate], angles[0])
+
+
+def dense(circuit, inputs, parameters):
+    """Expectation values (observables,) for one input; qubit 0 is the first axis of the state."""
+    state = np.zeros([2] * circuit.qubits, complex)
+    state[(0,) * circuit.qubits] = 1
+    for op in circuit:
+        angles = []
+        for a in op.angles:
+            term = 0.0 if a.input is None else inputs[a.input]
+            if a.scale is not None:
+                term *= parameters[a.scale.parameter].reshape(-1)[a.scale.index]
+            if a.weight is not None:
+                term += parameters[a.weight.parameter].reshape(-1)[a.weight.index]
+            angles.append(a.constant + term)
+        gate = np.asarray(matrix(op.gate, angles), complex)
+        if op.control is not None:
+            gate = np.block([[np.eye(2), np.zeros((2, 2))], [np.zeros((2, 2)), gate]])
+        k = len(op.qubits)
+        state = np.tensordot(gate.reshape([2] * 2 * k), state, (range(k, 2 * k), op.qubits))
+        state = np.moveaxis(state, range(k), op.qubits)
+    probability = np.abs(state) ** 2
+    sums = [
+        probability.sum(axis=tuple(i for i in range(circuit.qubits) if i != q)) for q in circuit.observables
+    ]
+    return np.array([p[0] - p[1] for p in sums])
+
+
+def every_gate():
+    """A circuit with every gate, controlled and not, constants, shared parameters, bare inputs, 2 of 3 qubits."""
+    circuit = Circuit(3, inputs=2)
+    w = circuit.parameter("w", (4, 6))
+    for q in range(3):
+        circuit.append("RY", q, 0.4 + q)
+    for k, (gate, signature) in enumerate(GATES.items()):
+        wires = [(k + i) % 3 for i in range(signature.wires)]
+        angles = [
+            w[0, 0] * circuit.input(0) + w[k % 4, i] if i % 2 == 0 else circuit.input(1) + 0.3
+            for i in range(signature.angles)
+        ]
+        circuit.append(gate, wires, *angles)
+        if signature.controllable:
+            circuit.append(gate, wires, *angles[:-1], w[k % 4, 3 + k % 3] if k else 0.7, control=(k + 2) % 3)
+    circuit.measure([2, 0])
+    return circuit
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_gate_against_dense_matrices(backend):
+    circuit = every_gate()
+    inputs, parameters, cotangent = draw(circuit, 2, 3 if backend not in SLOW else 1)
+    got = evaluate(create_backend(backend, circuit), inputs, parameters, cotangent)
+    tolerance = 1e-10
+
+    def values(x, w):
+        return np.array([[dense(circuit, row, {"w": w[s]}) for row in x[s]] for s in range(len(x))])
+
+    x, w, c = inputs.numpy(), parameters["w"].numpy(), cotangent.numpy()
+    np.testing.assert_allclose(got[0], values(x, w), atol=tolerance)
+    step = 1e-5  # central differences: exact to about step^2
+    for which, gradient in ((x, got[1].numpy()), (w, got[2].numpy())):
+        for index in np.ndindex(which.shape):
+            kept = which[index]
+            which[index] = kept + step
+            up = values(x, w)
+            which[index] = kept - step
+            down = values(x, w)
+            which[index] = kept
+            assert gradient[index] == pytest.approx(((up - down) * c).sum() / (2 * step), abs=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_rotation_by_the_input_gives_its_cosine(backend):
+    circuit = Circuit(2, inputs=1)
+    circuit.append("RX", 1, circuit.input(0))
+    x = torch.tensor([[0.0], [np.pi / 3], [np.pi / 2], [np.pi]], dtype=torch.float64)
+    values = expectations(circuit, x, {}, backend=backend)
+    expected = torch.tensor([[1.0, 1.0], [1.0, 0.5], [1.0, 0.0], [1.0, -1.0]])
+    assert_close([values], [expected.double()], 1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_circuit_without_variable_angles(backend):
+    circuit = Circuit(1)
+    circuit.append("X", 0)
+    circuit.append("RY", 0, 0.5)
+    values = create_backend(backend, circuit)(torch.zeros(2, 3, 1, dtype=torch.float64), {})
+    assert values.shape == (2, 3, 1)
+    assert_close([values], [torch.full((2, 3, 1), -np.cos(0.5), dtype=torch.float64)], 1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_float32_in_float32_out(backend):
+    circuit = ansatz("cz", 2, 1)
+    inputs, parameters, cotangent = draw(circuit, 1, 2)
+    single = {name: value.float() for name, value in parameters.items()}
+    got = evaluate(create_backend(backend, circuit), inputs.float(), single, cotangent.float())
+    assert {value.dtype for value in got} == {torch.float32}
+    expected = evaluate(create_backend("pennylane", circuit), inputs, parameters, cotangent)
+    assert_close(got, expected, 1e-4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_backends_survive_without_gradients(backend):
+    circuit = ansatz("cx", 2, 1)
+    inputs, parameters, _ = draw(circuit, 2, 3)
+    with torch.no_grad():
+        values = create_backend(backend, circuit)(inputs, parameters)
+    assert not values.requires_grad
+    assert values.shape == (2, 3, 2)
+
+
+# Seeds must not influence each other.
+
+
+@pytest.mark.parametrize("qubits", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("batch", [1, 5, 16, 50, 64])
+@pytest.mark.parametrize("name", ["iqp", "cx", "skolik"])
+def test_a_seed_has_the_same_bits_at_every_place_of_pennylanes_broadcast(name, batch, qubits):
+    circuit = ansatz(name, qubits, 2)
+    backend = create_backend("pennylane", circuit)
+    inputs, parameters, cotangent = draw(circuit, 3, batch)
+
+    def run(start, stop):
+        some = {key: value[start:stop] for key, value in parameters.items()}
+        return evaluate(backend, inputs[start:stop], some, cotangent[start:stop])
+
+    alone = [run(s, s + 1) for s in range(3)]
+    for start, stop in ((0, 3), (1, 3)):
+        for got, *each in zip(run(start, stop), *alone[start:stop], strict=True):
+            assert torch.equal(got, torch.cat(each))
+
+
+def test_seeds_that_do_not_fit_in_memory_are_recomputed_with_the_same_bits(monkeypatch):
+    circuit = ansatz("iqp", 3, 2)
+    backend = create_backend("pennylane", circuit)
+    given = draw(circuit, 5, 20)
+    whole = evaluate(backend, *given)
+    executed = []
+    execute = backend.execute
+    monkeypatch.setattr(
+        backend, "execute", lambda angles, *rest: executed.append(rest) or execute(angles, *rest)
+    )
+    evaluate(backend, *given)
+    assert len(executed) == 1
+    monkeypatch.setattr("qrlsuite.plugins.circuits.pennylane.MEMORY", 2 * len(circuit) * 20 * 16 * 8 * 2)
+    in_parts = evaluate(backend, *given)
+    assert len(executed) == 1 + 2 * 3  # two seeds at a time, forward and backward
+    assert all(torch.equal(a, b) for a, b in zip(whole, in_parts))
+
+
+# Finite shots.
+
+SAMPLING = [("pennylane", {}), ("pennylane", {"device": "lightning.qubit"}), ("qiskit", {})]
+
+
+@pytest.mark.parametrize(("backend", "options"), SAMPLING)
+def test_samples_scatter_about_the_exact_value(backend, options):
+    circuit = ansatz("iqp", 2, 1)
+    inputs, parameters, _ = draw(circuit, 1, 60)
+    exact = create_backend("pennylane", circuit)(inputs, parameters)
+    sampled = create_backend(backend, circuit, shots=400, **options)(inputs, parameters, [7])
+    error = (sampled - exact) * np.sqrt(400)  # 120 numbers of standard deviation sqrt(1 - exact^2), or 1
+    spread = torch.ones_like(exact) if backend == "qiskit" else torch.sqrt(1 - exact**2)
+    assert abs(float((error / spread).mean())) < 4 / np.sqrt(120)
+    assert 0.7 < float((error / spread).std()) < 1.3
+
+
+@pytest.mark.parametrize(("backend", "options"), SAMPLING)
+def test_sampled_gradients_scatter_about_the_exact_gradient(backend, options):
+    circuit = ansatz("iqp", 2, 1)
+    inputs, parameters, cotangent = draw(circuit, 1, 2)
+    exact = evaluate(create_backend("pennylane", circuit), inputs, parameters, cotangent)
+    sampled = evaluate(
+        create_backend(backend, circuit, shots=20000, **options), inputs, parameters, cotangent, seeds=[3]
+    )
+    for a, b in zip(sampled, exact):
+        assert 0 < float((a - b).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(("backend", "options"), SAMPLING)
+def test_the_sampling_of_a_seed_depends_on_its_own_seed_alone(backend, options):
+    circuit = ansatz("cz", 2, 1)
+    inputs, parameters, cotangent = draw(circuit, 3, 2)
+    sampler = create_backend(backend, circuit, shots=50, **options)
+    together = evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 12, 2**62])
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(together, evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 12, 2**62]))
+    )
+    for s, seed in enumerate([11, 12, 2**62]):
+        one = {name: value[s : s + 1] for name, value in parameters.items()}
+        alone = evaluate(sampler, inputs[s : s + 1], one, cotangent[s : s + 1], seeds=[seed])
+        assert all(torch.equal(a[0], b[s]) for a, b in zip(alone, together))
+    other = evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 13, 2**62])
+    assert torch.equal(other[0][[0, 2]], together[0][[0, 2]])
+    assert not torch.equal(other[0][1], together[0][1])
+
+
+@pytest.mark.parametrize(("backend", "options"), SAMPLING)
+def test_without_seeds_samples_are_fresh(backend, options):
+    circuit = ansatz("cz", 2, 1)
+    inputs, parameters, _ = draw(circuit, 1, 8)
+    sampler = create_backend(backend, circuit, shots=50, **options)
+    assert not torch.equal(sampler(inputs, parameters), sampler(inputs, parameters))
+
+
+@pytest.mark.parametrize(("backend", "options"), SAMPLING)
+def test_backward_samples_are_not_those_of_the_forward_pass(backend, options):
+    # At angle 0 the shifted circuits of RX have <Z> = 0 with fresh noise: a gradient of exactly 0 would mean
+    # that both shifts drew the same samples.
+    circuit = Circuit(1)
+    circuit.append("RX", 0, circuit.input(0))
+    sampler = create_backend(backend, circuit, shots=101, **options)
+    inputs = torch.zeros(1, 20, 1, dtype=torch.float64, requires_grad=True)
+    sampler(inputs, {}, [5]).sum().backward()
+    assert float(inputs.grad.abs().max()) > 0
+    assert len(inputs.grad.unique()) > 3
+
+
+def test_sampling_leaves_global_random_numbers_alone():
+    circuit = ansatz("cz", 2, 1)
+    inputs, parameters, cotangent = draw(circuit, 1, 2)
+
+    def state():
+        return np.random.get_state()[1].copy(), torch.get_rng_state().numpy()  # noqa: NPY002
+
+    for backend, options in SAMPLING:
+        before = state()
+        evaluate(
+            create_backend(backend, circuit, shots=20, **options), inputs, parameters, cotangent, seeds=[1]
+        )
+        assert all(np.array_equal(a, b) for a, b in zip(before, state()))
+
+
+# What cannot be done.
+
+
+@pytest.mark.parametrize(
+    ("backend", "options", "message"),
+    [
+        ("pennylane", {"device": "default.qubits"}, "did you mean 'default.qubit'?"),
+        ("pennylane", {"device": "lightning.gpu"}, "pip install pennylane-lightning-gpu"),
+        ("pennylane", {"device": "cirq.simulator"}, "pip install pennylane-cirq"),
+        ("pennylane", {"device": "default.gaussian"}, "'default.gaussian'.* cannot run this circuit.*RZ"),
+        ("pennylane", {"diff_method": "backprob"}, "diff_method = 'backprob': .*'backprop'"),
+        ("pennylane", {"device": "lightning.qubit", "diff_method": "backprop"}, "use 'adjoint'"),
+        ("pennylane", {"device": "default.mixed", "diff_method": "adjoint"}, "does not support adjoint"),
+        ("pennylane", {"shots": 10, "diff_method": "adjoint"}, "with shots = 10 use 'parameter-shift'"),
+        ("pennylane", {"shots": 0}, "shots = 0: .*greater than or equal to 1"),
+        ("qiskit", {"estimator": "air"}, "estimator = 'air'"),
+        ("qiskit", {"gradient": "revers"}, "gradient = 'revers'"),
+        ("qiskit", {"gradient": "reverse", "shots": 10}, "'reverse' needs .* without shots"),
+        ("qiskit", {"noise_model": "depolarizing"}, "needs estimator = 'aer'"),
+        ("qiskit", {"noise_rate": 1.5}, "noise_rate = 1.5"),
+    ],
+)
+def test_options_that_cannot_be_used_say_what_to_type(backend, options, message):
+    with pytest.raises(OptionError, match=message) as caught:
+        create_backend(backend, ansatz("cz", 2, 1), **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("missing", "options", "command"),
+    [
+        ("qiskit_algorithms", {"gradient": "reverse"}, r"pip install qiskit-algorithms"),
+        ("qiskit_aer", {"estimator": "aer"}, r"pip install 'qrlsuite\[aer\]'"),
+        ("psutil", {"estimator": "aer"}, r"pip install 'qrlsuite\[aer\]'"),
+    ],
+)
+def test_missing_packages_are_named_with_their_command(monkeypatch, missing, options, command):
+    import importlib
+
+    import_module = importlib.import_module
+
+    def without(name, package=None):
+        if name.split(".")[0] == missing:
+            raise ModuleNotFoundError(f"No module named '{missing}'", name=missing)
+        return object() if name.split(".")[0] in ("qiskit_aer", "psutil") else import_module(name, package)
+
+    monkeypatch.setattr("qrlsuite.plugins.circuits.qiskit.importlib.import_module", without)
+    from qrlsuite.plugins.circuits.options import QiskitOptions
+    from qrlsuite.plugins.circuits.qiskit import QiskitBackend
+
+    with pytest.raises(OptionError, match=f"'{missing}' is missing; {command}"):
+        QiskitBackend(ansatz("cz", 2, 1), QiskitOptions(**options))
+
+
+@pytest.mark.parametrize("gradient", ["parameter-shift", "lin-comb"])
+def test_qiskits_other_gradients(gradient):
+    circuit = ansatz("iqp", 2, 1, gate="u3")
+    given = draw(circuit, 1, 1)
+    got = evaluate(create_backend("qiskit", circuit, gradient=gradient), *given)
+    assert_close(got, evaluate(create_backend("pennylane", circuit), *given), 1e-10)
+
+
+def test_qiskits_spsa_is_an_unbiased_guess():
+    circuit = Circuit(1)
+    circuit.append("RX", 0, circuit.input(0))
+    x = torch.full((1, 1, 1), 0.7, dtype=torch.float64, requires_grad=True)
+    create_backend("qiskit", circuit, gradient="spsa")(x, {}, [1]).sum().backward()
+    assert float(x.grad) == pytest.approx(-np.sin(0.7), abs=1e-4)  # one angle: SPSA is a central difference
+
+
+def test_aer_is_exact_and_loses_contrast_under_noise():
+    pytest.importorskip("qiskit_aer")
+    pytest.importorskip("psutil")
+    circuit = ansatz("iqp", 2, 1, gate="u3")
+    given = draw(circuit, 1, 1)
+    expected = evaluate(create_backend("pennylane", circuit), *given)
+    assert_close(evaluate(create_backend("qiskit", circuit, estimator="aer"), *given), expected, 1e-10)
+    noisy = {"estimator": "aer", "noise_model": "depolarizing"}
+    got = evaluate(create_backend("qiskit", circuit, **noisy, noise_rate=0.0), *given)
+    assert_close(got, expected, 1e-10)
+    weaker = create_backend("qiskit", circuit, **noisy, noise_rate=0.2)(given[0], given[1])
+    assert float(weaker.abs().max()) < float(expected[0].abs().max())

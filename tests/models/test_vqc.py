@@ -1,0 +1,291 @@
+import copy
+
+import pytest
+import torch
+
+from qrlsuite import options, population, registry
+from qrlsuite.circuit import ansatz, create_backend
+from qrlsuite.errors import OptionError
+from qrlsuite.plugins.models import vqc
+from qrlsuite.plugins.models.vqc import NativeOptions, PennyLaneOptions, QiskitOptions, VQCOptions
+
+CLASSES = {"pennylane": PennyLaneOptions, "native": NativeOptions, "qiskit": QiskitOptions}
+BACKENDS = [name for name in CLASSES if name in registry.load().names("circuit_backends")]
+FAST = [name for name in BACKENDS if name != "qiskit"]
+
+
+def small(backend="pennylane", **values):
+    return options.build(CLASSES[backend], {"qubits": 3, "layers": 2, **values}, f"model 'vqc-{backend}'")
+
+
+def agents(count, given, obs=3, out=3):
+    return [vqc.build(obs, out, given, torch.Generator().manual_seed(s)) for s in range(count)]
+
+
+def observations(*shape, dtype=torch.float32):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
+
+
+@pytest.mark.parametrize(("qubits", "total"), [(6, 189), (8, 251), (10, 313), (12, 375), (14, 437)])
+def test_the_papers_parameter_counts(qubits, total):
+    module = agents(1, small(qubits=qubits, layers=4))[0]
+    classical, quantum = population.count_parameters(module)
+    assert classical + quantum == total == 6 * 4 * qubits + 7 * qubits + 3
+    assert quantum == 6 * 4 * qubits
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_one_agent_is_linear_circuit_linear(backend):
+    given = small(backend, qubits=2, layers=1, dtype="float64")
+    module = agents(1, given, obs=4, out=5)[0]
+    x = observations(6, 4, dtype=torch.float64)
+    p = dict(module.named_parameters())
+    inner = x @ p["input.weight"].T + p["input.bias"]
+    quantum = {
+        name.removeprefix("circuit."): value[None] for name, value in p.items() if name.startswith("circuit.")
+    }
+    values = create_backend("pennylane", ansatz("iqp", 2, 1))(inner[None], quantum)[0]
+    expected = values @ p["output.weight"].T + p["output.bias"]
+    assert module(x).shape == (6, 5)
+    torch.testing.assert_close(module(x), expected, atol=1e-9, rtol=0)
+
+
+def test_activations_sit_on_both_sides_of_the_circuit():
+    plain, both = (
+        agents(1, small(dtype="float64", **v))[0]
+        for v in ({}, {"activation_in": "tanh", "activation_out": "relu"})
+    )
+    x = observations(6, 3, dtype=torch.float64)
+    p = dict(both.named_parameters())
+    inner = torch.tanh(x @ p["input.weight"].T + p["input.bias"])
+    quantum = {name: p[f"circuit.{name}"][None] for name in ("scaling", "weights")}
+    values = torch.relu(create_backend("pennylane", ansatz("iqp", 3, 2))(inner[None], quantum)[0])
+    torch.testing.assert_close(both(x), values @ p["output.weight"].T + p["output.bias"], atol=1e-9, rtol=0)
+    assert not torch.allclose(both(x), plain(x))
+
+
+def test_initial_parameters_come_from_the_generator_and_lie_in_their_ranges():
+    first, again, other = (
+        vqc.build(3, 3, small(qubits=10, layers=4), torch.Generator().manual_seed(s)) for s in (1, 1, 2)
+    )
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+        assert name == "shot_count" or not torch.equal(value, other.state_dict()[name])
+    for name in ("scaling", "weights"):
+        value = first.circuit[name].detach()
+        assert value.shape == (4, 10, 3)
+        assert 0 <= float(value.min()) < 0.3
+        assert 2 * torch.pi - 0.3 < float(value.max()) < 2 * torch.pi
+    assert float(first.input.weight.detach().abs().max()) <= 3**-0.5
+    assert float(first.output.weight.detach().abs().max()) <= 10**-0.5
+    assert first.input.weight.shape == (10, 3)  # the layout of torch.nn.Linear
+    assert torch.equal(agents(1, small(ansatz="skolik"))[0].circuit["scaling"], torch.ones(2, 3))
+
+
+def test_building_leaves_global_random_numbers_alone():
+    before = torch.get_rng_state()
+    agents(1, small())
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_names_in_a_population_are_those_of_one_agent_with_a_leading_axis():
+    modules = agents(3, small())
+    together = vqc.population(modules, small())
+    state = together.state_dict()
+    assert state.keys() == modules[0].state_dict().keys()
+    for name, value in state.items():
+        assert torch.equal(value, torch.stack([m.state_dict()[name] for m in modules]))
+    assert (
+        together.quantum_parameters()
+        == modules[0].quantum_parameters()
+        == {"circuit.scaling", "circuit.weights"}
+    )
+    assert [name for name, _ in together.named_parameters()] == [
+        name for name, _ in modules[0].named_parameters()
+    ]
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize(
+    ("qubits", "out", "batch", "dtype"),
+    [
+        (3, 3, 64, "float32"),
+        (3, 3, 64, "float64"),
+        (4, 1, 7, "float32"),
+        (5, 3, 1, "float64"),
+        (16, 3, 1, "float32"),  # wide enough for batched matrix products
+    ],
+)
+def test_an_agent_has_the_same_bits_alone_and_anywhere_in_a_population(backend, qubits, out, batch, dtype):
+    count = 2 if qubits == 16 else 5
+    given = small(backend, qubits=qubits, layers=1, dtype=dtype)
+    modules = agents(count, given, out=out)
+    together = vqc.population(modules, given)
+    x, cotangent = observations(count, batch, 3), observations(count, batch, out)
+    values = together(x)
+    values.backward(cotangent)
+    assert values.shape == (count, batch, out)
+    assert values.dtype == torch.float32
+    for s, module in enumerate(modules):
+        alone = vqc.population([module], given)
+        for single, got in ((alone, alone(x[s : s + 1])[0]), (module, module(x[s]))):
+            assert torch.equal(got, values[s])
+            single.zero_grad()
+            got.backward(cotangent[s])
+            for name, parameter in single.named_parameters():
+                mine = together.get_parameter(name).grad[s]
+                assert torch.equal(parameter.grad.reshape(mine.shape), mine), name
+
+
+def test_many_agents_at_odd_offsets_have_the_bits_of_one():
+    given = small(qubits=6, layers=1)
+    modules = agents(17, given)
+    x, cotangent = observations(17, 64, 3), observations(17, 64, 3)
+
+    def gradients(some):
+        together = vqc.population([modules[s] for s in some], given)
+        values = together(x[some])
+        values.backward(cotangent[some])
+        return [values.detach(), *[p.grad for p in together.parameters()]]
+
+    everyone = gradients(list(range(17)))
+    for some in ([3], [16, 5, 9], list(range(1, 17))):
+        assert all(torch.equal(a, b[some]) for a, b in zip(gradients(some), everyone))
+
+
+def test_gradients_of_the_summed_loss_do_not_mix():
+    together = vqc.population(agents(3, small()), small())
+    together(observations(3, 4, 3))[1].sum().backward()
+    for parameter in together.parameters():
+        assert float(parameter.grad[[0, 2]].abs().sum()) == 0
+        assert float(parameter.grad[1].abs().sum()) > 0
+
+
+def test_deep_copies_are_independent_but_share_the_counter():
+    together = vqc.population(agents(2, small()), small())
+    target = copy.deepcopy(together)
+    x = observations(2, 4, 3)
+    before = together(x).detach()
+    assert torch.equal(target(x), before)
+    with torch.no_grad():
+        for parameter in together.parameters():
+            parameter.add_(0.1)
+    assert torch.equal(target(x), before)
+    target.load_state_dict(together.state_dict())
+    assert torch.equal(target(x), together(x))
+    assert target.executions is together.executions
+    assert together.executions.forward == 5 * 4
+
+
+@pytest.mark.parametrize("name", ["iqp", "cz"])
+def test_executions_are_those_of_each_agent(name):
+    given = small(ansatz=name)
+    together = vqc.population(agents(5, given), given)
+    assert together.executions.as_dict() == {"forward": 0, "parameter_shift": 0}
+    x = observations(5, 7, 3)
+    with torch.no_grad():
+        together(x)
+    assert together.executions.as_dict() == {"forward": 7, "parameter_shift": 0}
+    together(x).sum().backward()
+    per_input = 2 * 3 * 3 * (4 if name == "iqp" else 2)  # layers, qubits, angles, evaluations
+    assert together.executions.as_dict() == {"forward": 14, "parameter_shift": 7 * per_input}
+    together(x)[..., 0].sum().backward()
+    assert (together.executions.forward, together.executions.gradient) == (21, 14 * per_input)
+
+
+def test_shots_are_counted_with_both_kinds_of_executions():
+    given = small(qubits=2, layers=1, ansatz="cz", shots=10)
+    together = vqc.population(agents(2, given), given)
+    together(observations(2, 3, 3)).sum().backward()
+    assert together.executions.as_dict() == {"forward": 3, "parameter_shift": 36, "shots": 390}
+
+
+def test_shot_noise_is_new_in_every_pass_and_resumes_exactly():
+    given = small(qubits=2, layers=1, shots=20)
+    x = observations(3, 4, 3)
+    together = vqc.population(agents(3, given), given)
+    first = together(x)
+    state = copy.deepcopy(together.state_dict())
+    assert state["shot_count"].tolist() == [1, 1, 1]
+    second = together(x)
+    assert not torch.equal(first, second)
+    resumed = vqc.population(agents(3, small(qubits=2, layers=1, shots=20)), given)
+    resumed.load_state_dict(state)
+    assert torch.equal(resumed(x), second)
+
+
+def test_shot_noise_of_an_agent_does_not_depend_on_its_place():
+    given = small(qubits=2, layers=1, shots=20)
+    modules = agents(3, given)
+    x = observations(3, 4, 3)
+    together = vqc.population(modules, given)(x)
+    assert torch.equal(vqc.population([modules[2], modules[0]], given)(x[[2, 0]]), together[[2, 0]])
+    same = [copy.deepcopy(modules[0]) for _ in range(2)]
+    with torch.no_grad():
+        same[1].shot_key += 1
+    a, b = vqc.population(same, given)(x[[0, 0]])
+    assert not torch.equal(a, b)
+
+
+def test_a_target_network_draws_its_own_samples():
+    given = small(qubits=2, layers=1, shots=20)
+    together = vqc.population(agents(1, given), given)
+    target = copy.deepcopy(together)
+    target.load_state_dict(together.state_dict())
+    x = observations(1, 30, 3)
+    assert not torch.equal(together(x), target(x))
+
+
+def test_exact_models_do_not_count_passes():
+    together = vqc.population(agents(2, small()), small())
+    together(observations(2, 3, 3))
+    assert together.shot_count.tolist() == [0, 0]
+
+
+def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
+    own = set(options.field_names(VQCOptions))
+    assert own == {
+        "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype"
+    }  # fmt: skip
+    for name in BACKENDS:
+        backend_options = registry.circuit_backend(name).options
+        from qrlsuite.specs import resolve
+
+        assert set(options.field_names(CLASSES[name])) == own | set(
+            options.field_names(resolve(backend_options))
+        )
+    assert (PennyLaneOptions().qubits, PennyLaneOptions().layers, PennyLaneOptions().ansatz) == (10, 4, "iqp")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"qubits": 0}, "qubits = 0: .*greater than or equal to 1"),
+        ({"qubits": 21}, "qubits = 21: .*less than or equal to 20"),
+        ({"gate": "rott"}, "gate = 'rott'"),
+        ({"dtype": "float16"}, "dtype = 'float16'"),
+        ({"activation": "relu"}, "no option 'activation'; did you mean 'activation_in'?"),
+    ],
+)
+def test_bad_options_are_refused(values, message):
+    with pytest.raises(OptionError, match=message):
+        small(**values)
+
+
+def test_ansatz_options_reach_the_ansatz():
+    circuit = vqc.build_circuit(small(ansatz_options={"gate": "xyz"}))
+    assert {op.gate for op in circuit} == {"H", "RX", "RY", "RZ"}
+    with pytest.raises(OptionError, match="'iqp' has no option 'gates'"):
+        vqc.build_circuit(small(ansatz_options={"gates": "xyz"}))
+
+
+def test_a_gate_is_refused_where_the_ansatz_has_none():
+    assert {op.gate for op in vqc.build_circuit(small(ansatz="skolik"))} == {"RX", "RY", "RZ", "CZ"}
+    with pytest.raises(OptionError, match="gate = 'u3': ansatz 'skolik' has no option 'gate'"):
+        vqc.build_circuit(small(ansatz="skolik", gate="u3"))
+
+
+def test_a_population_finds_out_at_once_that_its_backend_cannot_run():
+    given = small(device="lightning.gpu")
+    with pytest.raises(OptionError, match="pip install pennylane-lightning-gpu"):
+        vqc.population(agents(1, given), given)
