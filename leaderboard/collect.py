@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
-from qrlsuite.store import EntryStore, SeedCurve, entries, read_lines
+from qrlsuite.store import EntryStore, SeedCurve, entries
 from qrlsuite.task import TaskFile
 
 
@@ -132,7 +131,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         curves=np.stack([curve.curve[:length] for curve in kept]),
         seeds=tuple(curve.seed for curve in kept),
         left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
-        hours=sum(_seconds(read_lines(store.seed(curve.seed).timings)) for curve in kept) / 3600,
+        hours=sum(store.seed(curve.seed).seconds() for curve in kept) / 3600,
         folder=store.path,
     )
 
@@ -141,7 +140,3 @@ def _common_length(curves: Iterable[SeedCurve]) -> int:
     """Return the epochs that finished runs have; before any finished, the fewest that any run has."""
     lengths = [len(curve.scores) for curve in curves if curve.finished]
     return max(lengths) if lengths else min(len(curve.scores) for curve in curves)
-
-
-def _seconds(lines: list[dict[str, Any]]) -> float:
-    return sum(float(line.get("train", 0.0)) + float(line.get("validate", 0.0)) for line in lines)

@@ -145,7 +145,7 @@ def _read(path: Path) -> Claim | None:
             token=str(content["token"]),
             seeds=tuple(int(seed) for seed in content["seeds"]),
         )
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None  # gone, or torn by a killed writer: nobody holds it
 
 

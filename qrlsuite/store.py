@@ -247,6 +247,23 @@ class SeedStore:
             write_atomically(self.table, table_bytes(rows))
             self.lines.unlink(missing_ok=True)
 
+    def seconds(self) -> float:
+        """Return the time spent on this seed's epochs so far: its share of its group's, one core.
+
+        Raises
+        ------
+        StoreError
+            If a line of the timings is damaged.
+        """
+        total = 0.0
+        for line in read_lines(self.timings):
+            for name in ("train", "validate"):
+                value = line.get(name, 0.0)
+                if not isinstance(value, int | float) or not 0 <= value < 1e12:
+                    raise StoreError(f"{self.timings}: {name} = {value!r} is not a number of seconds")
+                total += value
+        return total
+
     def curve(self) -> SeedCurve:
         """Return the validation scores so far.
 
@@ -264,7 +281,8 @@ class SeedStore:
         if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):
             raise StoreError(f"{self.path}: validation scores must be finite and equally many in every epoch")
         record = self.record() or {}
-        return SeedCurve(self.seed, scores.reshape(len(rows), -1), record.get("status") == "finished")
+        shaped = scores if rows else np.empty((0, 0), np.float32)
+        return SeedCurve(self.seed, shaped, record.get("status") == "finished")
 
 
 def _is_count(value: Any) -> bool:
@@ -324,16 +342,12 @@ def read_table(path: Path) -> list[dict[str, Any]]:
         table = pyarrow.parquet.ParquetFile(path).read()
     except (OSError, pyarrow.ArrowException) as error:
         raise StoreError(f"{path} is not a readable parquet file: {error}") from None
-    rows: list[dict[str, Any]] = []
-    for flat in table.to_pylist():
-        row: dict[str, Any] = {}
-        for name, value in flat.items():
-            outer, dot, inner = name.partition(".")
-            if dot:
-                row.setdefault(outer, {})[inner] = value
-            else:
-                row[name] = shortest(np.array(value)) if name == "scores" and value is not None else value
-        rows.append(row)
+    try:
+        rows = [_nest(flat) for flat in table.to_pylist()]
+    except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
+        raise StoreError(
+            f"{path} does not hold epochs; restore the file or delete the seed's folder"
+        ) from None
     if not rows:
         raise StoreError(f"{path} holds no epoch")
     return rows
@@ -341,6 +355,18 @@ def read_table(path: Path) -> list[dict[str, Any]]:
 
 def _first_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
+
+
+def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Undo `_flatten`."""
+    row: dict[str, Any] = {}
+    for name, value in flat.items():
+        outer, dot, inner = name.partition(".")
+        if dot:
+            row.setdefault(outer, {})[inner] = value
+        else:
+            row[name] = shortest(np.array(value)) if name == "scores" and value is not None else value
+    return row
 
 
 class EntryStore:

@@ -132,6 +132,6 @@ def read_progress(path: Path) -> dict[str, Any]:
     """Read a progress file; empty where it is missing or damaged."""
     try:
         content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -1,0 +1,131 @@
+"""Killing `qrlsuite run` and its workers at random moments, again and again.
+
+The test beside this file does it a few times. By hand, at large, with figures:
+
+    python -m tests.engine.stress --kills 200 --epochs 150
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from qrlsuite.store import EntryStore
+from tests.conftest import TINY, results
+
+
+def words(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> list[str]:
+    command = [sys.executable, "-m", "qrlsuite", "run", "--task", str(task), "--model", "mlp"]
+    command += ["--set", "width=16", "--seeds", str(seeds), "--epochs", str(epochs)]
+    return [*command, "--workers", str(workers), "--runs", str(runs), "--json"]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "QRLSUITE_CHECKPOINT_SECONDS": "0"}
+
+
+def children(pid: int) -> list[int]:
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def finished(runs: Path, seeds: int, epochs: int) -> Path | None:
+    for path in runs.glob("tiny/*/entry.json"):
+        if len(EntryStore(path.parent).finished(range(seeds), epochs)) == seeds:
+            return path.parent
+    return None
+
+
+def disturbed(
+    task: Path,
+    runs: Path,
+    kills: int,
+    dice: random.Random,
+    seeds: int,
+    epochs: int,
+    workers: int,
+    pause: float,
+) -> tuple[Path, Counter[str]]:
+    """Run the command until everything has finished, killing it or a worker up to `kills` times on the way."""
+    killed: Counter[str] = Counter()
+    deadline = time.monotonic() + 60 + 20 * kills
+    while (entry := finished(runs, seeds, epochs)) is None:
+        assert time.monotonic() < deadline, "no progress between the kills"
+        run = subprocess.Popen(
+            words(task, runs, seeds, epochs, workers),
+            env=environment(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        killed["starts"] += 1
+        while run.poll() is None:
+            if killed["supervisor"] + killed["worker"] >= kills:
+                run.wait()
+                break
+            time.sleep(dice.uniform(0, pause))
+            victims = children(run.pid)
+            if dice.random() < 0.2 or not victims:
+                victims = [run.pid]
+            victim = dice.choice(victims)
+            if run.poll() is None:
+                os.kill(victim, signal.SIGKILL)
+                killed["supervisor" if victim == run.pid else "worker"] += 1
+        run.wait()
+    return entry, killed
+
+
+def compare(straight: Path, entry: Path, seeds: int, epochs: int) -> None:
+    """Raise AssertionError unless all bytes are equal and every epoch is there once."""
+    for seed in range(seeds):
+        assert results(straight, seed) == results(entry, seed), f"seed {seed} differs"
+        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--epochs", type=int, default=150)
+    parser.add_argument("--workers", type=int, default=3)
+    parser.add_argument("--pause", type=float, default=3.0, help="seconds between kills, at most")
+    given = parser.parse_args()
+    dice = random.Random(0)
+    total: Counter[str] = Counter()
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        task = Path(folder) / "tiny.toml"
+        task.write_text(TINY)
+        subprocess.run(
+            words(task, Path(folder) / "straight", given.seeds, given.epochs, given.workers), check=True
+        )
+        straight = finished(Path(folder) / "straight", given.seeds, given.epochs)
+        assert straight is not None
+        while (done := total["supervisor"] + total["worker"]) < given.kills:
+            entry, killed = disturbed(
+                task,
+                Path(folder) / f"disturbed-{total['runs']}",
+                given.kills - done,
+                dice,
+                given.seeds,
+                given.epochs,
+                given.workers,
+                given.pause,
+            )
+            compare(straight, entry, given.seeds, given.epochs)
+            total += killed + Counter(runs=1)
+            print(json.dumps({**total, "seconds": round(time.monotonic() - began)}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
