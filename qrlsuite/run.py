@@ -7,6 +7,7 @@ checkpoint or keyed by the epoch, and lines newer than the checkpoint are cut.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import math
 import socket
@@ -23,7 +24,7 @@ from torch import nn
 from qrlsuite import checkpoint, options, population, provenance, registry, specs, store
 from qrlsuite.entry import Entry
 from qrlsuite.environment import LaneEnv
-from qrlsuite.errors import EnvironmentFailure, PluginError, StoreError
+from qrlsuite.errors import EnvironmentFailure, StoreError
 from qrlsuite.events import EventSink
 from qrlsuite.interrupts import Interruptible
 from qrlsuite.metering import MeteredEnv
@@ -55,11 +56,16 @@ Report = Callable[[Progress], None]
 def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
     """Build the task's environment with a number of lanes."""
     spec = entry.task.environment
-    if spec.vector is None:
-        raise PluginError(
-            f"environment '{spec.name}' has no vector form, and the generic one is not built yet"
-        )
-    inner: LaneEnv = specs.resolve(spec.vector)(entry.task.environment_options, lanes)
+    given = entry.task.environment_options
+    inner: LaneEnv
+    if spec.vector is not None:
+        inner = specs.resolve(spec.vector)(given, lanes)
+    else:
+        from qrlsuite import register_environments
+        from qrlsuite.gymlanes import GymLanes
+
+        register_environments()
+        inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(given))
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 

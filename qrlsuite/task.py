@@ -260,7 +260,9 @@ def parse(text: str, source: str) -> Task:
 
 
 def load(name: str) -> Task:
-    """Load a registered task by name, or a task file by path (anything that ends in `.toml`).
+    """Load a registered task by name, a task file by path (anything that ends in `.toml`), or `gym:ID`.
+
+    `gym:Acrobot-v1` is a task with settings for a quick look at an environment that Gymnasium knows.
 
     Raises
     ------
@@ -268,7 +270,13 @@ def load(name: str) -> Task:
         If no task has the name.
     TaskError
         If the file cannot be read or is malformed.
+    OptionError
+        If Gymnasium knows no such environment, or the algorithms cannot act or observe in it.
     """
+    if name.startswith("gym:"):
+        from qrlsuite.gymlanes import quick_task
+
+        return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
     path = Path(name) if name.endswith(".toml") else Path(registry.task(name).path)
     try:
         text = path.read_text(encoding="utf-8")

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import EnvironmentSpec
 
-_BEAM6G = "qrlsuite.plugins.environments.beam6g"
+_HERE = "qrlsuite.plugins.environments"
+_BEAM6G = f"{_HERE}.beam6g"
 
 
 @hookimpl
 def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
-    """Register BeamManagement6G."""
+    """Register BeamManagement6G, CartPole, and whatever else Gymnasium knows."""
     register(
         EnvironmentSpec(
             name="beam6g",
@@ -21,5 +22,24 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/BeamManagement6G-v1",
             entry_point=f"{_BEAM6G}.env:BeamManagement6G",
             vector=f"{_BEAM6G}.vector:make_vector",
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="cartpole",
+            summary="CartPole-v1: balance a pole on a cart; 500 steps at most",
+            options=f"{_HERE}.cartpole:Options",
+            gymnasium_id="qrlsuite/CartPole-v1",
+            entry_point=f"{_HERE}.cartpole:CartPole",
+            vector=f"{_HERE}.cartpole:make_vector",
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="gym",
+            summary="any environment of Gymnasium with discrete actions, by its id",
+            options=f"{_HERE}.gym:Options",
+            gymnasium_id="CartPole-v1",
+            vector=f"{_HERE}.gym:make_vector",
         )
     )

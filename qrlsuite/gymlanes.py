@@ -1,0 +1,408 @@
+"""Any Gymnasium environment with discrete actions, in lanes: the form of environments without one of their own.
+
+The state of an arbitrary environment cannot be copied. But an episode is fixed by the seed of its reset and by
+its actions, so these are what a checkpoint holds, and resuming plays them again.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
+from numpy.typing import NDArray
+
+from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.errors import EnvironmentFailure, OptionError, StoreError
+from qrlsuite.normalization import Kind, Normalization
+
+UNLIMITED = 10_000
+"""The longest episode, in steps, of an environment that states no time limit: longer ones are an error."""
+SEEDS = 2**31
+"""Reset seeds are drawn uniformly from 0 .. SEEDS - 1."""
+QUICK_STEPS = 1000
+"""The time limit of `--task gym:ID` where Gymnasium knows none."""
+
+
+class GymLanes(LaneEnv):
+    """Single environments side by side, with same-step autoreset and one random stream per group of lanes.
+
+    At every reset, a lane draws one integer from its stream and seeds its environment with it: whatever is
+    random in the episode comes from there. Observations are flattened as `gymnasium.spaces.flatten` does it,
+    so discrete ones are one-hot; actions count from 0, also where the environment's do not. At an episode's
+    end `infos["final_info"]` holds `score` (L,) where the environment's `info` does.
+
+    Without autoreset, a lane whose episode has ended stays where it is: its steps return the last observation,
+    reward 0, and neither termination nor truncation.
+
+    Parameters
+    ----------
+    env_id:
+        What `gymnasium.make` takes, `"module:Name-v0"` included.
+    num_envs:
+        Number of lanes L, at least 1.
+    arguments:
+        Keyword arguments of `gymnasium.make`.
+    normalization, low, high:
+        See `qrlsuite.normalization.Normalization`; for boxes only.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If there is no such environment, a package that it needs is missing, it refuses its arguments, its
+        actions are not discrete, or its observations are neither a box nor discrete.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int,
+        arguments: Mapping[str, Any] | None = None,
+        normalization: Kind = "none",
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        self.env_id = env_id
+        given = dict(arguments or {})
+        first = make(env_id, given)
+        self._action_space, self._raw_space, flat = _supported(env_id, first)
+        if normalization != "none" and not isinstance(self._raw_space, spaces.Box):
+            raise OptionError(
+                f"environment '{env_id}': normalization = '{normalization}' is for boxes, "
+                f"and its observations are {self._raw_space}"
+            )
+        self._normalize = Normalization(normalization, flat, low, high, f"environment '{env_id}'")
+        self.envs = [first, *(make(env_id, given) for _ in range(num_envs - 1))]
+        batched_spaces(self, self._normalize.space, spaces.Discrete(int(self._action_space.n)), num_envs)
+        limit = first.spec.max_episode_steps if first.spec is not None else None
+        self.capacity = int(limit or UNLIMITED)
+        self.streams = []
+        self._seeds = np.zeros(num_envs, dtype=np.int64)
+        self._actions = np.full((num_envs, self.capacity), -1, dtype=np.int32)
+        self._step = np.zeros(num_envs, dtype=np.int64)
+        self._raw = np.zeros((num_envs, *flat.shape), dtype=np.float32)
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._begun = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin a new episode in every lane; returns observations (L, n) and an empty dictionary.
+
+        Raises
+        ------
+        qrlsuite.errors.OptionError
+            If `options` are given: they would be lost in a checkpoint.
+        """
+        if options:
+            raise OptionError(
+                f"environment '{self.env_id}' in lanes takes no options of reset(), not {options}: "
+                "give arguments of gymnasium.make instead"
+            )
+        if seed is not None or not self.streams:
+            self.seed_from(seed)
+        self._begun = True
+        for lane in range(self.num_envs):
+            self._begin(lane)
+        return self._observations(), {}
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[
+        NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
+    ]:
+        """Take `actions` (L,) in all lanes.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        gymnasium.error.InvalidAction
+            If an action is not in 0 .. n - 1.
+        qrlsuite.errors.EnvironmentFailure
+            If an episode without a time limit gets too long to be checkpointed.
+        """
+        if not self._begun:
+            raise ResetNeeded("call reset() before step()")
+        actions = np.asarray(actions)
+        check_actions(actions, self.num_envs, int(self._action_space.n))
+        rewards = np.zeros(self.num_envs)
+        terminated = np.zeros(self.num_envs, dtype=np.bool_)
+        truncated = np.zeros(self.num_envs, dtype=np.bool_)
+        last: dict[int, dict[str, Any]] = {}
+        for lane in np.flatnonzero(~self._ended).tolist():
+            rewards[lane], terminated[lane], truncated[lane], info = self._play(lane, int(actions[lane]))
+            if terminated[lane] or truncated[lane]:
+                last[lane] = info
+        infos = self._finish(last, terminated | truncated) if last else {}
+        return self._observations(), rewards, terminated, truncated, infos
+
+    def state_dict(self) -> State:
+        """Return the episodes so far, lane-first.
+
+        `seed` (L,) of the last reset, `actions` (L, capacity) since then, -1 where there is none yet, and
+        `observation` (L, n) as it came from the environment.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("call reset() before state_dict()")
+        return {
+            "seed": self._seeds.copy(),
+            "actions": self._actions.copy(),
+            "observation": self._raw.copy(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Play the episodes of `state_dict` again; states may be sliced and joined along the lanes.
+
+        Raises
+        ------
+        qrlsuite.errors.StoreError
+            If an array is missing or has another shape, or an environment does not do again what it did.
+        """
+        shapes = {"seed": (self.num_envs,), "actions": self._actions.shape, "observation": self._raw.shape}
+        if set(state) != set(shapes):
+            raise StoreError(
+                f"environment '{self.env_id}': a state has {', '.join(sorted(shapes))}, "
+                f"not {', '.join(sorted(state))}"
+            )
+        for name, shape in shapes.items():
+            if state[name].shape != shape:
+                raise StoreError(
+                    f"environment '{self.env_id}': '{name}' has the shape {state[name].shape}, not {shape}"
+                )
+        for lane in range(self.num_envs):
+            try:
+                self._replay(lane, int(state["seed"][lane]), state["actions"][lane])
+            except Exception as error:  # whatever a stranger's environment raises is the user's to read
+                raise StoreError(
+                    f"environment '{self.env_id}' cannot be resumed: {type(error).__name__}: {error}"
+                ) from error
+            if not np.array_equal(self._raw[lane], state["observation"][lane], equal_nan=True):
+                raise StoreError(
+                    f"environment '{self.env_id}' cannot be resumed: with the same reset seed and the same actions "
+                    "it does something else, so its randomness does not all come from reset(seed=...)"
+                )
+        self._begun = True
+
+    def _replay(self, lane: int, seed: int, actions: NDArray[np.int32]) -> None:
+        """Play one lane's episode again, from its reset seed and its actions (capacity,), -1 after the last."""
+        self._begin(lane, seed)
+        for action in actions[: np.count_nonzero(actions >= 0)].tolist():
+            _, terminated, truncated, _ = self._play(lane, action)
+            self._ended[lane] = terminated or truncated
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close all environments."""
+        for env in self.envs:
+            env.close()
+
+    def _begin(self, lane: int, seed: int | None = None) -> None:
+        """Reset one lane with a seed from its stream, unless one is given."""
+        if seed is None:
+            stream = self.streams[lane // (self.num_envs // len(self.streams))]
+            seed = int(stream.integers(SEEDS))
+        observation, _ = self.envs[lane].reset(seed=seed)
+        self._seeds[lane] = seed
+        self._actions[lane] = -1
+        self._step[lane] = 0
+        self._ended[lane] = False
+        self._raw[lane] = self._flat(observation)
+
+    def _play(self, lane: int, action: int) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Take one step in one lane; returns reward, termination, truncation and info."""
+        if self._step[lane] == self.capacity:
+            raise EnvironmentFailure(
+                f"environment '{self.env_id}': an episode did not end within {self.capacity} steps; "
+                "give it a time limit (max_episode_steps)"
+            )
+        self._actions[lane, self._step[lane]] = action
+        self._step[lane] += 1
+        given = np.int64(action + self._action_space.start)
+        observation, reward, terminated, truncated, info = self.envs[lane].step(given)
+        self._raw[lane] = self._flat(observation)
+        return float(reward), bool(terminated), bool(truncated), info
+
+    def _finish(self, last: Mapping[int, dict[str, Any]], done: NDArray[np.bool_]) -> dict[str, Any]:
+        """Report the episodes that have ended (`last`: their infos by lane), and begin the next ones."""
+        infos: dict[str, Any] = {
+            "final_obs": np.where(done[:, None], self._observations(), np.float32(0.0)),
+            "_final_obs": done.copy(),
+            "final_info": {},
+            "_final_info": done.copy(),
+        }
+        scored = {lane: info["score"] for lane, info in last.items() if "score" in info}
+        if scored:
+            score = np.full(self.num_envs, np.nan)
+            score[list(scored)] = list(scored.values())
+            present = np.zeros(self.num_envs, dtype=np.bool_)
+            present[list(scored)] = True
+            infos["final_info"] = {"score": score, "_score": present}
+        self._ended |= done
+        if self.autoreset:
+            for lane in last:
+                self._begin(lane)
+        return infos
+
+    def _flat(self, observation: Any) -> NDArray[Any]:
+        """Return one observation as (n,)."""
+        if isinstance(self._raw_space, spaces.Box):  # nearly always, and six times faster
+            return np.asarray(observation, dtype=np.float32).reshape(-1)
+        return np.asarray(spaces.flatten(self._raw_space, observation))
+
+    def _observations(self) -> NDArray[np.float32]:
+        """Return the normalized observations (L, n), a new array."""
+        return self._normalize(self._raw.copy())
+
+
+def check_actions(actions: NDArray[Any], lanes: int, choices: int) -> None:
+    """Check that actions are (lanes,) integers in 0 .. choices - 1.
+
+    Raises
+    ------
+    gymnasium.error.InvalidAction
+        If not.
+    """
+    if actions.shape != (lanes,) or actions.dtype.kind not in "iu":
+        raise InvalidAction(f"actions must be {lanes} integers, not {actions.dtype} of shape {actions.shape}")
+    if actions.min() < 0 or actions.max() >= choices:
+        raise InvalidAction(f"actions must lie in 0..{choices - 1}, not {actions.min()}..{actions.max()}")
+
+
+def specification(env_id: str) -> gymnasium.envs.registration.EnvSpec:
+    """Return what Gymnasium knows of an id; for `"module:Name-v0"` the module is imported first.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the module cannot be imported, or the id is unknown: with the nearest known one.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # whatever a stranger's module raises is the user's to read
+            raise OptionError(
+                f"environment '{env_id}': module '{module}' cannot be imported: {type(error).__name__}: {error}"
+            ) from error
+    known = gymnasium.registry.get(name)
+    if known is None:
+        close = difflib.get_close_matches(name, gymnasium.registry, n=1, cutoff=0.5)
+        hint = f"did you mean '{close[0]}'?" if close else "gymnasium.pprint_registry() lists what it knows"
+        raise OptionError(
+            f"Gymnasium knows no environment '{name}'; {hint} (one of another package: MODULE:{name or 'ID'})"
+        )
+    return known
+
+
+def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Make one environment; Gymnasium's checks of every step are left out, for they cost more than the step.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If there is no such environment, a package that it needs is missing, or it refuses its arguments.
+    """
+    specification(env_id)
+    try:
+        return gymnasium.make(env_id, disable_env_checker=True, **arguments)
+    except DependencyNotInstalled as error:
+        raise OptionError(f"environment '{env_id}': {error}") from error
+    except ModuleNotFoundError as error:
+        package = str(error.name).partition(".")[0]
+        raise OptionError(
+            f"environment '{env_id}' needs a package that is not installed: pip install {package}"
+        ) from error
+    except Exception as error:
+        given = f" with {dict(arguments)}" if arguments else ""
+        raise OptionError(
+            f"environment '{env_id}' cannot be made{given}: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _supported(
+    env_id: str, env: gymnasium.Env[Any, Any]
+) -> tuple[spaces.Discrete, spaces.Space[Any], spaces.Box]:
+    """Return an environment's action space, observation space, and the latter's flat box.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the algorithms cannot act or observe in it.
+    """
+    action, observation = env.action_space, env.observation_space
+    if not isinstance(action, spaces.Discrete):
+        raise OptionError(
+            f"environment '{env_id}' has the action space {action}: only discrete actions are supported, "
+            "wrap it to choose among a few"
+        )
+    if not isinstance(observation, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
+        raise OptionError(
+            f"environment '{env_id}' has the observation space {observation}: only boxes and discrete observations "
+            "are supported, wrap it with gymnasium.wrappers.FlattenObservation"
+        )
+    flat: Any = spaces.flatten_space(observation)
+    limits = np.stack([flat.low, flat.high]).astype(np.float32)
+    return action, observation, spaces.Box(limits[0], limits[1], dtype=np.float32)
+
+
+def quick_task(env_id: str) -> dict[str, Any]:
+    """Return the content of a task file for a quick look at a Gymnasium environment, `--task gym:ID`.
+
+    20 seeds, 100 epochs of 1000 steps in 10 environments, 20 validation episodes. Thresholds on the return are
+    derived from the `reward_threshold` T at which Gymnasium counts the environment as solved: T - |T|,
+    T - |T|/2, T - |T|/4 and T, the last one shown first. Where Gymnasium knows none, the one threshold is 0:
+    a task file is needed to say what a good return is. Without a time limit, episodes are cut at 1000 steps.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If the environment cannot be made, or the algorithms cannot act or observe in it.
+    """
+    known = specification(env_id)
+    options: dict[str, Any] = {"id": env_id}
+    if known.max_episode_steps is None:
+        options["max_episode_steps"] = QUICK_STEPS
+    GymLanes(env_id, 1).close()
+    solved = known.reward_threshold
+    thresholds = [0.0]
+    if solved is not None:
+        thresholds = sorted({float(solved - abs(solved) * part) for part in (1, 0.5, 0.25, 0)})
+    return {
+        "format_version": 1,
+        "name": quick_name(env_id),
+        "summary": f"{env_id} of Gymnasium, with settings for a quick look",
+        "environment": {"name": "gym", "options": options},
+        "protocol": {
+            "seeds": 20,
+            "epochs": 100,
+            "environments": 10,
+            "interactions": 1000,
+            "validation_episodes": 20,
+        },
+        "score": {"source": "return"},
+        "ranking": {
+            "thresholds": thresholds,
+            "deltas": [0.5, 0.75],
+            "reference": {"threshold": thresholds[-1], "delta": 0.5},
+            "horizons": [100_000],
+        },
+    }
+
+
+def quick_name(env_id: str) -> str:
+    """Return the task name of `--task gym:ID`: usable as a folder, `gym-acrobot-v1`."""
+    words = re.findall(r"[a-z0-9]+", env_id.lower())
+    return "-".join(["gym", *words])[:64].rstrip("-")
