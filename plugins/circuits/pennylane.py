@@ -88,7 +88,10 @@ class PennyLaneBackend:
         """Return expectation values (S, B, observables), see `qrlsuite.circuit.CircuitBackend`."""
         # PennyLane's states are complex128 whatever the angles are, so float64 angles cost nothing.
         exact = {name: value.double() for name, value in parameters.items()}
-        return self._evaluate(self.table(inputs.double(), exact), seeds).to(inputs.dtype)
+        angles = self.table(inputs.double(), exact)
+        if self.diff_method != "backprop":
+            angles = angles.cpu()  # only default.qubit itself computes where torch's tensors are
+        return self._evaluate(angles, seeds).to(inputs)
 
     def _evaluate(self, angles: Tensor, seeds: Sequence[int] | None) -> Tensor:
         """Return expectation values (S, B, observables) from angles (A, S, B)."""

@@ -159,7 +159,7 @@ class QiskitBackend:
         """Return expectation values (S, B, observables), see `qrlsuite.circuit.CircuitBackend`."""
         S, B = inputs.shape[:2]
         exact = {name: value.double() for name, value in parameters.items()}
-        angles = self.table(inputs.double(), exact)
+        angles = self.table(inputs.double(), exact).cpu()
         if self.shots is None:
             values = self._run(self._exact, self.rotations(angles.reshape(-1, S * B)), inputs.dtype)
             values = values.reshape(S, B, -1)
@@ -171,7 +171,7 @@ class QiskitBackend:
                     for s, seed in enumerate(entropy)
                 ]
             )
-        result: Tensor = values.to(inputs.dtype)
+        result: Tensor = values.to(inputs)
         return result
 
     @staticmethod

@@ -76,10 +76,11 @@ class AngleTable:
         S = inputs.shape[0]
         fillers = inputs.new_tensor([0.0, 1.0]).expand(S, 2)
         flat = torch.cat([*(parameters[name].reshape(S, -1) for name in self.names), fillers], dim=1).t()
-        features = inputs.permute(2, 0, 1).index_select(0, self._feature)
-        scale = flat.index_select(0, self._scale)[..., None]
-        weight = flat.index_select(0, self._weight)[..., None]
+        device = inputs.device
+        features = inputs.permute(2, 0, 1).index_select(0, self._feature.to(device))
+        scale = flat.index_select(0, self._scale.to(device))[..., None]
+        weight = flat.index_select(0, self._weight.to(device))[..., None]
         angles = scale * features + weight
         if self._has_constant:
-            angles = angles + self._constant.to(inputs.dtype)[:, None, None]
+            angles = angles + self._constant.to(inputs)[:, None, None]
         return angles

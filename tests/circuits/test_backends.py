@@ -1,6 +1,7 @@
 """What every circuit backend must do, run on every registered ansatz and backend."""
 
 import functools
+import pkgutil
 
 import numpy as np
 import pytest
@@ -305,17 +306,28 @@ def test_without_seeds_samples_are_fresh(backend, options):
     assert not torch.equal(sampler(inputs, parameters), sampler(inputs, parameters))
 
 
-@pytest.mark.parametrize(("backend", "options"), SAMPLING)
-def test_backward_samples_are_not_those_of_the_forward_pass(backend, options):
-    # At angle 0 the shifted circuits of RX have <Z> = 0 with fresh noise: a gradient of exactly 0 would mean
-    # that both shifts drew the same samples.
-    circuit = Circuit(1)
-    circuit.append("RX", 0, circuit.input(0))
-    sampler = create_backend(backend, circuit, shots=101, **options)
-    inputs = torch.zeros(1, 20, 1, dtype=torch.float64, requires_grad=True)
-    sampler(inputs, {}, [5]).sum().backward()
-    assert float(inputs.grad.abs().max()) > 0
-    assert len(inputs.grad.unique()) > 3
+@pytest.mark.parametrize(
+    ("backend", "where", "argument"),
+    [
+        ("pennylane", "qrlsuite.plugins.circuits.pennylane._device", 2),
+        ("qiskit", "qrlsuite.plugins.circuits.qiskit.QiskitBackend._estimator", 2),
+    ],
+)
+def test_forward_and_backward_pass_do_not_share_their_samples(monkeypatch, backend, where, argument):
+    circuit = ansatz("cz", 2, 1)
+    sampler = create_backend(backend, circuit, shots=20)
+    module, _, name = where.rpartition(".")
+    original = getattr(pkgutil.resolve_name(module), name)
+    seeds = []
+
+    def spy(*arguments):
+        seed = arguments[argument]
+        seeds.append(int(seed.generate_state(1)[0]) if isinstance(seed, np.random.SeedSequence) else seed)
+        return original(*arguments)
+
+    monkeypatch.setattr(where, spy)
+    evaluate(sampler, *draw(circuit, 2, 2), seeds=[5, 6])
+    assert len(seeds) == len(set(seeds)) == 4  # two agents, two passes
 
 
 def test_sampling_leaves_global_random_numbers_alone():

@@ -105,15 +105,16 @@ def test_names_in_a_population_are_those_of_one_agent_with_a_leading_axis():
     ]
 
 
-@pytest.mark.parametrize("backend", FAST)
+SHAPES = [(3, 3, 64, "float32"), (3, 3, 64, "float64"), (4, 1, 7, "float32"), (5, 3, 1, "float64")]
+WIDE = (16, 3, 1, "float32")  # wide enough for batched matrix products
+
+
 @pytest.mark.parametrize(
-    ("qubits", "out", "batch", "dtype"),
+    ("backend", "qubits", "out", "batch", "dtype"),
     [
-        (3, 3, 64, "float32"),
-        (3, 3, 64, "float64"),
-        (4, 1, 7, "float32"),
-        (5, 3, 1, "float64"),
-        (16, 3, 1, "float32"),  # wide enough for batched matrix products
+        (backend, *shape)
+        for backend in FAST
+        for shape in (SHAPES if backend == "pennylane" else [*SHAPES, WIDE])
     ],
 )
 def test_an_agent_has_the_same_bits_alone_and_anywhere_in_a_population(backend, qubits, out, batch, dtype):
