@@ -27,6 +27,14 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
     """Register the backends."""
     register(
         CircuitBackendSpec(
+            name="native",
+            summary="The suite's own batched simulator with adjoint gradients; exact, no options",
+            options=f"{_HERE}.native:Options",
+            factory=f"{_HERE}.native:NativeBackend",
+        )
+    )
+    register(
+        CircuitBackendSpec(
             name="pennylane",
             summary="Any PennyLane device by name; options: device, diff_method, shots",
             options=f"{_HERE}.options:PennyLaneOptions",

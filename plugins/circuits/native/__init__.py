@@ -1,0 +1,7 @@
+"""The suite's own circuit simulator: compiled kernels on the CPU, torch on a GPU."""
+
+from __future__ import annotations
+
+from qrlsuite.plugins.circuits.native.backend import NativeBackend, Options
+
+__all__ = ["NativeBackend", "Options"]

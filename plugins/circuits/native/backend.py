@@ -1,0 +1,111 @@
+"""`NativeBackend`: the suite's own simulator behind the interface of every circuit backend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from qrlsuite.circuit import Circuit
+from qrlsuite.errors import OptionError
+from qrlsuite.plugins.circuits.native import dense
+from qrlsuite.plugins.circuits.native.program import compile_circuit
+
+if TYPE_CHECKING:
+    from qrlsuite.plugins.circuits.native.cpu import Simulator
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Options:
+    """The native simulator has no options: it is exact, and works in the precision of its inputs."""
+
+
+class NativeBackend:
+    """Batched statevector simulation with adjoint gradients, see `qrlsuite.circuit.CircuitBackend`.
+
+    On the CPU compiled kernels run on one thread; tensors on another device are computed there, by plain torch
+    operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state.
+
+    Parameters
+    ----------
+    circuit:
+        What to run; its whole content is compiled here, later changes have no effect.
+    options:
+        None are needed.
+    """
+
+    shots: int | None = None
+
+    def __init__(self, circuit: Circuit, options: Options | None = None) -> None:
+        self.shapes = {name: p.shape for name, p in circuit.parameters.items()}
+        self.program = compile_circuit(circuit)
+        self._simulator: Simulator | None = None
+
+    def __call__(
+        self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None = None
+    ) -> Tensor:
+        """Return expectation values (S, B, O), differentiable by inputs and parameters.
+
+        Parameters
+        ----------
+        inputs:
+            (S, B, I), float32 or float64.
+        parameters:
+            Every declared parameter by name, (S, *shape), of the inputs' dtype and device.
+        seeds:
+            Without meaning here: the values are exact.
+
+        Raises
+        ------
+        OptionError
+            For wrong shapes or dtypes, missing parameters, or values that are not finite.
+        """
+        self._check(inputs, parameters)
+        size = inputs.shape[0]
+        if self.shapes:
+            flat = torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
+        else:
+            flat = inputs.new_zeros((size, 0))
+        if inputs.device.type != "cpu":
+            result = dense.expectations(self.program, inputs, flat)
+        else:
+            result = self.simulator()(inputs, flat)
+        if not bool(torch.isfinite(result.detach().sum())):
+            raise OptionError("the circuit's inputs or parameters are not finite (NaN or infinite)")
+        return result
+
+    def simulator(self) -> Simulator:
+        """Return the CPU simulator, made when first needed."""
+        if self._simulator is None:
+            from qrlsuite.plugins.circuits.native.cpu import Simulator
+
+            self._simulator = Simulator(self.program)
+        return self._simulator
+
+    def _check(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> None:
+        if inputs.dim() != 3 or inputs.shape[2] != self.program.inputs or 0 in inputs.shape[:2]:
+            raise OptionError(
+                f"inputs have shape {tuple(inputs.shape)}: this circuit needs (seeds, batch, {self.program.inputs})"
+            )
+        if inputs.dtype not in (torch.float32, torch.float64):
+            raise OptionError(
+                f"inputs have dtype {inputs.dtype}: circuits are computed in float32 or float64"
+            )
+        for name, shape in self.shapes.items():
+            value = parameters.get(name)
+            if value is None:
+                raise OptionError(f"parameter '{name}' of shape {(inputs.shape[0], *shape)} is missing")
+            if tuple(value.shape) != (inputs.shape[0], *shape):
+                expected = (inputs.shape[0], *shape)
+                raise OptionError(
+                    f"parameter '{name}' has shape {tuple(value.shape)}, expected is {expected}"
+                )
+            if value.dtype != inputs.dtype:
+                raise OptionError(f"parameter '{name}' has dtype {value.dtype}, the inputs {inputs.dtype}")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NativeBackend:
+        return self
