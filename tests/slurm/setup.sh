@@ -70,12 +70,14 @@ LogFile=$state/slurmdbd.log
 END
 chmod 600 /etc/slurm/slurmdbd.conf
 
+# cred_expire: a task that goes back into the queue waits so many seconds, by default two minutes.
 # KillWait: seconds between SIGTERM and SIGKILL. OverTimeLimit 0: a time limit is a time limit.
 cat >/etc/slurm/slurm.conf <<END
 ClusterName=toy
 SlurmctldHost=$host(127.0.0.1)
 CommunicationParameters=NoInAddrAny,NoCtldInAddrAny
 AuthType=auth/munge
+AuthInfo=cred_expire=5
 SlurmUser=root
 SlurmdUser=root
 StateSaveLocation=$state/ctld

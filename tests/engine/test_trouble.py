@@ -1,0 +1,233 @@
+"""What the user sees when the disk is full, the folder read-only, the clock wrong, or somebody else at work."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import claims
+from qrlsuite.claims import SeedsClaimedError, acquire, living
+from qrlsuite.store import EntryStore
+from tests.conftest import TINY, results
+from tests.engine.stress import finished
+
+
+def qrlsuite(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
+    every = {**os.environ, **environment}
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=every)
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    task = tmp_path / "tiny.toml"
+    task.write_text(TINY)
+    return ["run", "--task", str(task), "--model", "mlp", "--set", "width=16", "--seeds", "2"]
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 200 kB of its own."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(path)]
+    done = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"a small tmpfs cannot be mounted here: {done.stderr.strip()}")
+    yield path
+    subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+def remount(disk: Path, option: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,{option}", str(disk)], check=True)
+
+
+def only_line(done: subprocess.CompletedProcess[str]) -> str:
+    """The one line after the announcement of the run."""
+    assert "Traceback" not in done.stderr, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+    return line
+
+
+def test_a_full_disk(disk: Path, words: list[str], tmp_path: Path) -> None:
+    runs = ["--runs", str(disk / "runs"), "--workers", "1"]
+    full = qrlsuite(*words, *runs, "--epochs", "250")
+    assert full.returncode == 2
+    assert "finished epochs are kept" in only_line(full)
+    assert "No space left on device" in only_line(full)
+    for command in ("runs", "status", "leaderboard"):
+        assert qrlsuite(command, "--runs", str(disk / "runs")).returncode == 0
+    remount(disk, "size=20m")
+    resumed = qrlsuite(*words, *runs, "--epochs", "250")
+    assert resumed.returncode == 0, resumed.stderr
+    qrlsuite(*words, "--runs", str(tmp_path / "straight"), "--workers", "1", "--epochs", "250")
+    entry, straight = finished(disk / "runs", 2, 250), finished(tmp_path / "straight", 2, 250)
+    assert entry is not None
+    assert straight is not None
+    for seed in (0, 1):
+        assert results(entry, seed) == results(straight, seed)
+
+
+def test_a_disk_that_is_full_from_the_start(disk: Path, words: list[str]) -> None:
+    status = os.statvfs(disk)
+    (disk / "filler").write_bytes(b"x" * (status.f_bavail - 1) * status.f_bsize)
+    done = qrlsuite(*words, "--runs", str(disk / "runs"), "--epochs", "2")
+    assert done.returncode == 2
+    assert "cannot write" in only_line(done)
+    assert "No space left on device" in only_line(done)
+
+
+def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
+    runs = ["--runs", str(disk / "runs")]
+    remount(disk, "size=20m")
+    assert qrlsuite(*words, *runs, "--epochs", "2").returncode == 0
+    remount(disk, "ro")
+    again = qrlsuite(*words, *runs, "--epochs", "2")
+    assert again.returncode == 0, "what is there can be asked for without writing"
+    more = qrlsuite(*words, *runs, "--epochs", "3")
+    assert more.returncode == 2
+    assert "cannot write" in only_line(more)
+    assert "Read-only file system" in only_line(more)
+    other = qrlsuite(*words[:-4], "--set", "width=8", *runs)
+    assert other.returncode == 2
+    assert "Read-only file system; what was there is unchanged" in only_line(other)
+    for command in (["runs"], ["status"], ["leaderboard"], ["runs", "gc"]):
+        done = qrlsuite(*command, *runs)
+        assert done.returncode == 0, done.stderr
+    gc = qrlsuite("runs", "gc", "--yes", *runs)
+    assert gc.returncode == 2
+    assert "Read-only file system" in only_line(gc)
+
+
+def test_two_commands_at_once(words: list[str], tmp_path: Path) -> None:
+    """Both begin before either has claimed anything; between them, every seed is trained once."""
+    command = [sys.executable, "-m", "qrlsuite", *words, "--epochs", "60", "--runs", str(tmp_path / "runs")]
+    both = [
+        subprocess.Popen([*command, "--workers", w], stderr=subprocess.PIPE, text=True) for w in ("1", "2")
+    ]
+    said = [process.communicate(timeout=200)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    text = "".join(said)
+    assert "are being trained by" in text, text
+    assert "Traceback" not in text
+    entry = finished(tmp_path / "runs", 2, 60)
+    if entry is None:  # one refused a group for a seed of it that the other trained
+        assert subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode == 0
+        entry = finished(tmp_path / "runs", 2, 60)
+    assert entry is not None
+    for seed in (0, 1):
+        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 61))
+
+
+@pytest.fixture
+def entry(train: Callable[..., Path]) -> EntryStore:
+    return EntryStore(train("runs", [0], 1))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claims, "WATCH", 0.6)
+
+
+def elsewhere(store: EntryStore, age: float, seeds: tuple[int, ...] = (0,)) -> Path:
+    """A claim of another machine, last refreshed `age` seconds ago."""
+    store.claims.mkdir(exist_ok=True)
+    path = store.claims / "other.json"
+    content = {"host": "node17", "pid": 4711, "namespace": "pid:[1]", "started": "1", "token": "other"}
+    path.write_text(json.dumps({**content, "seeds": list(seeds)}))
+    os.utime(path, (time.time() - age, time.time() - age))
+    return path
+
+
+@pytest.mark.parametrize("age", [0.0, 100.0, -100.0])
+def test_another_machines_fresh_claim_is_respected(entry: EntryStore, age: float, quick: None) -> None:
+    elsewhere(entry, age)
+    with pytest.raises(
+        SeedsClaimedError, match=r"process 4711 on node17.*this folder is a copy.*120 seconds after"
+    ):
+        acquire(entry, [0])
+    acquire(entry, [1]).release()
+
+
+@pytest.mark.parametrize("age", [1000.0, 1e8, -1000.0, -1e8])
+def test_a_claim_that_nobody_refreshes_is_taken_over_whatever_its_time(
+    entry: EntryStore, age: float, quick: None
+) -> None:
+    path = elsewhere(entry, age)
+    acquire(entry, [0]).release()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("age", [1000.0, 1e8, -1000.0, -1e8])
+def test_a_claim_that_is_refreshed_is_kept_whatever_its_time(
+    entry: EntryStore, age: float, quick: None
+) -> None:
+    """The clock jumped: the holder refreshes, with the times of a clock that is wrong."""
+    path = elsewhere(entry, age)
+    beats = threading.Timer(0.2, lambda: os.utime(path, (time.time() - age + 5, time.time() - age + 5)))
+    beats.start()
+    with pytest.raises(SeedsClaimedError, match="on node17"):
+        acquire(entry, [0])
+    beats.join()
+    assert path.exists()
+
+
+def test_a_claim_of_this_machine_does_not_depend_on_any_clock(entry: EntryStore) -> None:
+    claim = acquire(entry, [0])
+    for moment in (0.0, 4e9):
+        os.utime(claim.path, (moment, moment))
+        assert [holder.token for holder in living(entry)] == [claim.token]
+    claim.release()
+    assert living(entry) == []
+
+
+def test_another_container_of_this_machine_is_judged_like_another_machine(
+    entry: EntryStore, quick: None
+) -> None:
+    """Its process numbers mean nothing here: a number that is not running here says nothing about it."""
+    claim = acquire(entry, [0])
+    content = json.loads(claim.path.read_text())
+    claim.path.write_text(json.dumps({**content, "namespace": "pid:[1]", "pid": 2**22}))
+    with pytest.raises(SeedsClaimedError):
+        acquire(entry, [0])
+
+
+def test_a_file_system_that_does_not_answer_for_a_moment(
+    entry: EntryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claim = acquire(entry, [0])
+
+    def stale(path: object, *rest: object) -> None:
+        raise OSError(116, "Stale file handle")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "utime", stale)
+        assert claim.refresh(), "no reason to stop training"
+    claim.release()
+    assert not claim.refresh(), "a claim that is gone is lost"
+
+
+def test_a_folder_copied_while_it_was_at_work(words: list[str], tmp_path: Path) -> None:
+    """The copy holds a claim of another machine: at first it is respected, and the message says why and how long."""
+    assert qrlsuite(*words, "--runs", str(tmp_path / "here"), "--epochs", "2").returncode == 0
+    shutil.copytree(tmp_path / "here", tmp_path / "there")
+    (path,) = (tmp_path / "there").glob("*/*/entry.json")
+    store = EntryStore(path.parent)
+    claim = elsewhere(store, age=0.0, seeds=(0, 1))
+    more = [*words, "--runs", str(tmp_path / "there"), "--epochs", "3"]
+    waits = qrlsuite(*more)
+    assert waits.returncode == 0
+    assert "2 of the seeds are being trained by another process and are left to it" in waits.stderr
+    assert "node17" in qrlsuite("status", "--runs", str(tmp_path / "there")).stdout
+    claim.unlink()
+    assert qrlsuite(*more).returncode == 0
+    assert store.finished([0, 1], 3) == {0, 1}
