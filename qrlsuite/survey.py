@@ -12,6 +12,7 @@ from typing import Any
 
 from qrlsuite import checkpoint
 from qrlsuite.claims import Claim, SeedsClaimedError, acquire, living
+from qrlsuite.engine.groups import read_progress
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.store import EntryStore, entries, read_json, read_lines
 
@@ -181,8 +182,6 @@ class GroupStatus:
 
 def groups(store: EntryStore) -> list[GroupStatus]:
     """Return the groups of an entry that have not finished: those at work first, then waiting, then stopped."""
-    from qrlsuite.engine.groups import read_progress
-
     alive = living(store)
     found = [_running(store, claim) for claim in alive]
     seen = {seed for claim in alive for seed in claim.seeds}
@@ -190,7 +189,8 @@ def groups(store: EntryStore) -> list[GroupStatus]:
     for task in waiting(store, []):
         rest = tuple(seed for seed in task["seeds"] if seed not in seen | done)
         if rest:
-            found.append(GroupStatus(rest, "submitted", f"job {task['job']}"))
+            path = store.groups / checkpoint.group_id(task["seeds"]) / "progress.json"
+            found.append(GroupStatus(rest, "submitted", f"job {task['job']}", read_progress(path)))
             seen |= set(rest)
     left = set(store.seeds()) - seen - done
     for path in sorted(store.groups.glob("*/progress.json")):
@@ -203,8 +203,6 @@ def groups(store: EntryStore) -> list[GroupStatus]:
 
 
 def _running(store: EntryStore, claim: Claim) -> GroupStatus:
-    from qrlsuite.engine.groups import read_progress
-
     path = store.groups / checkpoint.group_id(claim.seeds or (0,)) / "progress.json"
     return GroupStatus(claim.seeds, "running", f"{claim.host}, process {claim.pid}", read_progress(path))
 

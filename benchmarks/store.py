@@ -1,0 +1,79 @@
+"""What storing and checkpointing cost: shares of one run of an MLP with 100 seeds.
+
+    python benchmarks/store.py [--seeds 100] [--epochs 5] [--task beam6g] [--runs DIR]
+
+Clocks around the runner's own steps count the seconds of one training in this process: *record* (a line per seed and
+epoch), *capture* (copying the state after every epoch), *save* (forcing lines to the disk, writing the checkpoint),
+*finish* (trained agents, tables, records; once per run). A run saves every minute, or after every epoch that takes
+longer; so the share is given per minute of a long run, from the seconds that each step took. Target: under 3 percent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from qrlsuite import run
+from qrlsuite.entry import resolve
+from qrlsuite.run import GroupRun
+from qrlsuite.store import EntryStore
+
+STEPS = {"record": "_record", "capture": "_capture", "save": "_save", "finish": "_finish"}
+
+
+def clocked(seconds: dict[str, list[float]], name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    def step(self: GroupRun, *arguments: Any) -> Any:
+        began = time.perf_counter()
+        try:
+            return method(self, *arguments)
+        finally:
+            seconds[name].append(time.perf_counter() - began)
+
+    return step
+
+
+def measure(task: str, seeds: int, epochs: int, runs: Path) -> dict[str, Any]:
+    """Train and return seconds per step, shares and sizes."""
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for name, method in {"epoch": "_one_epoch", **STEPS}.items():
+        setattr(GroupRun, method, clocked(seconds, name, getattr(GroupRun, method)))
+    store = EntryStore.create(runs, resolve(task, "mlp"))
+    began = time.perf_counter()
+    GroupRun(store.entry(), store, range(seeds), epochs).run()
+    total = time.perf_counter() - began
+    mean = {name: sum(values) / len(values) for name, values in seconds.items()}
+    period = max(run.CHECKPOINT_SECONDS, mean["epoch"])
+    per_epoch = mean["record"] + mean["capture"]
+    share = per_epoch / (mean["epoch"] + per_epoch) + max(seconds["save"]) / period
+    return {
+        "seeds": seeds,
+        "epochs": epochs,
+        "total_seconds": total,
+        "seconds_per": {name: round(value, 4) for name, value in mean.items()},
+        "checkpoint_megabytes": sum(p.stat().st_size for p in store.groups.glob("*/*.safetensors")) / 1e6,
+        "percent_of_this_run": 100 * sum(sum(seconds[name]) for name in STEPS) / total,
+        "percent_of_a_long_run": 100 * share,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--task", default="beam6g")
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--epochs", type=int, default=5)
+    parser.add_argument("--runs", type=Path, help="where to store; default: a temporary folder")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        print(
+            json.dumps(measure(given.task, given.seeds, given.epochs, given.runs or Path(folder)), indent=1)
+        )
+
+
+if __name__ == "__main__":
+    main()
