@@ -1,0 +1,294 @@
+"""Tasks on Gymnasium's environments: files, `gym:ID` without a file, and environments that fail in a run."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrlsuite import options, registry, run, specs, task
+from qrlsuite.entry import Entry, resolve
+from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
+from qrlsuite.gymlanes import GymLanes, quick_name
+from qrlsuite.hookspecs import hookimpl
+from qrlsuite.store import EntryStore
+from qrlsuite.tasks import placements
+from tests.conftest import results
+from tests.environments.strangers import HERE
+
+ROOT = Path(__file__).parents[2]
+TASKS = Path(placements.__file__).parent
+PRESETS = [
+    (name, preset, algorithm, family)
+    for name in registry.load().names("tasks")
+    for preset, tables in task.load(name).file.presets.items()
+    for algorithm, families in tables.items()
+    for family in ("classical", "quantum")
+    if families.keys() & {"all", family}
+]
+
+
+def cli(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "qrlsuite", *words]
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(cwd)}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", registry.load().names("tasks"))
+def test_every_task_is_whole(name: str) -> None:
+    loaded = task.load(name)
+    file = loaded.file
+    assert task.Task(task.TaskFile.model_validate(file.model_dump(mode="json")), "again").hash == loaded.hash
+    reference, ranking = file.ranking.reference, file.ranking
+    assert min(ranking.deltas) <= reference.delta <= max(ranking.deltas)
+    if ranking.thresholds is None:
+        assert reference.epsilon in (ranking.epsilons or [])
+    else:
+        assert reference.threshold in ranking.thresholds
+        assert file.score.max_return is None
+    steps = {file.protocol.interactions * epochs for epochs in file.protocol.algorithm_epochs.values()}
+    assert set(ranking.horizons) == steps | {file.protocol.interactions * file.protocol.epochs}
+
+
+@pytest.mark.parametrize(("name", "preset", "algorithm", "family"), PRESETS)
+def test_every_preset_is_made_of_options(name: str, preset: str, algorithm: str, family: str) -> None:
+    if algorithm not in registry.load().names("algorithms"):
+        pytest.skip(f"{algorithm} is not registered")
+    _, values = task.load(name).preset(preset, algorithm, family)
+    built = options.build(specs.resolve(registry.algorithm(algorithm).options), values, "preset")
+    assert {key: value for key, value in options.plain(built).items() if key in values} == values
+
+
+def test_cartpole_is_as_the_benchmark_says() -> None:
+    file = task.load("cartpole").file
+    assert (file.protocol.interactions, file.protocol.environments, file.protocol.epochs) == (1000, 10, 500)
+    assert (file.protocol.validation_episodes, file.score.max_return) == (100, 500)
+    assert file.ranking.epsilons == [0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4]
+    assert file.ranking.deltas == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+    assert file.default_algorithm == "reinforce"
+
+
+@pytest.mark.parametrize("name", placements.files())
+def test_the_placements_files_are_what_the_script_writes(name: str) -> None:
+    assert (TASKS / name).read_text(encoding="utf-8") == placements.files()[name]
+
+
+def test_all_twenty_placements_are_there_and_differ() -> None:
+    names = [name for name in registry.load().names("tasks") if re.fullmatch(r"beam6g-a\d-\d", name)]
+    assert names == [f"beam6g-a{antennas}-{index}" for antennas in (2, 3, 4, 5) for index in range(5)]
+    assert len({task.load(name).hash for name in names}) == 20
+    for name in names:
+        assert len(task.load(name).environment_options.antennas) == int(name[8])
+        assert "ours" in task.load(name).file.summary
+
+
+def test_the_text_variant_differs_from_beam6g_in_its_physics_alone() -> None:
+    text, released = (task.load(name).file for name in ("beam6g-text", "beam6g"))
+    assert text.environment.options == released.environment.options | {"physics": "text"}
+    for section in ("protocol", "score", "ranking", "presets", "default_algorithm", "default_preset"):
+        assert getattr(text, section) == getattr(released, section)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "thresholds"),
+    [
+        ("Acrobot-v1", [-200, -150, -125, -100]),
+        ("CartPole-v1", [0, 237.5, 356.25, 475]),
+        ("CliffWalking-v1", [0]),
+        (f"{HERE}:Walk-v0", [0]),
+    ],
+)
+def test_a_task_without_a_file(env_id: str, thresholds: list[float]) -> None:
+    quick = task.load(f"gym:{env_id}")
+    assert quick.environment_options.id == env_id
+    assert quick.file.ranking.thresholds == thresholds
+    assert quick.file.ranking.reference.threshold == thresholds[-1]
+    assert quick.file.score.source == "return"
+    unlimited = env_id.startswith("CliffWalking")
+    assert quick.environment_options.max_episode_steps == (1000 if unlimited else None)
+    assert quick.hash == task.load(f"gym:{env_id}").hash
+
+
+def test_names_of_tasks_without_a_file_are_names() -> None:
+    for env_id in ("Acrobot-v1", "phys2d/CartPole-v1", "a.b:C_d/E-v0", "X" * 99, "a" * 59 + "-b"):
+        assert specs.NAME.fullmatch(quick_name(env_id))
+        assert len(quick_name(env_id)) <= 64
+    assert quick_name("phys2d/CartPole-v1") == "gym-phys2d-cartpole-v1"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("Acrobat-v1", "knows no environment 'Acrobat-v1'; did you mean 'Acrobot-v1'"),
+        ("Pendulum-v1", "only discrete actions are supported"),
+        ("Blackjack-v1", "only boxes and discrete observations are supported"),
+        ("", "knows no environment ''"),
+    ],
+)
+def test_tasks_without_a_file_that_cannot_be(env_id: str, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        task.load(f"gym:{env_id}")
+
+
+def test_a_task_file_names_an_unknown_id_with_its_path(tmp_path: Path) -> None:
+    text = (TASKS / "acrobot.toml").read_text().replace("Acrobot-v1", "Acrobat-v1")
+    with pytest.raises(
+        QrlSuiteError, match=r"t.toml: environment.options: id = 'Acrobat-v1': .*'Acrobot-v1'"
+    ):
+        task.parse(text, "t.toml")
+
+
+def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
+    words = ["run", "--task", "gym:FrozenLake-v1", "--model", "mlp", "--seeds", "2", "--epochs", "2"]
+    done = cli(*words, "--runs", "tmp", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert (summary["task"], summary["seeds"], summary["epochs"]) == ("gym-frozenlake-v1", 2, 2)
+    assert 0 <= summary["median_score"] <= 1
+    wrong = cli("run", "--task", "gym:Pendulum-v1", "--model", "mlp", "--runs", "tmp", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert len(wrong.stderr.strip().splitlines()) == 1
+    assert "only discrete actions are supported" in wrong.stderr
+
+
+TASK = """
+format_version = 1
+name = "stranger"
+summary = "An environment of a third party"
+[environment]
+name = "gym"
+[environment.options]
+id = "{env_id}"
+arguments = {{ {arguments} }}
+[protocol]
+seeds = 2
+epochs = 4
+environments = 2
+interactions = 20
+validation_episodes = 3
+[score]
+source = "{source}"
+[ranking]
+thresholds = [0.5]
+deltas = [0.5]
+reference = {{ threshold = 0.5, delta = 0.5 }}
+horizons = [80]
+"""
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Callable[..., Entry]:
+    """An entry on an environment of `tests.environments.strangers`."""
+
+    def build(name: str = "Walk-v0", source: str = "return", **arguments: Any) -> Entry:
+        words = ", ".join(f"{key} = {json.dumps(value)}" for key, value in arguments.items())
+        path = tmp_path / "stranger.toml"
+        path.write_text(TASK.format(env_id=f"{HERE}:{name}", arguments=words, source=source))
+        return resolve(str(path), "mlp", settings=[options.parse_setting("width=8")])
+
+    return build
+
+
+def train(entry: Entry, folder: Path, seeds: list[int], epochs: int = 4) -> EntryStore:
+    store = EntryStore.create(folder, entry)
+    run.GroupRun(entry, store, seeds, epochs).run()
+    return store
+
+
+def test_seeds_together_and_apart_and_resumed(
+    stranger: Callable[..., Entry], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of different lengths, cut by epochs' ends: the same bytes however seeds are grouped."""
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    entry = stranger()
+    together = train(entry, tmp_path / "together", [0, 1])
+    mixed = tmp_path / "mixed"
+    train(entry, mixed, [1], 2)
+    train(entry, mixed, [0], 2)
+    train(entry, mixed, [1, 0], 3)
+    apart = train(entry, mixed, [0], 4)
+    train(entry, mixed, [1], 4)
+    for seed in (0, 1):
+        assert results(together.path, seed) == results(apart.path, seed)
+    assert results(together.path, 0) != results(together.path, 1)
+
+
+def test_scores_are_the_environments_or_returns(stranger: Callable[..., Entry], tmp_path: Path) -> None:
+    scores = train(stranger(source="info"), tmp_path / "info", [0]).seed(0).epochs()[-1]["scores"]
+    steps = np.array(scores) * 12
+    np.testing.assert_allclose(steps, steps.round(), atol=1e-5)
+    assert (steps >= 3).all()
+    with pytest.raises(EnvironmentFailure, match=r"gave no info\['score'\] at the end of an episode"):
+        train(stranger(source="info", scored=False), tmp_path / "none", [0])
+
+
+def test_an_environment_that_raises_fails_its_group_and_keeps_finished_epochs(
+    stranger: Callable[..., Entry], tmp_path: Path
+) -> None:
+    """It raises in training, in the 25th round of 10 per epoch: two epochs stay, and the rest comes later."""
+    marker = tmp_path / "marker"
+    entry = stranger("Broken-v0", marker=str(marker))
+    store = EntryStore.create(tmp_path / "runs", entry)
+    with pytest.raises(
+        EnvironmentFailure,
+        match=r"environment 'gym' failed: ZeroDivisionError: the cart left the rails; finished",
+    ):
+        run.GroupRun(entry, store, [0], 4).run()
+    assert [row["epoch"] for row in store.seed(0).epochs()] == [1, 2]
+    run.GroupRun(entry, store, [0], 4).run()
+    undisturbed = train(entry, tmp_path / "undisturbed", [0])
+    assert results(store.path, 0) == results(undisturbed.path, 0)
+
+
+def test_other_groups_go_on_when_one_fails(stranger: Callable[..., Entry], tmp_path: Path) -> None:
+    entry = stranger("Broken-v0", marker=str(tmp_path / "marker"))
+    words = ["run", "--task", "stranger.toml", "--model", "mlp", "--set", "width=8", "--workers", "2"]
+    failed = cli(*words, "--runs", "runs", cwd=tmp_path)
+    assert failed.returncode == 2
+    assert "1 group(s) failed, finished epochs are kept" in failed.stderr
+    assert "ZeroDivisionError: the cart left the rails" in failed.stderr
+    store = EntryStore.create(tmp_path / "runs", entry)
+    assert sorted(len(store.seed(seed).epochs()) for seed in (0, 1)) == [2, 4]
+    again = cli(*words, "--runs", "runs", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert [len(store.seed(seed).epochs()) for seed in (0, 1)] == [4, 4]
+
+
+def test_a_spec_without_a_vector_form_gets_the_generic_one(
+    stranger: Callable[..., Entry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its options are the keyword arguments of its environment, which is registered by its spec alone."""
+    spec = specs.EnvironmentSpec(
+        name="walk",
+        summary="A walk",
+        options=f"{HERE}:WalkOptions",
+        gymnasium_id="strangers/WalkBySpec-v0",
+        entry_point=f"{HERE}:Walk",
+    )
+
+    class Plugin:
+        @hookimpl
+        def register_environments(self, register: Any) -> None:
+            register(spec)
+
+    fresh = registry.create(strict=True)
+    fresh.add_plugin(Plugin(), "strangers")
+    monkeypatch.setattr(registry, "load", lambda: fresh)
+    text = TASK.format(env_id="", arguments="", source="info").replace('name = "gym"', 'name = "walk"')
+    text = re.sub(r"id = .*\narguments = .*", "start = 3", text)
+    entry = Entry(task.parse(text, "t"), *[None] * 5)  # type: ignore[arg-type]
+    envs = run.build_envs(entry, 4, lambda: None)
+    assert isinstance(envs.inner, GymLanes)
+    assert envs.inner.envs[3].unwrapped.action_space.start == 3  # type: ignore[attr-defined]
+    envs.seed_lanes([np.random.default_rng(g) for g in range(4)])
+    envs.reset()
+    for _ in range(15):
+        envs.step(np.zeros(4, dtype=np.int64))
+    assert len(envs.take_finished()[0]) >= 4

@@ -1,0 +1,108 @@
+"""Small environments of a third party, registered on import: `strangers:...-v0` in the tests of generic lanes."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from pydantic.dataclasses import dataclass
+
+HERE = "tests.environments.strangers"
+
+
+class Walk(gymnasium.Env[Any, Any]):
+    """A random walk of random length; what it shows depends on `kind`, and `start` shifts its actions."""
+
+    def __init__(self, kind: str = "box", start: int = 0, scored: bool = True) -> None:
+        self.kind = kind
+        self.scored = scored
+        self.action_space: Any = spaces.Discrete(3, start=start)
+        self.observation_space: Any = {
+            "box": spaces.Box(-10, 10, (2, 2), np.float64),
+            "image": spaces.Box(0, 255, (2, 2), np.uint8),
+            "discrete": spaces.Discrete(5, start=1),
+            "binary": spaces.MultiBinary(3),
+            "multi": spaces.MultiDiscrete([2, 3]),
+            "dict": spaces.Dict(a=spaces.Discrete(2)),
+            "tuple": spaces.Tuple([spaces.Discrete(2)]),
+        }[kind]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        super().reset(seed=seed)
+        self.length = int(self.np_random.integers(3, 12))
+        self.steps = 0
+        self.position = float(self.np_random.normal())
+        return self._observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert action in self.action_space, action
+        self.steps += 1
+        self.position += float(self.np_random.normal()) + float(action)
+        ended = self.steps == self.length
+        info = {"score": self.steps / 12} if ended and self.scored else {}
+        return self._observe(), self.position, ended, False, info
+
+    def _observe(self) -> Any:
+        return {
+            "box": np.tanh([[self.position, self.steps], [1.0, 0.0]]),
+            "image": np.full((2, 2), min(self.steps, 255), np.uint8),
+            "discrete": 1 + self.steps % 5,
+            "binary": np.array([self.steps & 1, self.steps >> 1 & 1, self.steps >> 2 & 1], np.int8),
+            "multi": np.array([self.steps % 2, self.steps % 3]),
+            "dict": {"a": 0},
+            "tuple": (0,),
+        }[self.kind]
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """Options of `Walk`."""
+
+    start: int = 0
+
+
+class Forgetful(Walk):
+    """Has randomness of its own, that a seed does not reach."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.position += int.from_bytes(os.urandom(4)) / 2**32
+        return super().step(action)
+
+
+class Endless(Walk):
+    """Never ends."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.length = -1
+        return super().step(action)
+
+
+class Broken(Walk):
+    """Raises once, in the step after the 24th of one of its instances: whichever creates the file `marker`."""
+
+    def __init__(self, marker: str) -> None:
+        super().__init__()
+        self.marker = marker
+        self.taken = 0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.taken += 1
+        if self.taken > 24 and not os.path.exists(self.marker):
+            os.close(os.open(self.marker, os.O_CREAT | os.O_EXCL))
+            raise ZeroDivisionError("the cart left the rails")
+        return super().step(action)
+
+
+class Unmade(Walk):
+    """Needs a package that nobody has."""
+
+    def __init__(self) -> None:
+        import no_such_package.inner  # noqa: F401
+
+
+for name, limit in [("Walk", 20), ("Forgetful", 20), ("Endless", None), ("Broken", 20), ("Unmade", 20)]:
+    gymnasium.register(f"{name}-v0", f"{HERE}:{name}", max_episode_steps=limit, disable_env_checker=True)
+gymnasium.register("Cut-v0", f"{HERE}:Endless", max_episode_steps=4, disable_env_checker=True)

@@ -1,0 +1,358 @@
+"""CartPole in lanes is Gymnasium's CartPole-v1 to the last bit, in every lane and whatever the number of lanes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.plugins.environments.cartpole import (
+    FORCE,
+    GRAVITY,
+    ID,
+    LENGTH,
+    POLE_MASS,
+    TAU,
+    TOTAL_MASS,
+    CartPoleLanes,
+    Options,
+    advance,
+    make_vector,
+    parse,
+)
+
+
+def lanes(count: int, streams: int | None = None, **options: Any) -> CartPoleLanes:
+    env = CartPoleLanes(parse(options), count)
+    env.seed_lanes([np.random.default_rng(g) for g in range(streams or count)])
+    return env
+
+
+def single(stream: int) -> CartPoleEnv:
+    env = CartPoleEnv()
+    env.np_random = np.random.default_rng(stream)
+    return env
+
+
+def test_one_step_by_hand() -> None:
+    """Pushed to the right at rest and upright: 10 N on both masses, and the pole's angle lags behind."""
+    after = advance(np.zeros((4, 1)), np.array([1]))[:, 0]
+    push = FORCE / TOTAL_MASS
+    falling = -push / (LENGTH * (4 / 3 - POLE_MASS / TOTAL_MASS))
+    assert after[0] == 0
+    assert after[2] == 0
+    assert after[1] == pytest.approx(TAU * (push - POLE_MASS * LENGTH * falling / TOTAL_MASS))
+    assert after[3] == pytest.approx(TAU * falling)
+    tilted = advance(np.array([[0.0], [0.0], [0.1], [0.0]]), np.array([1]))[3, 0]
+    assert tilted > after[3]
+    assert GRAVITY == 9.8
+
+
+def test_gymnasium_step_for_step_from_given_states() -> None:
+    """500 random actions in 7 lanes that a controller keeps upright a while: everything agrees to the last bit."""
+    count = 7
+    generator = np.random.default_rng(3)
+    start = generator.uniform(-0.05, 0.05, (count, 4))
+    env, singles = lanes(count), [single(lane) for lane in range(count)]
+    observations, _ = env.reset(options={"state": start})
+    for lane, one in enumerate(singles):
+        one.reset()
+        one.state = start[lane].copy()
+    env.seed_lanes([one.np_random for one in singles])  # a lane and its single environment share a stream
+    episodes = 0
+    for _ in range(500):
+        actions = np.where(generator.random(count) < 0.2, generator.integers(0, 2, count), env.state[2] > 0)
+        before = [one.np_random.bit_generator.state for one in singles]
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+        assert observations.dtype == np.float32
+        assert rewards.dtype == np.float64
+        for lane, one in enumerate(singles):
+            expected, reward, fallen, _, _ = one.step(int(actions[lane]))
+            assert (rewards[lane], terminated[lane]) == (reward, fallen)
+            assert fallen == bool(infos and infos["_final_obs"][lane])
+            if fallen:
+                episodes += 1
+                np.testing.assert_array_equal(infos["final_obs"][lane], expected)
+                one.np_random.bit_generator.state = before[lane]
+                expected, _ = one.reset()
+            elif truncated[lane]:
+                one.np_random.bit_generator.state = before[lane]
+                expected, _ = one.reset()
+            np.testing.assert_array_equal(env.state[:, lane], one.state)
+            np.testing.assert_array_equal(observations[lane], expected)
+    assert episodes > 3
+
+
+def test_a_lane_with_its_own_stream_plays_a_single_environments_episodes() -> None:
+    env, one = lanes(3), single(1)
+    observations, _ = env.reset()
+    expected, _ = one.reset()
+    np.testing.assert_array_equal(observations[1], expected)
+    for action in np.random.default_rng(0).integers(0, 2, 300):
+        observations, _, terminated, _, _ = env.step(np.full(3, action))
+        expected, _, fallen, _, _ = one.step(int(action))
+        assert terminated[1] == fallen
+        if fallen:
+            expected, _ = one.reset()
+        np.testing.assert_array_equal(observations[1], expected)
+
+
+@pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
+@pytest.mark.parametrize(("offset", "size"), [(0, 1), (1, 1), (3, 7), (5, 9), (13, 33), (64, 65), (127, 2)])
+def test_a_lane_does_not_depend_on_its_position_or_on_the_number_of_lanes(
+    offset: int, size: int, normalization: str
+) -> None:
+    total = 129
+    actions = np.random.default_rng(1).integers(0, 2, (60, total))
+    part = slice(offset, offset + size)
+    together = lanes(total, normalization=normalization)
+    apart = CartPoleLanes(parse({"normalization": normalization}), size)
+    apart.seed_lanes([np.random.default_rng(g) for g in range(offset, offset + size)])
+    np.testing.assert_array_equal(together.reset()[0][part], apart.reset()[0])
+    for row in actions:
+        whole, some = together.step(row), apart.step(row[part])
+        np.testing.assert_array_equal(whole[0][part], some[0])
+        np.testing.assert_array_equal(whole[2][part], some[2])
+        np.testing.assert_array_equal(together.state[:, part], apart.state)
+
+
+def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
+    env = lanes(6, streams=2)
+    observations, _ = env.reset()
+    second = np.random.default_rng(1)
+    np.testing.assert_array_equal(env.state[:, 3:].T, second.uniform(-0.05, 0.05, (3, 4)))
+    alone = CartPoleLanes(Options(), 3)
+    alone.seed_lanes([np.random.default_rng(1)])
+    np.testing.assert_array_equal(alone.reset()[0], observations[3:])
+    env.state[2, [3, 5]] = 1.0  # two of the second stream's lanes fall; they are reset in their order
+    env.step(np.zeros(6, dtype=np.int64))
+    np.testing.assert_array_equal(env.state[:, [3, 5]].T, second.uniform(-0.05, 0.05, (2, 4)))
+
+
+def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
+    first, again, other = (lanes(4).reset(seed=seed)[0] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
+
+
+def balance(state: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A linear controller that keeps the pole up for good."""
+    return (state[0] * 0.1 + state[1] * 0.3 + state[2] * 3 + state[3] > 0).astype(np.int64)
+
+
+def test_500_steps_are_truncation_and_not_termination() -> None:
+    env = lanes(3)
+    env.reset()
+    env.step(balance(env.state))
+    env.state[2, 1] = 0.5  # lane 1 falls now, so its next episode is two steps behind
+    for step in range(2, 503):
+        _, _, terminated, truncated, infos = env.step(balance(env.state))
+        assert terminated.tolist() == [False, step == 2, False]
+        assert truncated.tolist() == [step == 500, step == 502, step == 500]
+    assert infos["_final_obs"].tolist() == [False, True, False]
+
+
+def test_a_fall_in_the_last_step_is_both() -> None:
+    env = lanes(2, steps=1)
+    env.reset(options={"state": [[0, 0, 0, 0], [0, 0, 0.3, 0]]})
+    _, rewards, terminated, truncated, _ = env.step(np.zeros(2, dtype=np.int64))
+    assert rewards.tolist() == [1, 1]
+    assert terminated.tolist() == [False, True]
+    assert truncated.tolist() == [True, True]
+
+
+@pytest.mark.parametrize(("variable", "limit"), [(0, 2.4), (2, 12 * 2 * np.pi / 360)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_limits(variable: int, limit: float, sign: int) -> None:
+    state = np.zeros((2, 4))
+    state[0, variable] = sign * limit
+    state[1, variable] = sign * np.nextafter(limit, 9)
+    env = lanes(2)
+    env.reset(options={"state": state})
+    assert env.step(np.zeros(2, dtype=np.int64))[2].tolist() == [False, True]
+
+
+def test_without_autoreset_an_ended_lane_stays_put() -> None:
+    env = lanes(3)
+    env.autoreset = False
+    env.reset(options={"state": [[0, 0, 0, 0], [0, 0, 0.3, 0], [0, 0, 0, 0]]})
+    fallen, rewards, terminated, _, infos = env.step(np.ones(3, dtype=np.int64))
+    assert terminated.tolist() == [False, True, False]
+    assert rewards.tolist() == [1, 1, 1]
+    np.testing.assert_array_equal(infos["final_obs"][1], fallen[1])
+    free, _ = lanes(1), lanes(1).reset()
+    free.reset(options={"state": np.zeros((1, 4))})
+    for _ in range(4):
+        free.step(np.ones(1, dtype=np.int64))
+    for _ in range(3):
+        observations, rewards, terminated, truncated, infos = env.step(np.ones(3, dtype=np.int64))
+        np.testing.assert_array_equal(observations[1], fallen[1])
+        assert rewards.tolist() == [1, 0, 1]
+        assert not (terminated | truncated).any()
+        assert not infos
+    np.testing.assert_array_equal(env.state[:, 2], free.state[:, 0])
+    env.reset()
+    assert env.step(np.ones(3, dtype=np.int64))[1].tolist() == [1, 1, 1]
+
+
+def test_resuming_is_exact_and_states_are_sliced_and_joined() -> None:
+    actions = np.random.default_rng(2).integers(0, 2, (80, 4))
+    straight, stopped = lanes(4), lanes(4)
+    straight.reset()
+    stopped.reset()
+    for row in actions[:40]:
+        straight.step(row)
+        stopped.step(row)
+    state = stopped.state_dict()
+    halves = []
+    for part in (slice(0, 2), slice(2, 4)):
+        half = CartPoleLanes(Options(), 2)
+        half.seed_lanes(stopped.streams[part])
+        half.load_state_dict({name: values[part].copy() for name, values in state.items()})
+        halves.append((half, part))
+    for row in actions[40:]:
+        expected = straight.step(row)
+        for half, part in halves:
+            for values, wanted in zip(half.step(row[part])[:4], expected[:4]):
+                np.testing.assert_array_equal(values, wanted[part])
+    np.testing.assert_array_equal(np.hstack([half.state for half, _ in halves]), straight.state)
+
+
+def test_a_state_is_a_copy() -> None:
+    env = lanes(2)
+    env.reset()
+    state = env.state_dict()
+    before = {name: values.copy() for name, values in state.items()}
+    env.step(np.ones(2, dtype=np.int64))
+    for name, values in state.items():
+        np.testing.assert_array_equal(values, before[name])
+    assert state["state"].shape == (2, 4)
+
+
+def test_normalizations() -> None:
+    start = [[2.4, -2.5, 0.21, 0.0], [-1.2, 1.25, 0.0, 5.0]]
+    raw = np.array(start, dtype=np.float32)
+    got = {
+        kind: lanes(2, normalization=kind).reset(options={"state": start})[0]
+        for kind in ("none", "bounds", "arctan")
+    }
+    np.testing.assert_array_equal(got["none"], raw)
+    np.testing.assert_allclose(got["bounds"], [[1, -1, 1, 0], [-0.5, 0.5, 0, 2]], rtol=1e-6)
+    np.testing.assert_allclose(got["arctan"], np.arctan(raw.astype(np.float64)), rtol=1e-6)
+    assert all(values.dtype == np.float32 for values in got.values())
+    space = lanes(2, normalization="arctan").single_observation_space
+    assert space.high[1] == pytest.approx(np.pi / 2)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(
+        lanes(1, normalization="bounds", bounds=[1, 2, 3, 4]).reset(options={"state": [[1, 1, 1, 1]]})[0],
+        [[1, 1 / 2, 1 / 3, 1 / 4]],
+        rtol=1e-6,
+    )
+
+
+@pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
+def test_observations_lie_in_their_space(normalization: str) -> None:
+    env = lanes(8, normalization=normalization)
+    assert env.reset()[0] in env.observation_space
+    for row in np.random.default_rng(0).integers(0, 2, (60, 8)):
+        observations, _, terminated, _, infos = env.step(row)
+        assert observations in env.observation_space
+        if terminated.any():
+            assert infos["final_obs"] in env.observation_space
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*infinity:UserWarning")  # as Gymnasium's own
+@pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
+def test_the_single_environment_passes_gymnasiums_check_and_agrees(normalization: Any) -> None:
+    env = gymnasium.make(ID, normalization=normalization, steps=15)
+    check_env(env.unwrapped, skip_render_check=True)
+    vector = lanes(1, normalization=normalization, steps=15)
+    expected, _ = env.reset(seed=3)
+    inner = env.unwrapped
+    observations, _ = vector.reset(options={"state": inner.state[None]})  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(observations[0], expected)
+    for step in range(1, 16):
+        action = balance(vector.state)
+        expected, reward, terminated, truncated, _ = env.step(action[0])
+        observations, rewards, fallen, cut, infos = vector.step(action)
+        assert (rewards[0], fallen[0], cut[0]) == (reward, terminated, truncated)
+        assert truncated == (step == 15)
+        np.testing.assert_array_equal(infos["final_obs"][0] if infos else observations[0], expected)
+
+
+def test_importing_twice_and_the_factory() -> None:
+    from qrlsuite.plugins.environments import cartpole
+
+    cartpole.register()
+    assert make_vector(Options(), 5).num_envs == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "environment 'cartpole': steps = 0: .*greater than or equal to 1"),
+        ({"normalisation": "none"}, "no option 'normalisation'; did you mean 'normalization'"),
+        ({"normalization": "running"}, "normalization = 'running': .*'none', 'bounds' or 'arctan'"),
+        ({"bounds": [1, 2, 3]}, "bounds"),
+        ({"bounds": [1, 2, 3, 0]}, "every bound must be a positive, finite number"),
+    ],
+)
+def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        parse(options)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ([0, 2], r"actions must lie in 0..1, not 0..2"),
+        ([-1, 0], r"actions must lie in 0..1, not -1..0"),
+        ([0, 1, 0], r"actions must be 2 integers, not int64 of shape \(3,\)"),
+        ([0.0, 1.0], r"actions must be 2 integers, not float64 of shape \(2,\)"),
+    ],
+)
+def test_actions_that_cannot_be(actions: list[Any], message: str) -> None:
+    env = lanes(2)
+    env.reset()
+    with pytest.raises(InvalidAction, match=message):
+        env.step(np.array(actions))
+
+
+def test_misuse() -> None:
+    env = lanes(2)
+    with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
+        env.step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(ResetNeeded, match=r"reset\(\) before state_dict"):
+        env.state_dict()
+    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
+        CartPoleLanes(Options(), 0)
+    with pytest.raises(ValueError, match="3 streams cannot serve 2 lanes"):
+        env.seed_lanes([np.random.default_rng(g) for g in range(3)])
+    with pytest.raises(OptionError, match=r"takes the option 'state', not \['low'\]"):
+        env.reset(options={"low": 0.0})
+    with pytest.raises(OptionError, match=r"'state' has the shape \(4,\), not \(2, 4\)"):
+        env.reset(options={"state": np.zeros(4)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"step": None}, "a state has ended, state, step, not ended, state"),
+        ({"state": np.zeros((2, 3))}, r"'state' has the shape \(2, 3\), not \(2, 4\)"),
+        ({"step": np.array([0, 501])}, r"'step' must lie in 0..500"),
+    ],
+)
+def test_states_that_do_not_fit(change: dict[str, Any], message: str) -> None:
+    env = lanes(2)
+    env.reset()
+    before = env.state_dict()
+    given = {name: values for name, values in (before | change).items() if values is not None}
+    with pytest.raises(StoreError, match=message):
+        env.load_state_dict(given)
+    for name, values in env.state_dict().items():
+        np.testing.assert_array_equal(values, before[name])

@@ -1,0 +1,382 @@
+"""Any Gymnasium environment in lanes: as the single environments, lane by lane, and resumed exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import InvalidAction, ResetNeeded
+
+from qrlsuite.errors import EnvironmentFailure, OptionError, StoreError
+from qrlsuite.gymlanes import SEEDS, UNLIMITED, GymLanes
+from qrlsuite.options import build
+from qrlsuite.plugins.environments import gym
+from tests.environments.strangers import HERE
+
+WALK = f"{HERE}:Walk-v0"
+
+
+def lanes(env_id: str, count: int, streams: int | None = None, first: int = 0, **arguments: Any) -> GymLanes:
+    env = GymLanes(env_id, count, arguments)
+    env.seed_lanes([np.random.default_rng(first + g) for g in range(streams or count)])
+    return env
+
+
+def flat(env: gymnasium.Env[Any, Any], observation: Any) -> np.ndarray[Any, Any]:
+    return np.asarray(gymnasium.spaces.flatten(env.observation_space, observation), np.float32)
+
+
+@pytest.mark.parametrize(
+    "env_id", ["CartPole-v1", "Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", WALK, f"{HERE}:Cut-v0"]
+)
+def test_every_lane_is_the_single_environment(env_id: str) -> None:
+    count, stream = 4, [np.random.default_rng(g) for g in range(4)]
+    env = lanes(env_id, count)
+    singles = [gymnasium.make(env_id) for _ in range(count)]
+    observations, _ = env.reset()
+    for lane, one in enumerate(singles):
+        expected, _ = one.reset(seed=int(stream[lane].integers(SEEDS)))
+        np.testing.assert_array_equal(observations[lane], flat(one, expected))
+    ends = np.zeros(count, dtype=int)
+    for actions in np.random.default_rng(9).integers(0, env.single_action_space.n, (230, count)):  # type: ignore[attr-defined]
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+        assert observations in env.observation_space
+        for lane, one in enumerate(singles):
+            expected, reward, fallen, cut, _ = one.step(actions[lane])
+            assert (rewards[lane], terminated[lane], truncated[lane]) == (reward, fallen, cut)
+            assert (fallen or cut) == bool(infos and infos["_final_obs"][lane])
+            if fallen or cut:
+                ends[lane] += 1
+                np.testing.assert_array_equal(infos["final_obs"][lane], flat(one, expected))
+                expected, _ = one.reset(seed=int(stream[lane].integers(SEEDS)))
+            np.testing.assert_array_equal(observations[lane], flat(one, expected))
+    assert env_id == "Acrobot-v1" or ends.min() > 0
+    env.close()
+
+
+def test_a_time_limit_truncates_and_an_end_terminates() -> None:
+    cut, ended = lanes(f"{HERE}:Cut-v0", 2), lanes(WALK, 2)
+    for env in (cut, ended):
+        env.reset()
+    for step in range(1, 9):
+        _, _, terminated, truncated, _ = cut.step(np.zeros(2, dtype=np.int64))
+        assert not terminated.any()
+        assert truncated.tolist() == [step % 4 == 0] * 2
+    flags = [ended.step(np.zeros(2, dtype=np.int64))[2:4] for _ in range(20)]
+    assert sum(terminated.sum() for terminated, _ in flags) > 2
+    assert not any(truncated.any() for _, truncated in flags)
+
+
+def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
+    env = lanes(WALK, 6, streams=2)
+    observations, _ = env.reset()
+    second = np.random.default_rng(1)
+    np.testing.assert_array_equal(env.state_dict()["seed"][3:], [second.integers(SEEDS) for _ in range(3)])
+    alone = lanes(WALK, 3, streams=1, first=1)
+    np.testing.assert_array_equal(alone.reset()[0], observations[3:])
+    for actions in np.random.default_rng(0).integers(0, 3, (40, 6)):
+        np.testing.assert_array_equal(alone.step(actions[3:])[0], env.step(actions)[0][3:])
+
+
+def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
+    first, again, other = (GymLanes(WALK, 3).reset(seed=seed)[0] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert (first[:, 0] != other[:, 0]).all()
+
+
+def test_without_autoreset_an_ended_lane_stays_put() -> None:
+    env = lanes(WALK, 3)
+    env.autoreset = False
+    env.reset()
+    seeds = env.state_dict()["seed"]
+    last: dict[int, Any] = {}
+    for _ in range(15):
+        observations, rewards, terminated, _, infos = env.step(np.ones(3, dtype=np.int64))
+        for lane in range(3):
+            if lane in last:
+                np.testing.assert_array_equal(observations[lane], last[lane])
+                assert rewards[lane] == 0
+                assert not terminated[lane]
+            elif terminated[lane]:
+                last[lane] = observations[lane]
+                np.testing.assert_array_equal(infos["final_obs"][lane], observations[lane])
+    assert sorted(last) == [0, 1, 2]
+    np.testing.assert_array_equal(env.state_dict()["seed"], seeds)
+
+
+def test_scores_come_from_info_where_there_are_any() -> None:
+    for scored in (True, False):
+        env = lanes(WALK, 4, scored=scored)
+        env.reset()
+        for _ in range(15):
+            steps = env.state_dict()["actions"] >= 0
+            _, _, terminated, _, infos = env.step(np.zeros(4, dtype=np.int64))
+            if terminated.any() and scored:
+                np.testing.assert_array_equal(infos["final_info"]["_score"], terminated)
+                expected = (steps.sum(axis=1) + 1) / 12
+                np.testing.assert_allclose(infos["final_info"]["score"][terminated], expected[terminated])
+            elif terminated.any():
+                assert infos["final_info"] == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "first"),
+    [
+        ("discrete", 5, [1, 0, 0, 0, 0]),
+        ("binary", 3, [0, 0, 0]),
+        ("multi", 5, [1, 0, 1, 0, 0]),
+        ("image", 4, [0, 0, 0, 0]),
+        ("box", 4, None),
+    ],
+)
+def test_observations_are_flattened(kind: str, size: int, first: list[int] | None) -> None:
+    env = lanes(WALK, 2, kind=kind)
+    observations, _ = env.reset()
+    assert observations.dtype == np.float32
+    assert observations.shape == (2, size)
+    assert env.single_observation_space.shape == (size,)
+    assert observations in env.observation_space
+    if first is not None:
+        np.testing.assert_array_equal(observations[0], first)
+    observations = env.step(np.zeros(2, dtype=np.int64))[0]
+    if kind == "discrete":
+        np.testing.assert_array_equal(observations[0], [0, 1, 0, 0, 0])
+
+
+def test_actions_count_from_zero_also_where_the_environments_do_not() -> None:
+    plain, shifted = lanes(WALK, 1), lanes(WALK, 1, start=5)
+    assert shifted.single_action_space == gymnasium.spaces.Discrete(3)
+    for env in (plain, shifted):
+        env.reset()
+    difference = shifted.step(np.array([2]))[1] - plain.step(np.array([2]))[1]
+    assert difference[0] == pytest.approx(5)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Acrobot-v1", "FrozenLake-v1", WALK])
+def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str) -> None:
+    straight, stopped = lanes(env_id, 4), lanes(env_id, 4)
+    choices = int(straight.single_action_space.n)  # type: ignore[attr-defined]
+    actions = np.random.default_rng(2).integers(0, choices, (75, 4))
+    straight.reset()
+    stopped.reset()
+    for row in actions[:40]:
+        straight.step(row)
+        stopped.step(row)
+    state = stopped.state_dict()
+    assert all(len(values) == 4 for values in state.values())
+    halves = []
+    for part in (slice(0, 2), slice(2, 4)):
+        half = GymLanes(env_id, 2)
+        half.seed_lanes(stopped.streams[part])
+        half.load_state_dict({name: values[part].copy() for name, values in state.items()})
+        halves.append((half, part))
+    for row in actions[40:]:
+        expected = straight.step(row)
+        for half, part in halves:
+            for values, wanted in zip(half.step(row[part])[:4], expected[:4]):
+                np.testing.assert_array_equal(values, wanted[part])
+    joined = {name: np.concatenate([half.state_dict()[name] for half, _ in halves]) for name in state}
+    for name, values in straight.state_dict().items():
+        np.testing.assert_array_equal(values, joined[name])
+
+
+def test_resuming_without_autoreset_keeps_ended_lanes_ended() -> None:
+    env = lanes(WALK, 3)
+    env.autoreset = False
+    env.reset()
+    for _ in range(8):
+        env.step(np.ones(3, dtype=np.int64))
+    other = GymLanes(WALK, 3)
+    other.autoreset = False
+    other.load_state_dict(env.state_dict())
+    for _ in range(5):
+        for values, wanted in zip(
+            other.step(np.ones(3, dtype=np.int64))[:4], env.step(np.ones(3, dtype=np.int64))[:4]
+        ):
+            np.testing.assert_array_equal(values, wanted)
+
+
+def test_a_state_is_as_wide_as_the_time_limit() -> None:
+    env = lanes(WALK, 2)
+    env.reset()
+    assert env.state_dict()["actions"].shape == (2, 20)
+    assert GymLanes("CartPole-v1", 1, {"max_episode_steps": 7}).capacity == 7
+    assert lanes(f"{HERE}:Endless-v0", 1).capacity == UNLIMITED
+
+
+def test_an_episode_without_end_is_an_error() -> None:
+    env = lanes(f"{HERE}:Endless-v0", 1)
+    env.reset()
+    for _ in range(UNLIMITED):
+        env.step(np.zeros(1, dtype=np.int64))
+    with pytest.raises(
+        EnvironmentFailure, match=f"did not end within {UNLIMITED} steps; give it a time limit"
+    ):
+        env.step(np.zeros(1, dtype=np.int64))
+
+
+def test_an_environment_that_does_something_else_the_second_time_is_not_resumed() -> None:
+    env = lanes(f"{HERE}:Forgetful-v0", 2)
+    env.reset()
+    env.step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(StoreError, match=r"its randomness does not all come from reset\(seed"):
+        GymLanes(f"{HERE}:Forgetful-v0", 2).load_state_dict(env.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": None}, "a state has actions, observation, seed, not actions, observation"),
+        ({"actions": np.zeros((2, 3), np.int32)}, r"'actions' has the shape \(2, 3\), not \(2, 20\)"),
+        ({"actions": np.full((2, 20), 7, np.int32)}, "cannot be resumed: AssertionError: 7"),
+    ],
+)
+def test_states_that_do_not_fit(change: dict[str, Any], message: str) -> None:
+    env = lanes(WALK, 2)
+    env.reset()
+    given = {name: values for name, values in (env.state_dict() | change).items() if values is not None}
+    with pytest.raises(StoreError, match=message):
+        env.load_state_dict(given)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "arguments", "message"),
+    [
+        ("Acrobat-v1", {}, "Gymnasium knows no environment 'Acrobat-v1'; did you mean 'Acrobot-v1'"),
+        ("Zzz", {}, r"no environment 'Zzz'; gymnasium.pprint_registry\(\) lists"),
+        ("nowhere.at.all:X-v0", {}, "module 'nowhere.at.all' cannot be imported: ModuleNotFoundError"),
+        ("Pendulum-v1", {}, r"action space Box\(-2.0, 2.0, \(1,\), float32\): only discrete actions"),
+        (WALK, {"kind": "dict"}, r"observation space Dict\('a': Discrete\(2\)\): only boxes and discrete"),
+        (WALK, {"kind": "tuple"}, r"observation space Tuple\(Discrete\(2\)\): only boxes and discrete"),
+        (f"{HERE}:Unmade-v0", {}, "needs a package that is not installed: pip install no_such_package"),
+        (WALK, {"colour": "red"}, r"cannot be made with {'colour': 'red'}: TypeError: .*'colour'"),
+    ],
+)
+def test_environments_that_cannot_be_used(env_id: str, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        GymLanes(env_id, 1, arguments)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "package", "command"),
+    [("LunarLander-v3", "Box2D", r"gymnasium\[box2d\]"), ("Ant-v5", "mujoco", r"gymnasium\[mujoco\]")],
+)
+def test_a_missing_package_is_named_with_the_command_that_installs_it(
+    env_id: str, package: str, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    with pytest.raises(OptionError, match=f"'{env_id}': .*pip install.*{command}"):
+        GymLanes(env_id, 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"normalization": "bounds"},
+            r"needs finite bounds, and low\[1\] is -inf: give low as a list of 4 numbers",
+        ),
+        ({"normalization": "bounds", "low": [-1, -1, -1]}, "low has 3 values, an observation has 4"),
+        (
+            {"normalization": "bounds", "low": [-1, 2, -1, -1], "high": [1, 1, 1, 1]},
+            r"low\[1\] = 2 is not below high\[1\] = 1",
+        ),
+        ({"low": [-1, -1, -1, -1]}, "low and high are for normalization = 'bounds', not 'none'"),
+    ],
+)
+def test_normalizations_that_cannot_be(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        GymLanes("CartPole-v1", 1, **given)
+
+
+def test_normalization_is_for_boxes() -> None:
+    with pytest.raises(OptionError, match=r"'arctan' is for boxes, and its observations are Discrete\(16\)"):
+        GymLanes("FrozenLake-v1", 1, normalization="arctan")
+
+
+def test_normalizations() -> None:
+    raw = lanes("MountainCar-v0", 3)
+    scaled, angles = (
+        GymLanes("MountainCar-v0", 3, normalization="bounds"),
+        GymLanes("MountainCar-v0", 3, normalization="arctan"),
+    )
+    given = GymLanes("MountainCar-v0", 3, None, "bounds", [-2, -0.1], [0, 0.1])
+    for env in (scaled, angles, given):
+        env.seed_lanes([np.random.default_rng(g) for g in range(3)])
+    seen, *others = (env.reset()[0] for env in (raw, scaled, angles, given))
+    for actions in np.random.default_rng(0).integers(0, 3, (20, 3)):
+        low, high = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
+        np.testing.assert_allclose(others[0], (seen - low) / (high - low) * 2 - 1, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(others[1], np.arctan(seen), rtol=1e-6)
+        np.testing.assert_allclose(others[2], [1, 0] + seen * [1, 10], rtol=1e-5, atol=1e-6)
+        seen, *others = (env.step(actions)[0] for env in (raw, scaled, angles, given))
+    assert scaled.single_observation_space == gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ([0, 3], r"actions must lie in 0..2, not 0..3"),
+        ([0, 1, 0], r"actions must be 2 integers, not int64 of shape \(3,\)"),
+        ([0.0, 1.0], r"actions must be 2 integers, not float64"),
+    ],
+)
+def test_actions_that_cannot_be(actions: list[Any], message: str) -> None:
+    env = lanes(WALK, 2)
+    env.reset()
+    with pytest.raises(InvalidAction, match=message):
+        env.step(np.array(actions))
+
+
+def test_misuse() -> None:
+    env = lanes(WALK, 2)
+    with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
+        env.step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(ResetNeeded, match=r"reset\(\) before state_dict"):
+        env.state_dict()
+    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
+        GymLanes(WALK, 0)
+    with pytest.raises(OptionError, match=r"takes no options of reset\(\), not {'low': 0}"):
+        env.reset(options={"low": 0})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"id": "FrozenLke-v1"}, "id = 'FrozenLke-v1': .*did you mean 'FrozenLake-v1'"),
+        ({"arguments": {"max_episode_steps": 5}}, "'max_episode_steps' cannot be given here; use the option"),
+        ({"arguments": {"render_mode": "human"}}, "'render_mode' cannot be given here; use nothing"),
+        ({"max_episode_steps": 0}, "max_episode_steps = 0"),
+        ({"normalization": "running"}, "normalization = 'running'"),
+    ],
+)
+def test_options_that_cannot_be(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        build(gym.Options, values, "environment 'gym'")
+
+
+def test_the_factory_takes_every_option() -> None:
+    given = {
+        "id": "MountainCar-v0",
+        "arguments": {"goal_velocity": 0.01},
+        "max_episode_steps": 9,
+        "normalization": "bounds",
+        "low": [-3, -3],
+        "high": [3, 3],
+    }
+    env = gym.make_vector(build(gym.Options, given, "gym"), 2)
+    assert isinstance(env, GymLanes)
+    assert env.capacity == 9
+    assert env.envs[1].unwrapped.goal_velocity == 0.01  # type: ignore[attr-defined]
+    assert env.single_observation_space.low[0] == pytest.approx(-1.2 / 3)  # type: ignore[attr-defined]
+
+
+def test_closing_closes_every_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = lanes(WALK, 3)
+    closed = []
+    for one in env.envs:
+        monkeypatch.setattr(one.unwrapped, "close", lambda: closed.append(1))
+    env.close()
+    assert closed == [1, 1, 1]
