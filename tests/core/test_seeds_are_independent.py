@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from qrlsuite.store import EntryStore
 from tests.conftest import results
 
 MODELS = {
@@ -35,3 +36,15 @@ def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Cal
 def test_different_seeds_differ(train: Callable[..., Path]) -> None:
     folder = train("runs", [0, 1])
     assert results(folder, 0) != results(folder, 1)
+
+
+def test_native_and_pennylane_agents_of_one_seed_act_alike(train: Callable[..., Path]) -> None:
+    """In float64 the two backends choose exactly the same actions in the first epoch."""
+    settings = ("qubits=3", "layers=2", "dtype=float64")
+    rows = []
+    for model in ("vqc-native", "vqc-pennylane"):
+        entry = train("runs", [0], 1, model=model, settings=settings)
+        rows.append(EntryStore(entry).seed(0).epochs()[0])
+    for name in ("train_return", "train_score", "scores", "executions"):
+        assert rows[0][name] == rows[1][name], name
+    assert rows[0]["loss"] == pytest.approx(rows[1]["loss"], rel=1e-9)
