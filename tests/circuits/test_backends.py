@@ -345,6 +345,32 @@ def test_sampling_leaves_global_random_numbers_alone():
         assert all(np.array_equal(a, b) for a, b in zip(before, state()))
 
 
+# What "auto" chooses.
+
+
+@pytest.mark.parametrize(
+    ("options", "method"),
+    [
+        ({}, "backprop"),
+        ({"shots": 10}, "parameter-shift"),
+        ({"device": "lightning.qubit"}, "adjoint"),
+        ({"device": "lightning.qubit", "shots": 10}, "parameter-shift"),
+        ({"device": "default.mixed"}, "parameter-shift"),
+        ({"diff_method": "parameter-shift"}, "parameter-shift"),
+    ],
+)
+def test_pennylane_differentiates_by_the_fastest_way_that_the_device_has(options, method):
+    assert create_backend("pennylane", ansatz("cz", 2, 1), **options).diff_method == method
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_qiskit_differentiates_by_the_fastest_way_that_is_installed(monkeypatch, installed):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object() if installed else None)
+    circuit = ansatz("cz", 2, 1)
+    assert create_backend("qiskit", circuit).gradient == ("reverse" if installed else "lin-comb")
+    assert create_backend("qiskit", circuit, shots=10).gradient == "parameter-shift"
+
+
 # What cannot be done.
 
 
