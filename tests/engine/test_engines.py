@@ -1,0 +1,184 @@
+"""Engines: registered like everything else, built from options, and free to be anybody's."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite import checkpoint, registry, survey
+from qrlsuite.claims import acquire
+from qrlsuite.cli.app import build
+from qrlsuite.engine import api, worker
+from qrlsuite.engine.groups import Group
+from qrlsuite.engine.local import LocalEngine
+from qrlsuite.engine.slurm import Options, SlurmEngine, minutes
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.options import build as build_options
+from qrlsuite.store import EntryStore, write_json
+from tests.conftest import results
+
+
+def test_engines_enter_by_the_door_of_plugins() -> None:
+    assert {"local", "slurm"} <= set(registry.load().names("engines"))
+    assert isinstance(api.create("local", {"partition": None}), LocalEngine)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "error", "message"),
+    [
+        ("lokal", {}, UnknownNameError, "unknown engine 'lokal'; did you mean 'local'"),
+        ("local", {"partition": "x"}, OptionError, "engine 'local' has no options, got partition"),
+    ],
+)
+def test_wrong_engines(name: str, given: dict[str, object], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        api.create(name, given)
+
+
+def test_a_missing_package_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(QrlSuiteError, match=r"needs the package 'submitit': pip install 'qrlsuite\[slurm\]'"):
+        api.create("slurm", {})
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("90", 90),
+        (90, 90),
+        ("2:00:00", 120),
+        ("1:30", 2),
+        ("1-12", 2160),
+        ("1-12:30", 2190),
+        ("1-00:00:01", 1441),
+    ],
+)
+def test_time_limits_are_read_as_slurm_reads_them(text: object, expected: int) -> None:
+    assert minutes(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "soon", "1:2:3:4", "-5", "0", "0:30", "1h"])
+def test_times_that_are_none(text: str) -> None:
+    with pytest.raises(OptionError, match=r"engine 'slurm': time = .*: (write minutes|a task needs)"):
+        build_options(Options, {"time": text}, "engine 'slurm'")
+
+
+def test_slurm_that_is_not_there(train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
+    store = EntryStore(train("runs", [0], 1))
+    monkeypatch.setenv("PATH", "")
+    engine = SlurmEngine(Options())
+    with pytest.raises(QrlSuiteError, match="there is no SLURM on this machine"):
+        engine.run(api.Work(store, [Group((1,), 0)], 2, 1), lambda snapshot: None)
+    assert engine.queued(store) == set(), "without a submission nobody is asked"
+    write_json(
+        store.path / "slurm" / "submitted.json", {"tasks": [{"job": "1_0", "seeds": [3], "epochs": 2}]}
+    )
+    with pytest.raises(QrlSuiteError, match="squeue is not found"):
+        engine.queued(store)
+    (store.path / "slurm" / "submitted.json").write_text('{"format_version": 1, "tasks": 3}')
+    with pytest.raises(StoreError, match="is damaged: delete it"):
+        engine.queued(store)
+
+
+def test_what_is_queued_is_left_to_the_queue(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = EntryStore(train("runs", [0], 1))
+    tasks = [{"job": "7_0", "seeds": [1, 2]}, {"job": "7_1", "seeds": [3]}, {"job": "6", "seeds": [4]}]
+    write_json(store.path / "slurm" / "submitted.json", {"tasks": tasks})
+    answer = subprocess.CompletedProcess([], 0, stdout="7_1\n8_0\n6\n", stderr="")
+    monkeypatch.setattr(subprocess, "run", lambda *arguments, **options: answer)
+    assert SlurmEngine(Options()).queued(store) == {3, 4}
+
+
+def test_a_worker_started_twice_does_no_harm(train: Callable[..., Path]) -> None:
+    entry = train("runs", [0, 1])
+    before = {seed: results(entry, seed) for seed in (0, 1)}
+    stamps = {path: path.stat().st_mtime_ns for path in entry.glob("seed-*/*")}
+    worker.train_group(entry, [0, 1], 3)
+    assert stamps == {path: path.stat().st_mtime_ns for path in entry.glob("seed-*/*")}
+    worker.train_group(entry, [0, 1, 2], 3)  # a part has finished: only the rest is trained
+    assert before == {seed: results(entry, seed) for seed in (0, 1)}
+    assert results(train("alone", [2]), 2) == results(entry, 2)
+
+
+def test_a_worker_whose_parent_is_gone_does_not_begin(train: Callable[..., Path]) -> None:
+    entry = train("runs", [0], 1)
+    arguments = [str(entry), "--seeds", "0:1", "--epochs", "2"]
+    program = (
+        "import os, sys; from qrlsuite.engine import worker\n"
+        f"sys.exit(worker.main({arguments!r} + ['--follow-parent', str(os.getppid() + 1)]))"
+    )
+    import sys
+
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == 130
+    assert EntryStore(entry).finished([0], 2) == set()
+
+
+def test_the_time_between_checkpoints_is_checked(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = train("runs", [0], 1)
+    monkeypatch.setenv("QRLSUITE_CHECKPOINT_SECONDS", "often")
+    assert worker.main([str(entry), "--seeds", "0:1", "--epochs", "2"]) == 2
+
+
+def test_local_workers_are_as_many_as_cores_or_as_asked() -> None:
+    assert LocalEngine().workers(None) == len(os.sched_getaffinity(0))
+    assert LocalEngine().workers(7) == 7
+
+
+def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(
+    train: Callable[..., Path],
+) -> None:
+    entry = train("runs", [0, 1], 2)
+    train("runs", [2], 1)
+    store = EntryStore(entry)
+    store.seed(2).write_record({"status": "running", "epochs": 1, "parameters": {}})
+    runs = str(entry.parent.parent)
+
+    def say(*words: str) -> str:
+        return CliRunner().invoke(build(), [*words, "--runs", runs], catch_exceptions=False).output
+
+    listed = json.loads(say("runs", "--json"))
+    assert listed[0]["seeds"] == {"finished": 2, "interrupted": 1}
+    assert listed[0]["epochs"] == [1, 2]
+    before = results(entry, 0)
+    assert "would remove 1 checkpoint" in say("runs", "gc")
+    assert "can then not be extended" in say("runs", "gc")
+    assert len(checkpoint.headers(store)) == 2, "without --yes nothing is removed"
+    held = acquire(store, [1])
+    assert "nothing to remove" in say("runs", "gc", "--yes"), (
+        "a group that is being extended keeps its checkpoint"
+    )
+    held.release()
+    assert "freed" in say("runs", "gc", "--yes")
+    assert [header.seeds for header in checkpoint.headers(store)] == [(2,)], "unfinished groups keep theirs"
+    assert results(entry, 0) == before
+    assert "nothing to remove" in say("runs", "gc")
+    with pytest.raises(StoreError, match="it cannot be extended"):
+        train("runs", [0, 1], 3)
+
+
+def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = train("runs", [0, 1], 1)
+    store = EntryStore(entry)
+    write_json(entry / "slurm" / "submitted.json", {"tasks": [{"job": "9_3", "seeds": [5, 6], "epochs": 3}]})
+    store.seed(1).write_record({"status": "running", "epochs": 1})
+    claim = acquire(store, [0])
+    monkeypatch.setattr(subprocess, "run", lambda *arguments, **options: pytest.fail("it asked a queue"))
+    found = {group.state: group for group in survey.groups(store)}
+    assert found["running"].seeds == (0,)
+    assert str(os.getpid()) in found["running"].where
+    assert (found["submitted"].seeds, found["submitted"].where) == ((5, 6), "job 9_3")
+    assert found["stopped"].seeds == (1,)
+    claim.release()
