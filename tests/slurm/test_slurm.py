@@ -98,7 +98,7 @@ def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path) -> 
     """Eight groups: one canceled, one killed, one at its time limit; submitted again, everything is there once."""
     (tmp_path / "tiny.toml").write_text(TINY)
     epochs = int(
-        os.environ.get("QRLSUITE_SLURM_EPOCHS", "4000")
+        os.environ.get("QRLSUITE_SLURM_EPOCHS", "700")
     )  # two tasks at a time take longer than a minute
     job = submit(tmp_path, "1", epochs)
     entry = next((tmp_path / "runs" / "tiny").iterdir())
