@@ -7,6 +7,7 @@ filled chunk compute on inputs of zero and are dropped.
 
 from __future__ import annotations
 
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,20 +27,11 @@ from qrlsuite.plugins.circuits.native.trigonometry import sine_cosine
 from qrlsuite.plugins.circuits.native.vectors import load, splat, store, total
 
 
-class Tables(NamedTuple):
-    """A program's arrays, see `Program`, in the form that kernels take."""
-
-    qubits: int
-    steps: NDArray[np.int64]
-    angles: NDArray[np.int64]
-    constants: NDArray[np.float64]
-    rotations: NDArray[np.int64]
-    factors: NDArray[np.float64]
-    blocks: NDArray[np.int64]
-    cycles: NDArray[np.int64]
-    signs: NDArray[np.int8]
-    start: NDArray[np.int64]
-    observables: NDArray[np.int64]
+Tables = namedtuple(
+    "Tables",
+    "qubits steps angles constants rotations factors blocks cycles signs start observables",
+)
+"""A program's arrays, see `Program` for each, in the form that kernels take."""
 
 
 class Scratch(NamedTuple):

@@ -115,6 +115,16 @@ def store(typing_context: Any, array: Any, row: Any, value: Any) -> Any:
     return types.void(array, types.intp, vector), generate
 
 
+def _broadcast(builder: Any, vector: Vector, number: Any) -> Any:
+    """Put one number into every lane."""
+    undefined = ir.Constant(vector.llvm, ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    lanes = LANES[vector.element]
+    return builder.shuffle_vector(
+        one, undefined, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+    )
+
+
 @intrinsic
 def splat(typing_context: Any, array: Any, scalar: Any) -> Any:
     """Return a vector with one number in every lane, of the element type of `array`."""
@@ -122,10 +132,7 @@ def splat(typing_context: Any, array: Any, scalar: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[1], signature.args[1], vector.element)
-        undefined = ir.Constant(vector.llvm, ir.Undefined)
-        one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES[vector.element]), [0] * LANES[vector.element])
-        return builder.shuffle_vector(one, undefined, zeros)
+        return _broadcast(builder, vector, number)
 
     return vector(array, scalar), generate
 
@@ -136,10 +143,7 @@ def constant(typing_context: Any, like: Any, scalar: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[1], signature.args[1], like.element)
-        undefined = ir.Constant(like.llvm, ir.Undefined)
-        one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES[like.element]), [0] * LANES[like.element])
-        return builder.shuffle_vector(one, undefined, zeros)
+        return _broadcast(builder, like, number)
 
     return like(like, scalar), generate
 
