@@ -26,7 +26,6 @@ from qrlsuite.plugins.circuits.native.sweeps import (
 from qrlsuite.plugins.circuits.native.trigonometry import sine_cosine
 from qrlsuite.plugins.circuits.native.vectors import load, splat, store, total
 
-
 Tables = namedtuple(
     "Tables",
     "qubits steps angles constants rotations factors blocks cycles signs start observables",

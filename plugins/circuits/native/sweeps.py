@@ -8,8 +8,8 @@ the real part of amplitude i. A block's matrix in SU(2) is given by two numbers 
 so that an amplitude pair (p0, p1), whose indices differ in the target bit, becomes
 (a p0 - conj(b) p1, b p0 + conj(a) p1). A controlled block touches only pairs whose control bit is 1.
 
-Backward, psi is the state after a step and lambda = O psi carried back. With U(t) = exp(-i t P / 2) ... the
-derivative of <psi|O|psi> by t is Im <lambda| P |psi>: so every block collects
+Backward, psi is the state after a step, and lambda is O psi carried back to the same place. Where the last factor of
+that step is exp(-i t P / 2), the derivative of <psi|O|psi> by t is Im <lambda| P |psi>: so every block collects
 
     T_P = Im <lambda| P |psi>  for P = X, Y, Z,  and  T_1 = Im <lambda|psi> where it has a phase,
 
