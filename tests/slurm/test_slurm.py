@@ -57,7 +57,8 @@ def run(folder: Path, *words: str, epochs: int, seeds: int = SEEDS) -> subproces
 
 
 def submit(folder: Path, limit: str, epochs: int) -> str:
-    answer = run(folder, "--engine", "slurm", "--time", limit, "--json", epochs=epochs)
+    late = ("--engine-set", "grace=10")
+    answer = run(folder, "--engine", "slurm", "--time", limit, *late, "--json", epochs=epochs)
     words = json.loads(answer.stdout)["submitted"].split()
     return str(words[words.index("job") + 1].rstrip(";"))
 
@@ -94,12 +95,18 @@ def test_a_wrong_partition_is_slurms_own_message(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path) -> None:
+def longer_than_a_minute(train: Callable[..., Path]) -> int:
+    """Epochs that take a task about 80 seconds here and now, so that it meets its limit of one minute."""
+    store = EntryStore(train("measured", [0], 40))
+    return int(80 / (store.seed(0).seconds() / 40))
+
+
+def test_canceled_killed_and_timed_out_tasks_all_finish_once(
+    tmp_path: Path, train: Callable[..., Path]
+) -> None:
     """Eight groups: one canceled, one killed, one at its time limit; submitted again, everything is there once."""
     (tmp_path / "tiny.toml").write_text(TINY)
-    epochs = int(
-        os.environ.get("QRLSUITE_SLURM_EPOCHS", "700")
-    )  # two tasks at a time take longer than a minute
+    epochs = longer_than_a_minute(train)
     job = submit(tmp_path, "1", epochs)
     entry = next((tmp_path / "runs" / "tiny").iterdir())
     store = EntryStore(entry)
@@ -118,7 +125,10 @@ def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path) -> 
         cwd=tmp_path,
     )
     groups = json.loads(status.stdout)[0]["groups"]
-    assert sorted(group["state"] for group in groups) == ["running"] * 2 + ["submitted"] * 6
+    states = [group["state"] for group in groups]
+    assert len(states) == GROUPS
+    assert "submitted" in states
+    assert set(states) <= {"running", "submitted"}
 
     until(lambda: store.seed(0).lines.exists() and store.seed(1).lines.exists(), "epochs are recorded")
     subprocess.run(["scancel", f"{job}_0"], check=True)
