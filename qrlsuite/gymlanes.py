@@ -86,7 +86,8 @@ class GymLanes(LaneEnv):
         self.capacity = int(limit or UNLIMITED)
         self.streams = []
         self._seeds = np.zeros(num_envs, dtype=np.int64)
-        self._actions = np.full((num_envs, self.capacity), -1, dtype=np.int32)
+        smallest = np.min_scalar_type(-int(self._action_space.n))  # a signed type: -1 is no action yet
+        self._actions = np.full((num_envs, self.capacity), -1, dtype=smallest)
         self._step = np.zeros(num_envs, dtype=np.int64)
         self._raw = np.zeros((num_envs, *flat.shape), dtype=np.float32)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
@@ -138,8 +139,10 @@ class GymLanes(LaneEnv):
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         last: dict[int, dict[str, Any]] = {}
-        for lane in np.flatnonzero(~self._ended).tolist():
-            rewards[lane], terminated[lane], truncated[lane], info = self._play(lane, int(actions[lane]))
+        running = np.flatnonzero(~self._ended)
+        self._record(running, actions[running])
+        for lane, action in zip(running.tolist(), actions[running].tolist()):
+            rewards[lane], terminated[lane], truncated[lane], info = self._play(lane, action)
             if terminated[lane] or truncated[lane]:
                 last[lane] = info
         infos = self._finish(last, terminated | truncated) if last else {}
@@ -197,10 +200,11 @@ class GymLanes(LaneEnv):
                 )
         self._begun = True
 
-    def _replay(self, lane: int, seed: int, actions: NDArray[np.int32]) -> None:
+    def _replay(self, lane: int, seed: int, actions: NDArray[Any]) -> None:
         """Play one lane's episode again, from its reset seed and its actions (capacity,), -1 after the last."""
         self._begin(lane, seed)
         for action in actions[: np.count_nonzero(actions >= 0)].tolist():
+            self._record(np.array([lane]), np.array([action]))
             _, terminated, truncated, _ = self._play(lane, action)
             self._ended[lane] = terminated or truncated
 
@@ -221,15 +225,19 @@ class GymLanes(LaneEnv):
         self._ended[lane] = False
         self._raw[lane] = self._flat(observation)
 
-    def _play(self, lane: int, action: int) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Take one step in one lane; returns reward, termination, truncation and info."""
-        if self._step[lane] == self.capacity:
+    def _record(self, lanes: NDArray[np.intp], actions: NDArray[np.int64]) -> None:
+        """Note the actions (n,) that the lanes (n,) are about to take."""
+        steps = self._step[lanes]
+        if steps.size and steps.max() == self.capacity:
             raise EnvironmentFailure(
                 f"environment '{self.env_id}': an episode did not end within {self.capacity} steps; "
                 "give it a time limit (max_episode_steps)"
             )
-        self._actions[lane, self._step[lane]] = action
-        self._step[lane] += 1
+        self._actions[lanes, steps] = actions
+        self._step[lanes] += 1
+
+    def _play(self, lane: int, action: int) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Take one step in one lane; returns reward, termination, truncation and info."""
         given = np.int64(action + self._action_space.start)
         observation, reward, terminated, truncated, info = self.envs[lane].step(given)
         self._raw[lane] = self._flat(observation)

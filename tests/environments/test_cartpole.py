@@ -203,7 +203,7 @@ def test_without_autoreset_an_ended_lane_stays_put() -> None:
 
 def test_resuming_is_exact_and_states_are_sliced_and_joined() -> None:
     actions = np.random.default_rng(2).integers(0, 2, (80, 4))
-    straight, stopped = lanes(4), lanes(4)
+    straight, stopped = lanes(4, steps=17), lanes(4, steps=17)
     straight.reset()
     stopped.reset()
     for row in actions[:40]:
@@ -212,7 +212,7 @@ def test_resuming_is_exact_and_states_are_sliced_and_joined() -> None:
     state = stopped.state_dict()
     halves = []
     for part in (slice(0, 2), slice(2, 4)):
-        half = CartPoleLanes(Options(), 2)
+        half = CartPoleLanes(Options(steps=17), 2)
         half.seed_lanes(stopped.streams[part])
         half.load_state_dict({name: values[part].copy() for name, values in state.items()})
         halves.append((half, part))
@@ -222,6 +222,15 @@ def test_resuming_is_exact_and_states_are_sliced_and_joined() -> None:
             for values, wanted in zip(half.step(row[part])[:4], expected[:4]):
                 np.testing.assert_array_equal(values, wanted[part])
     np.testing.assert_array_equal(np.hstack([half.state for half, _ in halves]), straight.state)
+
+
+def test_resuming_without_autoreset_keeps_ended_lanes_ended() -> None:
+    env, other = lanes(2), lanes(2)
+    env.autoreset = other.autoreset = False
+    env.reset(options={"state": [[0, 0, 0.3, 0], [0, 0, 0, 0]]})
+    env.step(np.zeros(2, dtype=np.int64))
+    other.load_state_dict(env.state_dict())
+    assert other.step(np.zeros(2, dtype=np.int64))[1].tolist() == [0, 1]
 
 
 def test_a_state_is_a_copy() -> None:

@@ -80,6 +80,24 @@ def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
         np.testing.assert_array_equal(alone.step(actions[3:])[0], env.step(actions)[0][3:])
 
 
+def test_lanes_that_end_together_are_reset_in_lane_order() -> None:
+    env, stream = lanes(f"{HERE}:Cut-v0", 4, streams=1), np.random.default_rng(0)
+    env.reset()
+    for _ in range(3):
+        np.testing.assert_array_equal(env.state_dict()["seed"], [stream.integers(SEEDS) for _ in range(4)])
+        for _ in range(4):
+            env.step(np.zeros(4, dtype=np.int64))
+
+
+def test_observations_and_states_are_copies() -> None:
+    env = lanes(WALK, 2)
+    given: dict[str, np.ndarray[Any, Any]] = {"first": env.reset()[0], **env.state_dict()}
+    before = {name: values.copy() for name, values in given.items()}
+    env.step(np.ones(2, dtype=np.int64))
+    for name, values in given.items():
+        np.testing.assert_array_equal(values, before[name])
+
+
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
     first, again, other = (GymLanes(WALK, 3).reset(seed=seed)[0] for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
