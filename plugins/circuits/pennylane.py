@@ -149,10 +149,14 @@ class PennyLaneBackend:
         result: Tensor = _Shift.apply(angles, self, seed, lanes)  # type: ignore[no-untyped-call]
         return result
 
+    def lanes_per_pass(self) -> int:
+        """Return how many lanes one execution without gradients takes, so that its states fit in memory."""
+        return max(1, MEMORY // (4 * 16 * (1 << self.circuit.qubits)))
+
     def _seeds_per_pass(self, S: int, B: int, differentiated: bool) -> int:
         """Return how many seeds one execution takes, so that its states fit in memory."""
-        states = 2 * len(self.circuit) if differentiated and self.diff_method == "backprop" else 4
-        return max(1, MEMORY // (states * B * 16 * (1 << self.circuit.qubits)))
+        states = len(self.circuit) // 2 if differentiated and self.diff_method == "backprop" else 1
+        return max(1, self.lanes_per_pass() // (max(1, states) * B))
 
     def _build(self, device: Any) -> Any:
         """Return the QNode of the circuit on a device."""
@@ -192,7 +196,7 @@ class _Shift(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, angles: Tensor, backend: PennyLaneBackend, seed: int | None, lanes: int) -> Tensor:
         ctx.save_for_backward(angles)
-        ctx.backend, ctx.seed, ctx.lanes = backend, seed, lanes
+        ctx.backend, ctx.seed = backend, seed
         return backend.execute(angles.detach(), lanes, seed)
 
     @staticmethod
@@ -200,10 +204,12 @@ class _Shift(torch.autograd.Function):
         (angles,) = ctx.saved_tensors
         backend, (grad,) = ctx.backend, grads
         shifted, plan = shifted_angles(angles, backend.table.controlled)
-        seed = None if ctx.seed is None else _entropy(ctx.seed, 1)
+        values = []
         with torch.no_grad():
-            values = backend.execute(shifted, shifted.shape[1], seed)
-        return vector_jacobian(values, grad, plan), None, None, None
+            for part, some in enumerate(torch.split(shifted, backend.lanes_per_pass(), dim=1)):
+                seed = None if ctx.seed is None else _entropy(ctx.seed, 1, part)
+                values.append(backend.execute(some, some.shape[1], seed))
+        return vector_jacobian(torch.cat(values), grad, plan), None, None, None
 
 
 class _DeviceGradient(torch.autograd.Function):

@@ -244,10 +244,22 @@ def test_seeds_that_do_not_fit_in_memory_are_recomputed_with_the_same_bits(monke
     )
     evaluate(backend, *given)
     assert len(executed) == 1
-    monkeypatch.setattr("qrlsuite.plugins.circuits.pennylane.MEMORY", 2 * len(circuit) * 20 * 16 * 8 * 2)
+    monkeypatch.setattr(
+        "qrlsuite.plugins.circuits.pennylane.MEMORY", 4 * (len(circuit) // 2) * 20 * 16 * 8 * 2
+    )
     in_parts = evaluate(backend, *given)
     assert len(executed) == 1 + 2 * 3  # two seeds at a time, forward and backward
     assert all(torch.equal(a, b) for a, b in zip(whole, in_parts))
+
+
+def test_shifts_that_do_not_fit_in_memory_are_executed_in_parts(monkeypatch):
+    circuit = ansatz("iqp", 2, 2)
+    given = draw(circuit, 2, 3)
+    backend = create_backend("pennylane", circuit, diff_method="parameter-shift")
+    whole = evaluate(backend, *given)
+    monkeypatch.setattr("qrlsuite.plugins.circuits.pennylane.MEMORY", 4 * 16 * 4 * 10)  # ten lanes
+    assert backend.lanes_per_pass() == 10
+    assert_close(evaluate(backend, *given), whole, 1e-12)
 
 
 # Finite shots.
