@@ -164,7 +164,7 @@ class PennyLaneBackend:
         def measure(angles: Tensor) -> list[Any]:
             rows = list(angles) if self.table.count else []
             for operation, indices in zip(self.circuit, self.table.rows):
-                _apply(operation, [rows[i] if isinstance(i, int) else i for i in indices])
+                _apply(operation, _arguments(indices, rows))
             return [qml.expval(qml.PauliZ(q)) for q in self.circuit.observables]
 
         # The shift rule is applied outside, so that the QNode need not be differentiable.
@@ -239,6 +239,13 @@ def _float64() -> Iterator[None]:
         yield
     finally:
         torch.set_default_dtype(previous)
+
+
+def _arguments(indices: Sequence[int | float], rows: Sequence[Tensor]) -> list[Tensor | float]:
+    """Return a gate's angles; beside variable ones constants are tensors too, Rot refuses a mixture."""
+    if not any(isinstance(i, int) for i in indices):
+        return list(indices)
+    return [rows[i] if isinstance(i, int) else torch.full_like(rows[0], i) for i in indices]
 
 
 def _apply(operation: Operation, angles: list[Any]) -> None:

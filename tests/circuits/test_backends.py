@@ -171,6 +171,28 @@ def test_every_gate_against_dense_matrices(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("gate", ["Rot", "U3"])
+@pytest.mark.parametrize("control", [None, 0])
+def test_constants_may_stand_beside_variable_angles(backend, gate, control):
+    circuit = Circuit(2)
+    w = circuit.parameter("w", (3,))
+    circuit.append("RY", 0, 0.8)
+    for variable in range(3):
+        circuit.append(gate, 1, *[w[k] if k == variable else 0.3 + k for k in range(3)], control=control)
+    parameters = {"w": torch.tensor([[0.2, 1.1, 2.3]], dtype=torch.float64, requires_grad=True)}
+    values = create_backend(backend, circuit)(torch.zeros(1, 1, 2, dtype=torch.float64), parameters)
+    values.sum().backward()
+    w = parameters["w"].detach().numpy()[0]
+
+    def total(w):
+        return dense(circuit, None, {"w": w}).sum()
+
+    assert float(values.detach().sum()) == pytest.approx(total(w), abs=1e-10)
+    slopes = [(total(w + step) - total(w - step)) / 2e-5 for step in 1e-5 * np.eye(3)]
+    np.testing.assert_allclose(parameters["w"].grad[0].numpy(), slopes, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_rotation_by_the_input_gives_its_cosine(backend):
     circuit = Circuit(2, inputs=1)
     circuit.append("RX", 1, circuit.input(0))
