@@ -10,12 +10,28 @@ from qrlsuite.specs import AlgorithmSpec
 
 @hookimpl
 def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
-    """Register `ddqn`."""
+    """Register `ddqn`, `ppo` and `reinforce`."""
     register(
         AlgorithmSpec(
             name="ddqn",
             summary="Double deep Q-learning with replay buffer and target network",
             options="qrlsuite.plugins.algorithms.ddqn:Options",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
+        )
+    )
+    register(
+        AlgorithmSpec(
+            name="ppo",
+            summary="Proximal policy optimization with generalized advantages, separate actor and critic",
+            options="qrlsuite.plugins.algorithms.ppo:Options",
+            factory="qrlsuite.plugins.algorithms.ppo:PPO",
+        )
+    )
+    register(
+        AlgorithmSpec(
+            name="reinforce",
+            summary="REINFORCE, the vanilla policy gradient, with or without a baseline",
+            options="qrlsuite.plugins.algorithms.reinforce:Options",
+            factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
         )
     )

@@ -1,0 +1,298 @@
+"""REINFORCE (Williams 1992), the vanilla policy gradient, for a population of S seeds.
+
+With policy pi (a softmax over the model's outputs), discount g, and the n steps of a seed's episodes that were
+completed in an epoch:
+
+    G_t  = r_t + g G_{t+1}, G = 0 after an episode's last step          the reward-to-go
+    loss = - 1/n sum_t (G_t - b) log pi(a_t|s_t),  summed over the S agents
+    b    = 0 (`baseline = "none"`), the mean of the n G_t ("mean"), or V(s_t) of a value network of the model's
+           architecture ("value"), which learns by 1/n sum_t (V(s_t) - G_t)^2 in the same step
+
+One Adam step per epoch. The paper names the algorithm only ('vanilla policy gradient', its appendix on CartPole)
+and gives no settings; the defaults are ours.
+
+How it meets a fixed number of steps per epoch:
+- An episode that is unfinished when the epoch ends carries over, and its steps are learned from in the epoch in which
+  it ends. Its actions stay as they were chosen, log pi(a|s) is evaluated under the parameters of the update: with
+  episodes longer than an epoch, the earliest steps are off-policy by as many updates. No importance weights.
+- A seed without a completed episode makes no step: its parameters, moments and step count stay.
+- Of an unfinished episode the last `memory` steps are kept. Of a longer one the earliest are not learned from; the
+  reward-to-go of the others is exact, as it does not look back.
+- A time limit ends the reward-to-go like any other end, except with a value network, which then stands in for what
+  would have followed: r_t + g V(s') at a truncated step. Without one there is nothing to bootstrap from.
+
+Steps lie in slots, (memory + rounds) per environment, and every slot goes through the networks in every epoch, those
+without a step to learn from with weight 0. All sums thus run over shapes that do not depend on the lengths of
+episodes, which is what makes each agent bitwise the agent it would have been alone. A model's count of circuit
+executions includes the empty slots, so `memory` should not be longer than episodes are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from qrlsuite.algorithm import BuildModel
+from qrlsuite.environment import LaneEnv
+from qrlsuite.population import Adam, part, prefixed
+from qrlsuite.seeding import Streams
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+BLOCK = 128
+"""Slots per forward and backward pass of each agent; bounds the memory that simulated circuits take."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Options:
+    """Options of REINFORCE."""
+
+    gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
+    lr: Annotated[float, Field(gt=0, description="learning rate of classical parameters")] = 1e-2
+    quantum_lr: Annotated[float, Field(gt=0, description="learning rate of quantum parameters")] = 1e-3
+    baseline: Annotated[
+        Literal["none", "mean", "value"],
+        Field(description="subtracted from rewards-to-go: nothing, their mean, or a value network"),
+    ] = "none"
+    memory: Annotated[
+        int,
+        Field(ge=1, description="steps kept of an unfinished episode, per environment, when an epoch ends"),
+    ] = 500
+
+
+def rewards_to_go(rewards: FloatArray, ended: BoolArray, gamma: float) -> tuple[FloatArray, BoolArray]:
+    """Return the discounted reward-to-go of every step, and whether its episode has ended; (S, E, T) all.
+
+    The reward-to-go of a step whose episode has not ended is what has been collected so far.
+    """
+    later, complete = np.zeros(rewards.shape[:2]), np.zeros(rewards.shape[:2], dtype=np.bool_)
+    returns, known = np.empty_like(rewards), np.empty_like(ended)
+    for t in reversed(range(rewards.shape[2])):
+        later = rewards[:, :, t] + gamma * np.where(ended[:, :, t], 0.0, later)
+        complete = complete | ended[:, :, t]
+        returns[:, :, t], known[:, :, t] = later, complete
+    return returns, known
+
+
+class Reinforce:
+    """S agents learning by REINFORCE; see `qrlsuite.algorithm.Algorithm` for the contract."""
+
+    def __init__(
+        self,
+        envs: LaneEnv,
+        build_model: BuildModel,
+        options: Options,
+        streams: Sequence[Streams],
+        device: torch.device,
+    ) -> None:
+        self.envs, self.options, self.streams, self.device = envs, options, streams, device
+        self.S = len(streams)
+        self.E = envs.num_envs // self.S
+        self.n_actions = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+        self.obs_dim = int(np.prod(envs.single_observation_space.shape or (1,)))
+        self.policy = build_model(self.n_actions).to(device)
+        self.adam = Adam(self.policy, options.lr, options.quantum_lr)
+        self.value = build_model(1).to(device) if options.baseline == "value" else None
+        self.value_adam = None if self.value is None else Adam(self.value, options.lr, options.quantum_lr)
+        self.epoch = 0
+        self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
+        # the steps of unfinished episodes, the last step in the last slot; a row is observation, action, reward
+        self.carried = torch.zeros((self.S, self.E, options.memory, self.obs_dim + 2), device=device)
+        self.lengths = torch.zeros((self.S, self.E), dtype=torch.int64)  # slots of `carried` in use
+
+    def start(self) -> None:
+        """Reset the environments."""
+        first, _ = self.envs.reset()
+        self.observations = self._tensor(first)
+
+    def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
+        """Collect `rounds` steps of every environment and make one update.
+
+        Returns, per seed (S,), the number of steps learned from `learned_steps` and the policy's loss `loss`, NaN
+        where no episode ended; with a value network also its mean squared error `value_loss`.
+        """
+        rows, ended, cut, final = self._collect(rounds)
+        memory = self.options.memory
+        rewards = rows[..., -1].to(torch.float64).cpu().numpy()
+        if self.value is not None:
+            beyond = self._beyond(final)  # (S, E, rounds)
+            rewards[:, :, memory:] += self.options.gamma * np.where(cut[:, :, memory:], beyond, 0.0)
+        returns, known = rewards_to_go(rewards, ended, self.options.gamma)
+        lengths = self.lengths.numpy()
+        filled = np.arange(memory + rounds) >= memory - lengths[..., None]
+        metrics = self._learn(rows[..., :-1], returns, known & filled)
+        self._carry(rows, lengths + rounds, known)
+        self.epoch += 1
+        return metrics
+
+    def _collect(self, rounds: int) -> tuple[Tensor, BoolArray, BoolArray, Tensor]:
+        """Step every environment `rounds` times with the stochastic policy.
+
+        An action is the argmax of logits plus standard Gumbel noise, which draws from their softmax (Gumbel-max).
+
+        Returns
+        -------
+        tuple
+            With T = memory + rounds slots: rows (S, E, T, obs + 2), whether an episode ended at a step (S, E, T),
+            whether it did by truncation (S, E, T), and where truncated steps arrived (S, E, rounds, obs).
+        """
+        memory, shape = self.options.memory, (self.S, self.E, self.options.memory + rounds)
+        noise = np.empty((self.S, rounds, self.E, self.n_actions), dtype=np.float32)
+        for s, streams in enumerate(self.streams):
+            noise[s] = streams.numpy("exploration", self.epoch).gumbel(size=noise.shape[1:])
+        gumbel = torch.from_numpy(noise).to(self.device)
+        rows = torch.zeros((*shape, self.obs_dim + 2), device=self.device)
+        rows[:, :, :memory] = self.carried
+        ended, cut = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
+        final = torch.zeros((self.S, self.E, rounds, self.obs_dim), device=self.device)
+        for k in range(rounds):
+            with torch.no_grad():
+                actions = (self.policy(self.observations) + gumbel[:, k]).argmax(2)  # (S, E)
+            lanes = actions.reshape(-1).cpu().numpy()
+            after, reward, terminated, truncated, infos = self.envs.step(lanes)
+            slot = memory + k
+            rows[:, :, slot, :-2] = self.observations
+            rows[:, :, slot, -2] = actions.to(torch.float32)
+            rows[:, :, slot, -1] = torch.from_numpy(np.asarray(reward, np.float32)).view(self.S, self.E)
+            ended[:, :, slot] = np.reshape(terminated | truncated, (self.S, self.E))
+            cut[:, :, slot] = np.reshape(truncated & ~terminated, (self.S, self.E))
+            if self.value is not None and truncated.any():
+                arrived = self._tensor(infos["final_obs"])
+                mask = torch.from_numpy(cut[:, :, slot, None]).to(self.device)
+                final[:, :, k] = torch.where(mask, arrived, final[:, :, k])
+            self.observations = self._tensor(after)
+        return rows, ended, cut, final
+
+    @torch.no_grad()
+    def _beyond(self, final: Tensor) -> FloatArray:
+        """Return the value network's estimates (S, E, rounds) at states (S, E, rounds, obs)."""
+        assert self.value is not None
+        states = final.reshape(self.S, -1, self.obs_dim)
+        values = [self.value(block.contiguous()) for block in torch.split(states, BLOCK, dim=1)]
+        result: FloatArray = torch.cat(values, dim=1).view(final.shape[:3]).to(torch.float64).cpu().numpy()
+        return result
+
+    def _learn(self, rows: Tensor, returns: FloatArray, learned: BoolArray) -> dict[str, NDArray[np.float64]]:
+        """Make one Adam step of every agent that has anything to learn from.
+
+        Parameters
+        ----------
+        rows:
+            Observation and action of every slot (S, E, T, obs + 1).
+        returns:
+            Reward-to-go (S, E, T).
+        learned:
+            Which slots hold a step of a completed episode (S, E, T).
+        """
+        flat = learned.reshape(self.S, -1)
+        count = flat.sum(1)
+        weight = flat / np.maximum(count, 1)[:, None]
+        g = np.where(flat, returns.reshape(self.S, -1), 0.0)
+        baseline = (g * weight).sum(1, keepdims=True) if self.options.baseline == "mean" else 0.0
+        columns = np.stack([weight, g - baseline]).astype(np.float32)
+        w, advantage = torch.from_numpy(columns).to(self.device)  # (S, N) each, N = E x T
+        every = rows.reshape(self.S, -1, self.obs_dim + 1)
+        self.adam.zero_grad()
+        if self.value_adam is not None:
+            self.value_adam.zero_grad()
+        total = torch.zeros((2, self.S), dtype=torch.float64, device=self.device)
+        for a in range(0, every.shape[1], BLOCK):
+            block = slice(a, a + BLOCK)
+            total += self._accumulate(
+                every[:, block, :-1].contiguous(),
+                every[:, block, -1].long(),
+                w[:, block].contiguous(),
+                advantage[:, block].contiguous(),
+            )
+        active = torch.from_numpy(count > 0)
+        self.adam.step(active)
+        metrics = {"learned_steps": count.astype(np.float64)}
+        names = ["loss"]
+        if self.value_adam is not None:
+            self.value_adam.step(active)
+            names.append("value_loss")
+        for name, loss in zip(names, total.cpu().numpy()):
+            metrics[name] = np.where(count > 0, loss, np.nan)
+        return metrics
+
+    def _accumulate(self, states: Tensor, actions: Tensor, weights: Tensor, advantages: Tensor) -> Tensor:
+        """Add a block's part of both losses to the gradients; returns the parts (2, S).
+
+        Parameters
+        ----------
+        states:
+            (S, B, obs).
+        actions, weights, advantages:
+            (S, B); weights are 1/n, or 0 in slots that are not learned from.
+        """
+        log_policy = torch.log_softmax(self.policy(states), -1).gather(2, actions[..., None]).squeeze(2)
+        value_loss = torch.zeros(self.S, device=self.device)
+        if self.value is not None:
+            error = self.value(states).squeeze(2) - advantages
+            value_loss = (weights * error.square()).sum(1)
+            advantages = -error.detach()
+        loss = -(weights * advantages * log_policy).sum(1)
+        torch.autograd.backward((loss + value_loss).sum())
+        return torch.stack([loss.detach(), value_loss.detach()]).to(torch.float64)
+
+    def _carry(self, rows: Tensor, steps: NDArray[np.int64], known: BoolArray) -> None:
+        """Keep the last steps of unfinished episodes: those after the last end among the last `steps` slots."""
+        memory = self.options.memory
+        open_steps = np.minimum((~known).sum(2), steps)
+        self.lengths = torch.from_numpy(np.minimum(open_steps, memory))
+        kept = torch.arange(memory) >= memory - self.lengths[..., None]
+        rows = rows[:, :, -memory:]
+        self.carried = torch.where(kept[..., None].to(self.device), rows, torch.zeros_like(rows))
+
+    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the greedy actions (S, B) for observations (S, B, obs)."""
+        with torch.no_grad():
+            logits: Tensor = self.policy(torch.from_numpy(observations).to(self.device))
+        result: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
+        return result
+
+    def _tensor(self, lanes: NDArray[np.float32]) -> Tensor:
+        """Reshape lane-major observations (S * E, ...) to (S, E, obs)."""
+        return (
+            torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
+        )
+
+    def policy_state(self) -> dict[str, Tensor]:
+        """Return the policy network's parameters and buffers."""
+        return dict(self.policy.state_dict())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return networks, optimizers, unfinished episodes, current observations and the epoch, seed-first."""
+        networks: dict[str, Mapping[str, Tensor]] = {
+            "policy": self.policy.state_dict(),
+            "adam": self.adam.state_dict(),
+        }
+        if self.value is not None and self.value_adam is not None:
+            networks |= {"value": self.value.state_dict(), "value_adam": self.value_adam.state_dict()}
+        return {
+            **prefixed(**networks),
+            "carried": self.carried,
+            "lengths": self.lengths,
+            "observations": self.observations,
+            "epoch": torch.full((self.S,), self.epoch, dtype=torch.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self.policy.load_state_dict(part(state, "policy"))
+        self.adam.load_state_dict(part(state, "adam"))
+        if self.value is not None and self.value_adam is not None:
+            self.value.load_state_dict(part(state, "value"))
+            self.value_adam.load_state_dict(part(state, "value_adam"))
+        self.carried.copy_(state["carried"])
+        self.lengths.copy_(state["lengths"])
+        self.observations = state["observations"].clone()
+        self.epoch = int(state["epoch"][0])
