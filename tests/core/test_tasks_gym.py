@@ -19,12 +19,12 @@ from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.gymlanes import GymLanes, quick_name
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.store import EntryStore
-from qrlsuite.tasks import placements
+from qrlsuite.tasks import variants
 from tests.conftest import results
 from tests.environments.strangers import HERE
 
 ROOT = Path(__file__).parents[2]
-TASKS = Path(placements.__file__).parent
+TASKS = Path(variants.__file__).parent
 PRESETS = [
     (name, preset, algorithm, family)
     for name in registry.load().names("tasks")
@@ -75,9 +75,19 @@ def test_cartpole_is_as_the_benchmark_says() -> None:
     assert file.default_algorithm == "reinforce"
 
 
-@pytest.mark.parametrize("name", placements.files())
-def test_the_placements_files_are_what_the_script_writes(name: str) -> None:
-    assert (TASKS / name).read_text(encoding="utf-8") == placements.files()[name]
+@pytest.mark.parametrize("name", variants.files())
+def test_the_variants_of_beam6g_are_what_the_script_writes(name: str) -> None:
+    assert (TASKS / name).read_text(encoding="utf-8") == variants.files()[name], (
+        "run python -m qrlsuite.tasks.variants"
+    )
+
+
+def test_a_base_file_of_another_form_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    base = tmp_path / "beam6g.toml"
+    base.write_text((TASKS / "beam6g.toml").read_text().replace("steps = 200", "steps = 100"))
+    monkeypatch.setattr(variants, "_BASE", base)
+    with pytest.raises(ValueError, match=r"beam6g.toml: .*steps = 200.* matches 0 times, not once"):
+        variants.files()
 
 
 def test_all_twenty_placements_are_there_and_differ() -> None:
