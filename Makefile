@@ -16,15 +16,15 @@ quickstart: install
 test: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	cd $(VENV) && bin/mypy --config-file ../pyproject.toml -p qrlsuite
+	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
+	cd $(VENV) && MYPYPATH=wheel bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 install: $(BIN)/python
 	$(BIN)/pip install --quiet .
 
-# Strict mode lays the four folders out as one package, which type checkers can follow.
 install-dev: $(BIN)/python
-	$(BIN)/pip install --quiet --editable '.[dev]' --config-settings editable_mode=strict
+	$(BIN)/pip install --quiet --editable '.[dev]'
 
 # The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,
 # install the torch of your choice into $(VENV) before anything else; it is kept.
