@@ -1,0 +1,165 @@
+"""What every registered algorithm keeps to: seeds apart, exact resuming, and that it learns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from qrlsuite import registry
+from tests.algorithms.worlds import Contexts, Group
+
+E = 3
+VARIANTS: dict[str, list[dict[str, Any]]] = {
+    "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
+    "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
+    "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 9), ("mean", 4), ("value", 12))],
+}
+CASES = [(name, case) for name in registry.load().names("algorithms") for case in VARIANTS.get(name, [{}])]
+IDS = [f"{name}-{'-'.join(str(v) for v in case.values())}" for name, case in CASES]
+every_algorithm = pytest.mark.parametrize(("name", "case"), CASES, ids=IDS)
+
+
+def group(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) -> Group:
+    return Group(name, seeds, Contexts(len(seeds) * E), **more, **case)
+
+
+def trained(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) -> dict[str, NDArray[Any]]:
+    """Everything a group has after three epochs: its state, its metrics and its actions; seed-first."""
+    made = group(name, seeds, case, **more).start()
+    result: dict[str, NDArray[Any]] = {}
+    for epoch in range(3):
+        for metric, values in made.algorithm.train_epoch(7).items():
+            result[f"{metric}{epoch}"] = values
+        result[f"actions{epoch}"] = np.stack([actions(made) for _ in range(3)], axis=1)
+    return {**made.save(), **result}
+
+
+def actions(made: Group) -> NDArray[np.int64]:
+    observations = [s.numpy("test").random((11, 4)).astype(np.float32) for s in made.streams]
+    chosen: NDArray[np.int64] = made.algorithm.act(np.stack(observations))
+    return chosen
+
+
+def assert_same(
+    part: dict[str, NDArray[Any]], members: Sequence[int], whole: dict[str, NDArray[Any]]
+) -> None:
+    assert part.keys() == whole.keys()
+    for key, array in whole.items():
+        np.testing.assert_array_equal(
+            part[key], array[list(members)], err_msg=f"{key} of {members}", strict=True
+        )
+
+
+@every_algorithm
+@pytest.mark.parametrize("model", ["mlp", "vqc-native"])
+def test_a_seed_does_not_depend_on_its_company(name: str, case: dict[str, Any], model: str) -> None:
+    size = 19 if model == "mlp" else 5
+    whole = trained(name, range(size), case, model=model)
+    groups: list[list[int]] = [[0], [size - 1], [1, 2], [4, 1, 3]]
+    if model == "mlp":
+        groups += [[17, 18], list(range(2, 13)), list(range(18, 0, -1))]
+    for members in groups:
+        assert_same(trained(name, members, case, model=model), members, whole)
+
+
+@every_algorithm
+def test_a_hundred_seeds_do_not_change_one(name: str, case: dict[str, Any]) -> None:
+    """Wide layers, whose products are computed by another library routine than narrow ones."""
+    more: dict[str, Any] = {"model_options": {"width": 64, "depth": 2}}
+    whole = trained(name, range(100), case, **more)
+    for members in ([0], [99], [37, 38, 39]):
+        assert_same(trained(name, members, case, **more), members, whole)
+
+
+@every_algorithm
+def test_different_seeds_differ(name: str, case: dict[str, Any]) -> None:
+    whole = trained(name, [0, 1], case)
+    for key, array in whole.items():
+        if key.startswith("algorithm.") and "steps" not in key and array.dtype == np.float32:
+            assert not np.array_equal(array[0], array[1]) or not array.any(), key
+
+
+@every_algorithm
+def test_groups_split_and_merge_at_the_end_of_an_epoch(name: str, case: dict[str, Any]) -> None:
+    straight = group(name, range(4), case).start()
+    halves = [group(name, [0, 1, 2], case).start(), group(name, [3], case).start()]
+    for _ in range(2):
+        for each in (straight, *halves):
+            each.algorithm.train_epoch(7)
+    for epoch, regrouped in enumerate(([[1, 3], [0, 2]], [[2], [3, 0, 1]], [[0, 1, 2, 3]])):
+        saved: dict[int, dict[str, NDArray[Any]]] = {}
+        for each in halves:
+            arrays = each.save()
+            saved.update({seed: {k: v[s] for k, v in arrays.items()} for s, seed in enumerate(each.seeds)})
+        halves = [
+            group(name, seeds, case).load({k: np.stack([saved[s][k] for s in seeds]) for k in saved[0]})
+            for seeds in regrouped
+        ]
+        expected = straight.algorithm.train_epoch(7)
+        drawn = actions(straight)
+        whole = {**straight.save(), **expected}
+        for each in halves:
+            metrics = each.algorithm.train_epoch(7)
+            np.testing.assert_array_equal(actions(each), drawn[each.seeds], err_msg=f"epoch {epoch}")
+            assert_same({**each.save(), **metrics}, each.seeds, whole)
+
+
+@every_algorithm
+def test_states_and_metrics_have_the_seed_axis_first(name: str, case: dict[str, Any]) -> None:
+    made = group(name, range(5), case).start()
+    metrics = made.algorithm.train_epoch(6)
+    for key, tensor in {**made.algorithm.state_dict(), **made.algorithm.policy_state()}.items():
+        assert tensor.shape[:1] == (5,), key
+    for metric, values in metrics.items():
+        assert values.shape == (5,), metric
+        assert values.dtype == np.float64, metric
+
+
+@every_algorithm
+def test_the_published_policy_is_what_acts(name: str, case: dict[str, Any]) -> None:
+    made, other = (group(name, range(2), {**case}).start() for _ in range(2))
+    for _ in range(2):
+        made.algorithm.train_epoch(12)
+    before = actions(other)
+    state = other.algorithm.state_dict()
+    policy = made.algorithm.policy_state()
+    mine = {k: v for k, v in state.items() if k.partition(".")[2] in policy and "adam" not in k}
+    acting = {k.partition(".")[0] for k in mine} & {"online", "actor", "policy"}
+    assert len(acting) == 1
+    for key, tensor in mine.items():
+        if key.partition(".")[0] in acting:
+            tensor.copy_(policy[key.partition(".")[2]])
+    if case.get("validation") != "sampled":
+        np.testing.assert_array_equal(actions(other), actions(made))
+    assert before.shape == (2, 11)
+
+
+LEARNING: dict[str, tuple[int, int, dict[str, Any]]] = {
+    "ddqn": (3, 150, {"lr": 5e-3, "gamma": 0.5, "target_steps": 50}),
+    "ppo": (8, 60, {"lr": 5e-3}),
+    "reinforce": (60, 20, {"lr": 3e-2, "memory": 10, "gamma": 0.5}),
+    "reinforce-mean": (60, 20, {"lr": 3e-2, "memory": 10, "gamma": 0.5, "baseline": "mean"}),
+    "reinforce-value": (60, 20, {"lr": 3e-2, "memory": 10, "gamma": 0.5, "baseline": "value"}),
+}
+
+
+@pytest.mark.parametrize("label", LEARNING)
+def test_it_learns_a_bandit(label: str) -> None:
+    """After seconds every seed knows the action of every context, at every step."""
+    epochs, rounds, settings = LEARNING[label]
+    made = group(label.partition("-")[0], range(4), settings).start()
+    grid = np.array([[*np.eye(3)[c], t / 10] for c in range(3) for t in range(8)], dtype=np.float32)
+    wanted = np.repeat(np.arange(3), 8)
+
+    def correct() -> NDArray[np.float64]:
+        shares: NDArray[np.float64] = (made.algorithm.act(np.stack([grid] * 4)) == wanted).mean(1)
+        return shares
+
+    assert correct().mean() < 0.7
+    for _ in range(epochs):
+        made.algorithm.train_epoch(rounds)
+    assert correct().min() > 0.95
