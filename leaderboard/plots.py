@@ -16,7 +16,7 @@ STYLES = ("-", "--", "-.", ":")
 
 
 def curves(entries: Sequence[EntryCurves]) -> Figure:
-    """Draw learning curves: the median run, the 5th to 95th percentile of runs, and every run faintly.
+    """Draw learning curves: the median over runs, their 5th to 95th percentile, and single runs where they are few.
 
     Parameters
     ----------
@@ -30,13 +30,15 @@ def curves(entries: Sequence[EntryCurves]) -> Figure:
     """
     figure = Figure(figsize=(7.2, 4.3), layout="constrained")
     axes = figure.subplots()
+    few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
     for i, entry in enumerate(entries):
         color, style = COLORS[i % len(COLORS)], STYLES[(i // len(COLORS)) % len(STYLES)]
         epochs = entry.curves.shape[1]
         steps = np.arange(1, epochs + 1) * entry.steps_per_epoch
         low, middle, high = np.percentile(entry.curves, (5, 50, 95), axis=0)
-        axes.plot(steps, entry.curves.T, color=color, linewidth=0.5, alpha=min(0.25, 4 / len(entry.seeds)))
-        axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
+        if few:
+            axes.plot(steps, entry.curves.T, color=color, linewidth=0.5, alpha=0.25)
+        axes.fill_between(steps, low, high, color=color, alpha=0.15 if few else 0.1, linewidth=0)
         seeds = f"{len(entry.seeds)} seed" + "s" * (len(entry.seeds) != 1)
         axes.plot(steps, middle, color=color, linestyle=style, linewidth=2, label=f"{entry.label}  ({seeds})")
     axes.set_xlabel("environment steps")
@@ -48,7 +50,9 @@ def curves(entries: Sequence[EntryCurves]) -> Figure:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(loc="lower right", frameon=False)
-    axes.set_title(f"{entries[0].task}: median run, 5th to 95th percentile", fontsize="medium", loc="left")
+    axes.set_title(
+        f"{entries[0].task}: median of the runs, 5th to 95th percentile", fontsize="medium", loc="left"
+    )
     return figure
 
 
