@@ -77,7 +77,8 @@ class Engine(Protocol):
 
 def worker_command(work: Work, group: Group) -> list[str]:
     """Return the command line that trains a group."""
-    command = [sys.executable, "-m", "qrlsuite.engine.worker", str(work.store.path.absolute())]
+    # -P: never import from the folder one stands in, which may be a source tree without its plugins
+    command = [sys.executable, "-P", "-m", "qrlsuite.engine.worker", str(work.store.path.absolute())]
     return [
         *command,
         "--seeds",

@@ -116,7 +116,7 @@ class Group:
         self.model_options = options.build(
             specs.resolve(self.model.options), {**defaults, **(model_options or {})}, "model"
         )
-        self.built = 0
+        self.modules: list[nn.Module] = []
         spec = registry.algorithm(algorithm)
         self.algorithm = specs.resolve(spec.factory)(
             envs,
@@ -132,14 +132,18 @@ class Group:
             int(np.prod(self.envs.single_observation_space.shape)),
         )
         agents = [
-            build(inputs, out_dim, self.model_options, streams.torch("init", self.built))
+            build(inputs, out_dim, self.model_options, streams.torch("init", len(self.modules)))
             for streams in self.streams
         ]
-        self.built += 1
         if self.model.population is None:
-            return population.stack(agents)
-        module: nn.Module = specs.resolve(self.model.population)(agents, self.model_options)
-        return module
+            self.modules.append(population.stack(agents))
+        else:
+            self.modules.append(specs.resolve(self.model.population)(agents, self.model_options))
+        return self.modules[-1]
+
+    def executions(self) -> list[dict[str, int]]:
+        """The circuit executions of each network of an agent; nothing for classical ones."""
+        return [m.executions.as_dict() for m in self.modules if hasattr(m, "executions")]
 
     def start(self) -> Group:
         self.envs.seed_lanes([s.numpy("environment", lane) for s in self.streams for lane in range(self.E)])

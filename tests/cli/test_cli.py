@@ -178,3 +178,13 @@ def test_version_and_help() -> None:
     assert qrlsuite("--version").stdout.startswith("qrlsuite ")
     for command in ("run", "leaderboard", "compare", "plot", "list", "show"):
         assert "Example" in qrlsuite(command, "--help").stdout
+
+
+def test_workers_do_not_import_from_the_folder_one_stands_in(task: str, tmp_path: Path) -> None:
+    """A source tree, or any folder called qrlsuite, may lie where the command is typed."""
+    (tmp_path / "qrlsuite").mkdir()
+    (tmp_path / "qrlsuite" / "__init__.py").write_text("raise ImportError('the wrong qrlsuite')")
+    command = [str(Path(sys.executable).parent / "qrlsuite"), "run", "--task", task, "--model", "mlp"]
+    command += ["--set", "width=16", "--seeds", "1", "--epochs", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
