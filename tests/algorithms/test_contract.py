@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from qrlsuite import registry
 from tests.algorithms.worlds import Contexts, Group
+from tests.conftest import results
 
 E = 3
 VARIANTS: dict[str, list[dict[str, Any]]] = {
@@ -111,6 +113,30 @@ def test_groups_split_and_merge_at_the_end_of_an_epoch(name: str, case: dict[str
             metrics = each.algorithm.train_epoch(7)
             np.testing.assert_array_equal(actions(each), drawn[each.seeds], err_msg=f"epoch {epoch}")
             assert_same({**each.save(), **metrics}, each.seeds, whole)
+
+
+@every_algorithm
+def test_stored_results_do_not_depend_on_groups(
+    name: str, case: dict[str, Any], tiny_task: str, tmp_path: Path
+) -> None:
+    """Through the core, with a circuit: curves, executions and agents are the same bytes, also after a pause."""
+    from qrlsuite.engine.worker import train_group
+    from qrlsuite.entry import resolve
+    from qrlsuite.options import parse_setting
+    from qrlsuite.store import EntryStore
+
+    settings = {"qubits": 2, "layers": 1, **{f"algorithm.{k}": v for k, v in case.items()}}
+    words = [parse_setting(f"{k}={v}") for k, v in settings.items()]
+    entry = resolve(tiny_task, "vqc-native", name, words)
+    plans = {"together": [([0, 1, 2], 3)], "apart": [([1], 1), ([0, 2], 2), ([1], 2), ([2, 1, 0], 3)]}
+    folders = []
+    for folder, stages in plans.items():
+        store = EntryStore.create(tmp_path / folder, entry)
+        for seeds, epochs in stages:
+            train_group(store.path, seeds, epochs)
+        folders.append(store.path)
+    for seed in range(3):
+        assert results(folders[0], seed) == results(folders[1], seed)
 
 
 @every_algorithm
