@@ -336,7 +336,7 @@ class PPO:
         self.critic.load_state_dict(part(state, "critic"))
         self.actor_adam.load_state_dict(part(state, "actor_adam"))
         self.critic_adam.load_state_dict(part(state, "critic_adam"))
-        self.observations = state["observations"].clone()
+        self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])
         self._validation = []
 

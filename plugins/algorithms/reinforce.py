@@ -294,5 +294,5 @@ class Reinforce:
             self.value_adam.load_state_dict(part(state, "value_adam"))
         self.carried.copy_(state["carried"])
         self.lengths.copy_(state["lengths"])
-        self.observations = state["observations"].clone()
+        self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])

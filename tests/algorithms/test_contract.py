@@ -18,7 +18,7 @@ E = 3
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
     "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
-    "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 9), ("mean", 4), ("value", 12))],
+    "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 4), ("mean", 90), ("value", 12))],
 }
 CASES = [(name, case) for name in registry.load().names("algorithms") for case in VARIANTS.get(name, [{}])]
 IDS = [f"{name}-{'-'.join(str(v) for v in case.values())}" for name, case in CASES]
