@@ -209,7 +209,7 @@ class Adam:
                 square.mul_(beta2).addcmul_(parameter.grad, parameter.grad, value=1.0 - beta2)
                 parameter.sub_((mean * rate).div_(square.sqrt().mul_(correction).add_(self.eps)))
                 continue
-            mask = active.view(axes)
+            mask = active.view(axes).to(parameter.device)
             new_mean = mean.lerp(parameter.grad, 1.0 - beta1)
             new_square = (square * beta2).addcmul_(parameter.grad, parameter.grad, value=1.0 - beta2)
             change = (new_mean * rate).div_(new_square.sqrt().mul_(correction).add_(self.eps))

@@ -200,5 +200,5 @@ class DDQN:
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
         self.buffer.copy_(state["buffer"])
-        self.observations = state["observations"].clone()
+        self.observations = state["observations"].clone().to(self.device)
         self.stored, self.epoch = (int(v) for v in state["counters"][0])
