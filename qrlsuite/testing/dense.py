@@ -1,0 +1,87 @@
+"""A circuit's expectation values by dense matrices: slow, a few lines, and independent of every backend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.circuit import Angle, Circuit, Operation
+
+Matrix = NDArray[np.complex128]
+
+_X: Matrix = np.array([[0, 1], [1, 0]], dtype=np.complex128)
+_Y: Matrix = np.array([[0, -1j], [1j, 0]])
+_Z: Matrix = np.diag([1, -1]).astype(np.complex128)
+_FIXED: dict[str, Matrix] = {
+    "H": (_X + _Z) / np.sqrt(2),
+    "X": _X,
+    "Y": _Y,
+    "Z": _Z,
+    "S": np.diag([1, 1j]),
+    "T": np.diag([1, np.exp(0.25j * np.pi)]),
+    "CNOT": np.eye(4, dtype=np.complex128)[[0, 1, 3, 2]],
+    "CZ": np.diag([1, 1, 1, -1]).astype(np.complex128),
+    "SWAP": np.eye(4, dtype=np.complex128)[[0, 2, 1, 3]],
+}
+
+
+def expectation_values(
+    circuit: Circuit, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Return the expectation values (len(circuit.observables),) of one input (circuit.inputs,)."""
+    n = circuit.qubits
+    state = np.zeros((2,) * n, dtype=np.complex128)
+    state[(0,) * n] = 1.0
+    for operation in circuit.operations:
+        matrix = _matrix(operation, [_angle(a, inputs, parameters) for a in operation.angles])
+        wires = list(operation.qubits)
+        k = len(wires)
+        state = np.tensordot(matrix.reshape((2,) * (2 * k)), state, axes=(range(k, 2 * k), wires))
+        state = np.moveaxis(state, range(k), wires)
+    probabilities = np.abs(state) ** 2
+    values = []
+    for wire in circuit.observables:
+        marginal = probabilities.sum(axis=tuple(q for q in range(n) if q != wire))
+        values.append(float(marginal[0] - marginal[1]))
+    return np.array(values)
+
+
+def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:
+    value = angle.constant
+    if angle.input is not None:
+        scale = 1.0 if angle.scale is None else parameters[angle.scale.parameter].flat[angle.scale.index]
+        value += float(scale * inputs[angle.input])
+    if angle.weight is not None:
+        value += float(parameters[angle.weight.parameter].flat[angle.weight.index])
+    return value
+
+
+def _rotation(pauli: Matrix, angle: float) -> Matrix:
+    rotated: Matrix = np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
+    return rotated
+
+
+def _matrix(operation: Operation, angles: list[float]) -> Matrix:
+    """Return the matrix of an operation on (control, wires): 2 x 2 or 4 x 4."""
+    gate = operation.gate
+    if gate in ("RX", "RY", "RZ"):
+        matrix = _rotation({"RX": _X, "RY": _Y, "RZ": _Z}[gate], angles[0])
+    elif gate == "Rot":
+        matrix = _rotation(_Z, angles[2]) @ _rotation(_Y, angles[1]) @ _rotation(_Z, angles[0])
+    elif gate == "U3":
+        t, p, d = angles
+        matrix = np.array(
+            [
+                [np.cos(t / 2), -np.exp(1j * d) * np.sin(t / 2)],
+                [np.exp(1j * p) * np.sin(t / 2), np.exp(1j * (p + d)) * np.cos(t / 2)],
+            ]
+        )
+    else:
+        matrix = _FIXED[gate]
+    if operation.control is None:
+        return matrix
+    controlled = np.eye(4, dtype=np.complex128)
+    controlled[2:, 2:] = matrix
+    return controlled

@@ -1,0 +1,90 @@
+"""What a conformance check reports, and how it goes through its rules."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+SIZES: tuple[tuple[int, ...], ...] = ((0,), (3,), (1, 2), (4, 1, 3), (3, 0, 4, 2, 1))
+"""Groups in which an agent of 0..4 is compared with itself among all five: alone, in pairs, shuffled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one rule found.
+
+    Attributes
+    ----------
+    rule:
+        The rule's name.
+    ok:
+        Whether it holds.
+    message:
+        Where it holds: what was looked at. Where it does not: what is wrong, and the likely cause.
+    """
+
+    rule: str
+    ok: bool
+    message: str
+
+
+class BrokenRuleError(Exception):
+    """A rule does not hold; the message says what is wrong and the likely cause."""
+
+
+def require(holds: bool, message: str) -> None:
+    """Raise `BrokenRuleError(message)` unless a condition holds."""
+    if not holds:
+        raise BrokenRuleError(message)
+
+
+class Checklist:
+    """Goes through rules; a rule that raises is a finding, never an end.
+
+    Attributes
+    ----------
+    findings:
+        One per rule, in order.
+    """
+
+    def __init__(self) -> None:
+        self.findings: list[Finding] = []
+
+    def run(self, rule: str, looked_at: str, check: Callable[[], object], cause: str = "") -> bool:
+        """Check one rule; returns whether it holds.
+
+        Parameters
+        ----------
+        rule:
+            Its name.
+        looked_at:
+            What a passing check has established.
+        check:
+            Raises `BrokenRuleError` where the rule is broken. Any other exception breaks it too.
+        cause:
+            The likely cause of another exception.
+        """
+        try:
+            check()
+        except BrokenRuleError as error:
+            self.findings.append(Finding(rule, False, str(error)))
+        except Exception as error:  # whatever a stranger's code raises is the stranger's to read
+            hint = f"; {cause}" if cause else ""
+            self.findings.append(Finding(rule, False, f"{type(error).__name__}: {error}{hint}"))
+        else:
+            self.findings.append(Finding(rule, True, looked_at))
+        return self.findings[-1].ok
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread, as runs do: sums are otherwise cut into parts that depend on the machine."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,390 @@
+"""What a model keeps to: its generator alone decides, gradients reach everything, and company changes nothing."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from qrlsuite import population as populations
+from qrlsuite import specs
+from qrlsuite.testing.common import Subject
+from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
+
+OBS, OUT, B, S = 4, 3, 6, 5
+
+
+class Subjects:
+    """Builds agents and populations of the model that is checked."""
+
+    def __init__(self, subject: Subject) -> None:
+        spec = subject.spec
+        assert isinstance(spec, specs.ModelSpec)
+        self.spec, self.options = spec, subject.options()
+        self.build = specs.resolve(spec.build)
+        self.sampled = getattr(self.options, "shots", None) is not None
+
+    def agent(self, seed: int) -> nn.Module:
+        """Return one agent, from a generator of that seed."""
+        made: nn.Module = self.build(OBS, OUT, self.options, torch.Generator().manual_seed(seed))
+        return made
+
+    def population(self, seeds: Sequence[int]) -> nn.Module:
+        """Return a population of freshly built agents."""
+        agents = [self.agent(seed) for seed in seeds]
+        if self.spec.population is None:
+            return populations.stack(agents)
+        made: nn.Module = specs.resolve(self.spec.population)(agents, self.options)
+        return made
+
+
+def check(subject: Subject) -> list[Finding]:
+    """Check a model with 4 inputs and 3 outputs."""
+    made = Subjects(subject)
+    rules = Checklist()
+    with one_thread():
+        if not rules.run(
+            "builds", "a torch.nn.Module from (4, 3, options, generator)", lambda: _builds(made)
+        ):
+            return rules.findings
+        cause = "forward takes (B, inputs) and returns (B, outputs)"
+        if not rules.run("shapes", "(B, 4) to (B, 3), float32, finite", lambda: _shapes(made), cause):
+            return rules.findings
+        rules.run(
+            "parameters registered", "no tensor or module is hidden from torch", lambda: _registered(made)
+        )
+        rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(made))
+        rules.run("same seed", "the generator alone decides the parameters", lambda: _same(made))
+        rules.run("different seed", "every generator gives other parameters", lambda: _different(made))
+        rules.run("global randomness", "torch's is untouched by building and running", lambda: _global(made))
+        rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(made))
+        flows = rules.run("gradients", "reach every trainable parameter", lambda: _flow(made))
+        if flows and not made.sampled:
+            rules.run("finite differences", "equal the gradients", lambda: _differences(made))
+        rules.run("copies", "deep copies are independent and equal", lambda: _copies(made))
+        if not rules.run(
+            "population", "(S, B, 4) to (S, B, 3), each slice its agent", lambda: _population(made)
+        ):
+            return rules.findings
+        rules.run(
+            "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(made)
+        )
+        rules.run("state", "saved, sliced and restored exactly", lambda: _state(made))
+    return rules.findings
+
+
+def _x(*lead: int, seed: int = 0) -> Tensor:
+    return torch.rand(*lead, B, OBS, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+
+
+def _builds(made: Subjects) -> None:
+    agent = made.agent(0)
+    require(
+        isinstance(agent, nn.Module),
+        f"build returned {type(agent).__name__}, not a torch.nn.Module: is `return` there?",
+    )
+
+
+def _shapes(made: Subjects) -> None:
+    agent = made.agent(0)
+    for batch in (B, 1):
+        values = agent(_x()[:batch])
+        require(isinstance(values, Tensor), f"forward returned {type(values).__name__}, not a tensor")
+        require(
+            tuple(values.shape) == (batch, OUT),
+            f"forward maps ({batch}, {OBS}) to {tuple(values.shape)}, and it must give ({batch}, {OUT}): the last "
+            "layer has as many outputs as there are actions, and the batch comes first",
+        )
+        require(
+            values.dtype == torch.float32,
+            f"inputs of float32 give {values.dtype}: end forward with .to(x.dtype), or losses mix types",
+        )
+        require(
+            bool(torch.isfinite(values).all()), "outputs are not finite: what do large or zero weights do?"
+        )
+
+
+def _inside(value: Any) -> Iterator[Any]:
+    """Go through lists, tuples and dicts."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _inside(item)
+    else:
+        yield value
+
+
+def _registered(made: Subjects) -> None:
+    agent = made.agent(0)
+    known = {id(m) for m in agent.modules()}
+    tensors = {id(t) for t in [*agent.parameters(), *agent.buffers()]}
+    for path, module in agent.named_modules():
+        for name, attribute in vars(module).items():
+            if name.startswith("_") and name in vars(nn.Module()):
+                continue
+            where = f"{path}.{name}".lstrip(".")
+            for item in _inside(attribute):
+                require(
+                    not isinstance(item, nn.Module) or id(item) in known,
+                    f"self.{where} holds a module in a plain list or dict, so torch does not see its parameters and "
+                    "nothing trains them: use nn.ModuleList or nn.ModuleDict",
+                )
+                require(
+                    not (isinstance(item, Tensor) and item.requires_grad) or id(item) in tensors,
+                    f"self.{where} is a tensor that wants a gradient and is no registered parameter, so nothing trains "
+                    "or saves it: write self.name = nn.Parameter(...), or nn.ParameterList for several",
+                )
+    trainable = [name for name, p in agent.named_parameters() if p.requires_grad]
+    require(bool(trainable), "there is no trainable parameter: write self.name = nn.Parameter(...)")
+
+
+def _quantum(made: Subjects) -> None:
+    agent = made.agent(0)
+    declared = populations.quantum_parameters(agent)
+    known = {name for name, _ in agent.named_parameters()}
+    require(
+        declared <= known,
+        f"quantum_parameters() names {sorted(declared - known)}, which are none of {sorted(known)}",
+    )
+    if made.spec.family == "quantum":
+        require(
+            bool(declared),
+            "family = 'quantum' and no parameter is declared quantum, so that quantum_lr reaches none: define "
+            "quantum_parameters(self) -> set[str]",
+        )
+    else:
+        require(
+            not declared,
+            f"family = 'classical', and quantum_parameters() names {sorted(declared)}: is it 'quantum'?",
+        )
+
+
+def _values(module: nn.Module) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+
+def _equal(a: dict[str, Tensor], b: dict[str, Tensor]) -> str | None:
+    """Return the first name that differs, or None."""
+    if a.keys() != b.keys():
+        return ", ".join(sorted(a.keys() ^ b.keys()))
+    return next((name for name, value in a.items() if not torch.equal(value, b[name])), None)
+
+
+_DRAW = (
+    "draw every number from the generator that build is given; layers of torch.nn draw from torch's global one, so "
+    "build them inside `with torch.random.fork_rng(devices=[]): torch.manual_seed(torch.randint(2**62, (), "
+    "generator=generator).item())`"
+)
+
+
+def _same(made: Subjects) -> None:
+    kept = np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng(devices=[]):
+        built = []
+        for noise in (1, 2):
+            torch.manual_seed(noise)
+            np.random.seed(noise)  # noqa: NPY002
+            built.append(_values(made.agent(7)))
+        np.random.set_state(kept)  # noqa: NPY002
+    name = _equal(*built)
+    require(name is None, f"two builds from generators of the same seed differ in '{name}': {_DRAW}")
+
+
+def _different(made: Subjects) -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        first = _values(made.agent(7))
+        torch.manual_seed(1)
+        second = _values(made.agent(8))
+        require(
+            _equal(first, second) is not None,
+            f"generators of different seeds give the same parameters: {_DRAW}",
+        )
+        generator = torch.Generator().manual_seed(7)
+        torch.manual_seed(1)
+        one = _values(made.build(OBS, OUT, made.options, generator))
+        torch.manual_seed(1)
+        two = _values(made.build(OBS, OUT, made.options, generator))
+    require(
+        _equal(one, two) is not None,
+        "the second network from one generator (a critic, say) equals the first: draw from the generator, do not "
+        "only read its seed",
+    )
+
+
+def _global(made: Subjects) -> None:
+    before = torch.get_rng_state()
+    made.agent(0)(_x())
+    require(
+        torch.equal(before, torch.get_rng_state()),
+        f"building or running it draws from torch's global generator, which all seeds share: {_DRAW}",
+    )
+
+
+def _pure(made: Subjects) -> None:
+    agent, x = made.agent(0), _x()
+    kept = x.clone()
+    first = agent(x).detach().clone()
+    require(
+        torch.equal(x, kept),
+        "forward changes its input in place: avoid x += ..., x.mul_(...), relu(inplace=True)",
+    )
+    if not made.sampled:
+        require(
+            torch.equal(first, agent(x).detach()),
+            "two passes over the same input differ: dropout, batch normalization and other state have no place here, "
+            "for target networks and greedy validation rely on a function",
+        )
+
+
+def _gradients(module: nn.Module, x: Tensor) -> dict[str, Tensor | None]:
+    for parameter in module.parameters():
+        parameter.grad = None
+    values = module(x)
+    require(
+        bool(values.requires_grad),
+        "the outputs have no gradient: is there a .detach(), .item(), .numpy() or torch.no_grad() in forward?",
+    )
+    values.square().sum().backward()
+    return {name: p.grad for name, p in module.named_parameters() if p.requires_grad}
+
+
+def _flow(made: Subjects) -> None:
+    for name, gradient in _gradients(made.agent(0), _x()).items():
+        require(
+            gradient is not None,
+            f"parameter '{name}' gets no gradient: forward does not use it, or detaches what it gave",
+        )
+        assert gradient is not None
+        require(bool(torch.isfinite(gradient).all()), f"the gradient of '{name}' is not finite")
+        require(
+            bool((gradient != 0).any()),
+            f"the gradient of '{name}' is zero for {B} random inputs: do the outputs depend on it?",
+        )
+
+
+def _differences(made: Subjects) -> None:
+    agent = made.agent(0).double()
+    x = _x().double()
+    gradients = {name: g.clone() for name, g in _gradients(agent, x).items() if g is not None}
+    exact_type = next(iter(gradients.values())).dtype == torch.float64
+    step, tolerance = (1e-6, 1e-4) if exact_type else (1e-2, 5e-2)
+    source = torch.Generator().manual_seed(1)
+    for name, parameter in agent.named_parameters():
+        if name not in gradients:
+            continue
+        direction = torch.randn(parameter.shape, generator=source, dtype=torch.float64)
+        kept, sides = parameter.detach().clone(), []
+        for sign in (1.0, -1.0):
+            with torch.no_grad():
+                parameter.copy_(kept + sign * step * direction)
+                sides.append(float(agent(x).square().sum()))
+        with torch.no_grad():
+            parameter.copy_(kept)
+        numeric = (sides[0] - sides[1]) / (2 * step)
+        exact = float((gradients[name] * direction).sum())
+        require(
+            abs(numeric - exact) <= tolerance * max(1.0, abs(exact)),
+            f"the derivative by '{name}' is {exact:.6g}, finite differences give {numeric:.6g}: is a backward pass "
+            "written by hand wrong, or a part of forward detached?",
+        )
+
+
+def _copies(made: Subjects) -> None:
+    agent, x = made.agent(0), _x()
+    agent(x)
+    copied = copy.deepcopy(agent)
+    name = _equal(_values(agent), _values(copied))
+    require(name is None, f"copy.deepcopy, which makes target networks, changes '{name}'")
+    if not made.sampled:
+        require(torch.equal(agent(x), copied(x)), "a deep copy computes something else than its original")
+    before = _values(agent)
+    with torch.no_grad():
+        for parameter in copied.parameters():
+            parameter.add_(1.0)
+    name = _equal(before, _values(agent))
+    require(
+        name is None, f"a deep copy shares '{name}' with its original: target networks would follow at once"
+    )
+
+
+def _population(made: Subjects) -> None:
+    together, x = made.population(range(S)), _x(S)
+    values = together(x)
+    require(
+        tuple(values.shape) == (S, B, OUT),
+        f"the population maps ({S}, {B}, {OBS}) to {tuple(values.shape)}, and it must give ({S}, {B}, {OUT})",
+    )
+    agent = made.agent(2)
+    mine = {name: tuple(p.shape) for name, p in agent.named_parameters()}
+    theirs = {name: tuple(p.shape) for name, p in together.named_parameters()}
+    require(
+        theirs == {name: (S, *shape) for name, shape in mine.items()},
+        f"one agent's parameters are {mine}, the population's {theirs}: same names, with a leading axis of seeds",
+    )
+    require(
+        populations.quantum_parameters(together) == populations.quantum_parameters(agent),
+        "the population declares other quantum parameters than its agents: hand quantum_parameters() on",
+    )
+    if not made.sampled:
+        difference = float((values[2] - agent(x[2])).detach().abs().max())
+        require(
+            difference < 1e-4,
+            f"slice 2 of the population differs from agent 2 alone by {difference:.2g}: are slices mixed, or initial "
+            "parameters drawn again?",
+        )
+
+
+def _independence(made: Subjects) -> None:
+    x = _x(S)
+    whole = made.population(range(S))
+    gradients = _gradients(whole, x)
+    values = made.population(range(S))(x).detach()
+    for members in SIZES:
+        chosen = list(members)
+        part = made.population(chosen)
+        require(
+            torch.equal(made.population(chosen)(x[chosen]).detach(), values[chosen]),
+            f"seeds {chosen} among themselves compute other values than among all {S}; products of narrow matrices "
+            "round differently by size of the stack: use torch.nn.Linear (which is replaced by an exact form) or "
+            "qrlsuite.population.linear, and no reduction over seeds",
+        )
+        for name, gradient in _gradients(part, x[chosen]).items():
+            expected = gradients[name]
+            require(
+                gradient is not None and expected is not None and torch.equal(gradient, expected[chosen]),
+                f"seeds {chosen} among themselves get another gradient of '{name}' than among all {S}: slices must "
+                "not mix, and sums must not depend on the size of the stack",
+            )
+
+
+def _state(made: Subjects) -> None:
+    first, second = made.population(range(S)), made.population(range(10, 10 + S))
+    x = _x(S)
+    first(x)  # a pass may advance a counter
+    state = _values(first)
+    for name, value in state.items():
+        require(
+            value.dim() > 0 and value.shape[0] == S,
+            f"state '{name}' of shape {tuple(value.shape)} has no leading axis of {S} seeds: checkpoints are sliced",
+        )
+    second.load_state_dict(state)
+    lost = _equal(state, _values(second))
+    require(lost is None, f"state '{lost}' is not restored by load_state_dict")
+    require(
+        torch.equal(first(x).detach(), second(x).detach()),
+        "a population with restored state computes something else: something it depends on is not in state_dict(); "
+        "register it with register_buffer",
+    )
+    alone = made.population([99])
+    alone.load_state_dict({name: value[3:4] for name, value in state.items()})
+    first.load_state_dict(state)
+    require(
+        torch.equal(first(x)[3:4].detach(), alone(x[3:4]).detach()),
+        "slice 3 of the state, restored as a population of one, computes something else",
+    )
