@@ -62,30 +62,27 @@ def minutes(text: Any) -> int:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Options:
-    """Options of the engine `slurm`.
+    """Options of the engine `slurm`; where one is absent, the cluster's own default is taken."""
 
-    Attributes
-    ----------
-    partition, account, qos, constraint:
-        As for `sbatch`; None leaves the cluster's default.
-    time:
-        Time limit of a task in minutes. Tasks that need longer go back into the queue.
-    memory:
-        Memory of a task in GB; None leaves the cluster's default.
-    grace:
-        Seconds before the time limit at which a task saves and goes back into the queue.
-    setup:
-        Shell lines before the task, such as `module load`.
-    """
-
-    partition: str | None = None
-    time: Annotated[int, pydantic.BeforeValidator(minutes)] = 240
-    memory: Annotated[float, pydantic.Field(gt=0)] | None = None
-    account: str | None = None
-    qos: str | None = None
-    constraint: str | None = None
-    grace: Annotated[int, pydantic.Field(ge=10)] = 120
-    setup: tuple[str, ...] = ()
+    partition: Annotated[str | None, pydantic.Field(description="as for sbatch")] = None
+    time: Annotated[
+        int,
+        pydantic.BeforeValidator(minutes),
+        pydantic.Field(description="time limit of a task in minutes; longer ones go back into the queue"),
+    ] = 240
+    memory: Annotated[float | None, pydantic.Field(gt=0, description="memory of a task in GB")] = None
+    account: Annotated[str | None, pydantic.Field(description="as for sbatch")] = None
+    qos: Annotated[str | None, pydantic.Field(description="as for sbatch")] = None
+    constraint: Annotated[str | None, pydantic.Field(description="as for sbatch")] = None
+    grace: Annotated[
+        int,
+        pydantic.Field(
+            ge=10, description="seconds before the limit at which a task saves and goes back into the queue"
+        ),
+    ] = 120
+    setup: Annotated[
+        tuple[str, ...], pydantic.Field(description="shell lines before the task, such as module load")
+    ] = ()
 
 
 class Task:
