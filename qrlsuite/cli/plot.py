@@ -29,11 +29,11 @@ def plot(
     Example: qrlsuite plot curves --task beam6g --out curves.pdf
     """
     from qrlsuite.errors import OptionError, UnknownNameError, nearest
-    from qrlsuite.leaderboard import collect, plots
+    from qrlsuite.leaderboard import collect, pictures
     from qrlsuite.store import write_atomically
 
-    if kind not in plots.KINDS:
-        raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, plots.KINDS)}")
+    if kind not in pictures.KINDS:
+        raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, pictures.KINDS)}")
     found, refused = collect.collect(runs, task)
     for line in refused:
         typer.echo(f"left out: {line}", err=True)
@@ -51,16 +51,5 @@ def plot(
     format_ = path.suffix.removeprefix(".").lower()
     if format_ not in ("png", "pdf", "svg"):
         raise OptionError(f"--out {path}: the file's ending must be .png, .pdf or .svg")
-    write_atomically(path, _encode(plots.KINDS[kind](found), format_))
+    write_atomically(path, pictures.encode(pictures.draw(kind, found), format_))
     typer.echo(f"wrote {path}")
-
-
-def _encode(figure: object, format_: str) -> bytes:
-    import io
-
-    from matplotlib.figure import Figure
-
-    buffer = io.BytesIO()
-    if isinstance(figure, Figure):
-        figure.savefig(buffer, format=format_, dpi=160)
-    return buffer.getvalue()

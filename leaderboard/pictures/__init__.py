@@ -1,0 +1,87 @@
+"""Pictures for papers and talks, with matplotlib: color-blind safe, no LaTeX, png, pdf or svg.
+
+One file per picture, each with an `Options` dataclass (its settings) and
+`draw(entries, **settings) -> matplotlib.figure.Figure`. This module names them without importing matplotlib.
+Pictures of an environment (a map, sample trajectories) come with the environment, see
+`qrlsuite.specs.EnvironmentSpec`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from qrlsuite.errors import UnknownNameError, nearest
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from qrlsuite.leaderboard.collect import EntryCurves
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A kind of picture.
+
+    Attributes
+    ----------
+    summary:
+        One line for `qrlsuite plot --help`.
+    module:
+        The module with its `Options` and `draw`.
+    of:
+        What `draw` takes first: the entries of a task, or nothing.
+    """
+
+    summary: str
+    module: str
+    of: Literal["entries", "nothing"] = "entries"
+
+    @property
+    def options(self) -> str:
+        """Reference to the dataclass of its settings."""
+        return f"{self.module}:Options"
+
+
+_HERE = "qrlsuite.leaderboard.pictures"
+KINDS: dict[str, Picture] = {
+    "curves": Picture("learning curves: median, 5th to 95th percentile, single runs", f"{_HERE}.curves"),
+}
+"""Pictures by name."""
+
+
+def draw(kind: str, entries: Sequence[EntryCurves] = (), **settings: Any) -> Figure:
+    """Draw a picture by name.
+
+    Parameters
+    ----------
+    kind:
+        A key of `KINDS`.
+    entries:
+        What it shows; empty for a picture of nothing.
+    settings:
+        Its options by name.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no picture of that name.
+    OptionError
+        If a setting is unknown or has a bad value, or the picture cannot be made of these entries.
+    """
+    from qrlsuite.specs import resolve
+
+    if kind not in KINDS:
+        raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, KINDS)}")
+    figure: Figure = resolve(f"{KINDS[kind].module}:draw")(entries, **settings)
+    return figure
+
+
+def encode(figure: Figure, format_: str) -> bytes:
+    """Return a figure as the bytes of a png, pdf or svg file."""
+    import io
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=format_, dpi=160)
+    return buffer.getvalue()

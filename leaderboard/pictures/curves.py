@@ -1,0 +1,54 @@
+"""Learning curves: the median over runs, their 5th to 95th percentile, and single runs where they are few."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from qrlsuite import options
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.pictures import style
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the learning curves."""
+
+    runs: Annotated[
+        bool | None, Field(description="draw single runs; by default where there are at most 40 in all")
+    ] = None
+
+
+def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+    """Draw the validation score of each entry against environment steps."""
+    chosen: Options = options.build(Options, settings, "picture 'curves'")
+    figure = Figure(figsize=(7.2, 4.3), layout="constrained")
+    axes = figure.subplots()
+    few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
+    single = few if chosen.runs is None else chosen.runs
+    for i, entry in enumerate(entries):
+        look = style.style(i)
+        steps = np.arange(1, entry.curves.shape[1] + 1) * entry.steps_per_epoch
+        low, middle, high = np.percentile(entry.curves, (5, 50, 95), axis=0)
+        if single:
+            axes.plot(steps, entry.curves.T, color=look.color, linewidth=0.5, alpha=0.25)
+        axes.fill_between(steps, low, high, color=look.color, alpha=0.15 if single else 0.1, linewidth=0)
+        axes.plot(steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry))
+    relative = style.relative(entries)
+    axes.set_xlabel("environment steps")
+    axes.set_ylabel("validation score (received / optimal)" if relative else "validation score")
+    axes.xaxis.set_major_formatter(style.thousands)
+    axes.set_xlim(left=0)
+    if relative:
+        axes.set_ylim(0, 1)
+    style.tidy(axes)
+    axes.legend(loc="lower right", frameon=False, title=style.note(entries) or None, title_fontsize="small")
+    axes.set_title(
+        f"{entries[0].task}: median of the runs, 5th to 95th percentile", fontsize="medium", loc="left"
+    )
+    return figure
