@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ class EntryCurves:
         Seeds whose runs have fewer than T epochs yet.
     hours:
         Core-hours spent on the N runs.
+    identity:
+        What the entry's hash covers: task, algorithm, model and their resolved options.
     """
 
     name: str
@@ -43,6 +46,7 @@ class EntryCurves:
     left_out: tuple[int, ...]
     hours: float
     folder: Path
+    identity: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def steps_per_epoch(self) -> int:
@@ -133,6 +137,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
         hours=sum(store.seed(curve.seed).seconds() for curve in kept) / 3600,
         folder=store.path,
+        identity=identity,
     )
 
 
