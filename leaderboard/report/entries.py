@@ -1,0 +1,103 @@
+"""Entries as the page shows them: a name that is unique, and everything an entry was made with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
+from qrlsuite.leaderboard.report.words import counted, ranges
+
+SINGLE_RUNS = 100_000
+"""Values of single runs that a page carries at most, all entries together: two bytes each."""
+
+
+@dataclass(frozen=True)
+class EntryView:
+    """One entry of the page.
+
+    Attributes
+    ----------
+    facts:
+        What it was made with: (term, description).
+    options:
+        (heading, lines), a line being (option, value).
+    """
+
+    index: int
+    curves: EntryCurves
+    label: str
+    facts: tuple[tuple[str, str], ...]
+    options: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
+
+    @property
+    def quantum(self) -> bool:
+        """Whether the entry has quantum parameters."""
+        return self.curves.parameters[1] > 0
+
+
+def views(entries: Sequence[EntryCurves]) -> list[EntryView]:
+    """Return the entries of a page, labels made harmless and unique within a task."""
+    labels = [(entry.task, clean(entry.label)) for entry in entries]
+    return [
+        EntryView(
+            index=index,
+            curves=entry,
+            label=label if labels.count((task, label)) == 1 else clean(f"{label} ({entry.name})"),
+            facts=tuple((term, value) for term, value in _facts(entry) if value),
+            options=tuple(_options(entry)),
+        )
+        for index, (entry, (task, label)) in enumerate(zip(entries, labels))
+    ]
+
+
+def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
+    classical, quantum = entry.parameters
+    return [
+        ("Name", clean(entry.name)),
+        ("Algorithm", clean(entry.algorithm)),
+        ("Model", clean(entry.model)),
+        ("Parameters", f"{classical:,} classical, {quantum:,} quantum"),
+        ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
+        ("Unfinished seeds", ranges(entry.left_out)),
+        ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
+        ("Core-hours", f"{entry.hours:.2f}"),
+        ("Task definition", clean(entry.task_hash)),
+    ]
+
+
+def _options(entry: EntryCurves) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
+    return []
+
+
+def curves_data(entries: Sequence[EntryView]) -> list[dict[str, Any]]:
+    """Return the learning curves of all entries for the page's scripts.
+
+    The median and the percentiles are those of all runs; single runs are thinned where a page has many.
+    """
+    total = sum(view.curves.curves.size for view in entries)
+    share = min(1.0, SINGLE_RUNS / max(total, 1))
+    data = []
+    for view in entries:
+        curves = view.curves.curves
+        low, high = scale(curves)
+        kept = thinned(curves, max(1, int(share * curves.shape[0])))
+        bands = np.percentile(curves, (5, 50, 95), axis=0)
+        data.append(
+            {
+                "label": view.label,
+                "steps": view.curves.steps_per_epoch,
+                "epochs": curves.shape[1],
+                "runs": curves.shape[0],
+                "kept": kept.shape[0],
+                "low": low,
+                "high": high,
+                "band": [pack(band, low, high) for band in bands],
+                "single": pack(kept, low, high),
+            }
+        )
+    return data

@@ -1,0 +1,135 @@
+"""Every pair of a section, cell by cell: what `qrlsuite.statistics.compare` says, with shared resamples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from qrlsuite.leaderboard.board import grid_of, learning_curves
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    Evidence,
+    Grid,
+    IntervalRule,
+    LearningCurves,
+    Outcome,
+    SignificanceRule,
+    at_cap,
+)
+from qrlsuite.statistics.compare import overall
+
+SYMBOLS = {1: "+", -1: "-", 0: ".", 2: "^", 3: "?"}
+"""A cell's verdict from the first entry's side: fewer samples, more, no difference, both at cap, undecided."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two entries of a section, by their place on the board (first < second).
+
+    Attributes
+    ----------
+    cells:
+        One character of `SYMBOLS` per cell, row by row of the (E, D) grid, from the first entry's side.
+    n_runs:
+        Number of runs at which both were compared.
+    """
+
+    first: int
+    second: int
+    n_runs: int
+    cells: str
+
+    def counts(self, by: int) -> tuple[int, int]:
+        """Return in how many cells an entry of the pair needs significantly fewer, and more, samples."""
+        wins, losses = self.cells.count("+"), self.cells.count("-")
+        return (wins, losses) if by == self.first else (losses, wins)
+
+    def outcome(self, by: int) -> Outcome:
+        """Return the result from an entry's side."""
+        return Outcome.UNDECIDED if "?" in self.cells else overall(*self.counts(by))
+
+    def words(self, by: int) -> str:
+        """Return the result from an entry's side in words."""
+        (wins, losses), cells = self.counts(by), len(self.cells)
+        fewer, more = "significantly fewer samples", "significantly more samples"
+        match self.outcome(by):
+            case Outcome.UNDECIDED:
+                return f"undecided: fewer than {MIN_RUNS} runs"
+            case Outcome.OUTPERFORMS:
+                return f"outperforms: {fewer} in {wins} of {cells} cells, {more} in none"
+            case Outcome.OUTPERFORMED:
+                return f"is outperformed: {more} in {losses} of {cells} cells, {fewer} in none"
+            case Outcome.TRADE_OFF:
+                return f"trade-off: {fewer} in {wins} of {cells} cells, {more} in {losses}"
+            case _:
+                return f"no significant difference in any of {cells} cells"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """All pairs of a section.
+
+    Attributes
+    ----------
+    evidence:
+        By (entry's place, number of runs): what each verdict rests on. The entry's own number is always there.
+    """
+
+    grid: Grid
+    horizon: int
+    rule: str
+    entries: tuple[LearningCurves, ...]
+    pairs: tuple[Pair, ...]
+    evidence: dict[tuple[int, int], Evidence]
+
+    def own(self, place: int) -> Evidence:
+        """Return an entry's evidence at all its runs."""
+        return self.evidence[place, self.entries[place].n_runs]
+
+    def pair(self, one: int, other: int) -> Pair:
+        """Return the pair of two places on the board, in either order."""
+        wanted = (min(one, other), max(one, other))
+        return next(pair for pair in self.pairs if (pair.first, pair.second) == wanted)
+
+    def beats(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+        """Return, shape (M, M), whether the row's entry outperforms the column's."""
+        matrix = np.zeros((len(self.entries), len(self.entries)), dtype=bool)
+        for pair in self.pairs:
+            for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
+                matrix[one, other] = pair.outcome(one) is Outcome.OUTPERFORMS
+        return matrix
+
+
+def judge(entries: Sequence[EntryCurves], horizon: int, rule: SignificanceRule | None = None) -> Judgement:
+    """Judge all pairs of a section's entries, which all reach its horizon.
+
+    Parameters
+    ----------
+    rule:
+        None means the paper's, as for the board.
+    """
+    chosen = rule or IntervalRule()
+    grid = grid_of(entries[0].task_file.ranking)
+    curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)
+    evidence = {(i, curve.n_runs): Evidence(curve, grid, curve.n_runs) for i, curve in enumerate(curves)}
+    pairs = []
+    for i in range(len(curves)):
+        for j in range(i + 1, len(curves)):
+            n_runs = min(curves[i].n_runs, curves[j].n_runs)
+            for place in (i, j):
+                if (place, n_runs) not in evidence:
+                    evidence[place, n_runs] = Evidence(curves[place], grid, n_runs)
+            cells = _cells(chosen, evidence[i, n_runs], evidence[j, n_runs], horizon)
+            pairs.append(Pair(i, j, n_runs, cells))
+    return Judgement(grid, horizon, chosen.name, curves, tuple(pairs), evidence)
+
+
+def _cells(rule: SignificanceRule, first: Evidence, second: Evidence, horizon: int) -> str:
+    if first.n_runs < MIN_RUNS:
+        return SYMBOLS[3] * first.grid.size
+    signs = np.asarray(rule(first, second), dtype=np.int64)
+    capped = at_cap(first.interval(), horizon) & at_cap(second.interval(), horizon)
+    return "".join(SYMBOLS[int(code)] for code in np.where((signs == 0) & capped, 2, signs).ravel())

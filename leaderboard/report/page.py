@@ -1,0 +1,89 @@
+"""The page: templates, style and scripts put into one file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import hashlib
+from importlib import resources
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import qrlsuite
+from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.report import entries, sections, words
+from qrlsuite.leaderboard.report.encode import clean, script_json
+from qrlsuite.statistics import MIN_RUNS
+
+PAPER = "https://arxiv.org/abs/2501.15893"
+SCRIPTS = ("plotly-basic.min.js", "page.js", "pairs.js", "figures.js")
+LONGEST_REASON = 600
+
+
+def render(board: Leaderboard, title: str = "Sample complexity leaderboard") -> str:
+    """Return a leaderboard as one self-contained HTML page.
+
+    It loads nothing: style, scripts, plotly.js and the learning curves are inside, and its content security
+    policy forbids connections and any script but its own.
+
+    Parameters
+    ----------
+    board:
+        As `qrlsuite.leaderboard.board.build` returns it.
+    title:
+        The page's heading.
+    """
+    curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
+    shown = entries.views(list(curves.values()))
+    by_curves = {id(entry.curves): entry for entry in shown}
+    boards = [sections.view(section, number, by_curves) for number, section in enumerate(board.sections)]
+    scripts = [_file(name) for name in SCRIPTS]
+    data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        _environment()
+        .get_template("page.html.jinja")
+        .render(
+            title=clean(title),
+            version=qrlsuite.__version__,
+            date=f"{now.day} {now:%B %Y}",
+            headline=sections.headline(boards, shown),
+            sections=boards,
+            entries=shown,
+            tasks=len({section.task for section in board.sections}),
+            refused=[clean(line, LONGEST_REASON) for line in board.refused],
+            min_runs=MIN_RUNS,
+            paper=PAPER,
+            policy=_policy(scripts),
+            css=Markup(_file("style.css")),
+            data=Markup(script_json(data)),
+            scripts=[Markup(script) for script in scripts],
+            clean=clean,
+            counted=words.counted,
+        )
+    )
+
+
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("qrlsuite.leaderboard.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _file(name: str) -> str:
+    return resources.files("qrlsuite.leaderboard.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _policy(scripts: list[str]) -> str:
+    """Return a content security policy that allows these scripts and nothing from elsewhere."""
+    digests = (hashlib.sha256(script.encode()).digest() for script in scripts)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:; "
+        "base-uri 'none'; form-action 'none'"
+    )
