@@ -12,7 +12,7 @@ from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from qrlsuite.errors import OptionError
-from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, register, render
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, physics, register, render
 from tests.conftest import golden
 from tests.environments.test_physics import antennas
 
@@ -222,8 +222,50 @@ def test_rendering_without_a_mode_warns_and_without_reset_raises():
 def test_ground_truth_is_the_best_antenna_at_each_place():
     # Two antennas in a mirror at x = 3: the map is its own mirror image with the antennas exchanged.
     options = Options(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
-    antenna, intensity = render.ground_truth(options, 40)
+    antenna, beam, intensity = render.ground_truth(options, 40)
     assert (antenna == 1 - antenna[:, ::-1]).mean() > 0.95  # where both are equal, the first is taken
     np.testing.assert_allclose(intensity, intensity[:, ::-1], rtol=1e-6)
     assert antenna[20, 3] == 0
-    assert render.ground_truth_figure(options, 20).axes[0].get_title(loc="left").startswith("Best antenna")
+    # By brute force: no antenna and no beam gives more, anywhere.
+    model = physics.physics("released")
+    x, y = np.meshgrid((np.arange(40) + 0.5) * 6 / 40, (np.arange(40) + 0.5) * 6 / 40)
+    every = np.stack([physics.all_intensities(model, x, y, one) for one in options.antennas])
+    np.testing.assert_allclose(intensity, every.max((0, 1)), rtol=1e-9)
+    rows, columns = np.indices(antenna.shape)
+    np.testing.assert_allclose(every[antenna, beam, rows, columns], intensity, rtol=1e-9)
+
+
+def test_the_map_of_the_best_antenna_names_its_regions_and_draws_every_antenna():
+    # The field falls apart at x = 3: left the first antenna, right the second, each around its own place.
+    options = Options(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
+    figure = render.ground_truth_figure(options, 60)
+    field, scale = figure.axes
+    assert field.get_title(loc="left").startswith("Best antenna")
+    truth = render.ground_truth(options, 60)
+    words = [(text.get_text(), *text.get_position()) for text in field.texts]
+    assert ("0", 1.0, 3.0) in words  # the antennas themselves
+    assert ("1", 5.0, 3.0) in words
+    regions = [(text, x, y) for text, x, y in words if (x, y) not in {(1.0, 3.0), (5.0, 3.0)}]
+    assert {text for text, _, _ in regions} == {"0", "1"}
+    for text, x, y in regions:
+        assert truth.antenna[int(y * 10), int(x * 10)] == int(text)
+    assert [tick.get_text() for tick in scale.get_xticklabels()][-1] == "1"
+
+
+def test_the_colors_of_antennas_differ_for_the_color_blind():
+    """Simulated as Machado, Oliveira & Fernandes (2009) do, full strength; distances in OKLab, black to white 100."""
+    simulations = {
+        "normal": np.eye(3),
+        "protanopia": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+        "deuteranopia": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+        "tritanopia": [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]],
+    }
+    cones = [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
+    opponent = [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+    colors = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in render.COLORS[:6]])
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    for kind, matrix in simulations.items():
+        seen = np.clip(linear @ np.transpose(matrix), 0, 1)
+        places = 100 * np.cbrt(seen @ np.transpose(cones)) @ np.transpose(opponent)
+        distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+        assert distances[~np.eye(6, dtype=bool)].min() > 7, kind

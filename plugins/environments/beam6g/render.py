@@ -1,14 +1,15 @@
 """Pictures of BeamManagement6G: a moment as image, text or window, and the map of the best antenna.
 
 The background is the ground truth: each place has the color of its best antenna, the stronger the higher
-that antenna's intensity (on a logarithmic scale, because it falls with a power of the distance).
+that antenna's intensity (on a logarithmic scale, because it falls with a power of the distance). Two shaded
+colors can look alike to the color-blind, so the map of the best antenna names its larger regions, too.
 Matplotlib's global state is not touched.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
@@ -22,8 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7f4fa0", "#4d4d4d")
-"""Colors of the antennas, in their order; the first are safe for the color-blind (Okabe and Ito)."""
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e0cc00", "#000000", "#56b4e9", "#e69f00")
+"""Colors of the antennas, in their order: those of Okabe and Ito for the color-blind, with a darker yellow."""
+_DARK = ("#0072b2", "#d55e00", "#009e73", "#000000")
+"""Those that white writing can be read on."""
 _INK = "#202428"
 _FAINT, _STRONG = 10**-4.5, 10**-0.5
 """Intensities drawn in the palest and in the fullest color."""
@@ -56,23 +59,70 @@ class Moment:
     received: float
 
 
-def ground_truth(options: Options, resolution: int = 300) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the best antenna's index and its intensity on a grid over the field.
+class GroundTruth(NamedTuple):
+    """What is best at every place of a grid over the field.
 
-    Both (resolution, resolution), rows from y = 0 up, columns from x = 0 right, at the centers of the cells.
+    All (resolution, resolution), rows from y = 0 up, columns from x = 0 right, at the centers of the cells.
     """
+
+    antenna: NDArray[np.intp]
+    """Index of the best antenna, the first of equals."""
+    beam: NDArray[np.int8]
+    """Index of that antenna's best beam in the codebook, the first of equals."""
+    intensity: FloatArray
+    """The intensity of both, in [0, 1]: what an agent that knew the user's position would receive."""
+
+
+def ground_truth(options: Options, resolution: int = 300) -> GroundTruth:
+    """Return the best antenna, its best beam and their intensity on a grid of `resolution` x `resolution` places."""
     places = (np.arange(resolution) + 0.5) * (FIELD / resolution)
     x, y = np.meshgrid(places, places)
     model = physics.physics(options.physics)
-    intensities = np.stack([physics.best_intensity(model, x, y, antenna)[0] for antenna in options.antennas])
-    return intensities.argmax(axis=0), intensities.max(axis=0)
+    found = [physics.best_intensity(model, x, y, antenna) for antenna in options.antennas]
+    intensities, beams = (np.stack(part) for part in zip(*found))
+    antenna = intensities.argmax(axis=0)
+    at_best = antenna[None]
+    return GroundTruth(
+        antenna,
+        np.take_along_axis(beams, at_best, 0)[0],
+        np.take_along_axis(intensities, at_best, 0)[0],
+    )
 
 
-def ground_truth_figure(options: Options, resolution: int = 400) -> Figure:
-    """Draw the map of the best antenna, as in the paper's figure of the ground truth."""
-    figure, axes = _figure(5.6)
-    _draw_field(axes, options, resolution)
-    axes.set_title("Best antenna, and the intensity it gives", fontsize=11, color=_INK, loc="left")
+def ground_truth_figure(options: Options, resolution: int = 500) -> Figure:
+    """Draw the map of the best antenna, as the paper's figure of the ground truth does (appendix on the environment).
+
+    Each place has the color of its best antenna, deeper where the intensity of that antenna's best beam is higher:
+    the bands along which it is low lie between beams. A region of more than two percent of the field carries its
+    antenna's number. Antennas are disks with their number and a bar along the axis of their array.
+
+    Parameters
+    ----------
+    options:
+        Options of the environment: antennas and physics are what matters here.
+    resolution:
+        Places along each side at which the best antenna is sought.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Its axes are the field in units of the model, and the scale of the intensity.
+    """
+    figure, axes = _figure(5.6, below=0.55)
+    truth = ground_truth(options, resolution)
+    _draw_field(axes, options, truth)
+    cell = FIELD / resolution
+    for x, y, antenna in _regions(truth.antenna, cell, 0.02):
+        if min(np.hypot(x - place[0], y - place[1]) for place, _ in options.antennas) > 0.45:
+            axes.text(x, y, str(antenna), color=_INK, ha="center", va="center_baseline", fontsize=9, zorder=5)
+    axes.set_title("Best antenna, and the intensity of its best beam", fontsize=11, color=_INK, loc="left")
+    scale = figure.add_axes((0.06, 0.058, 0.4, 0.02))
+    levels = np.geomspace(1e-5, 1.0, 256)
+    scale.imshow(_shaded(np.zeros(3), levels)[None], extent=(-5.0, 0.0, 0.0, 1.0), aspect="auto")
+    scale.set_xticks(range(-5, 1), [f"$10^{{{power}}}$" for power in range(-5, 0)] + ["1"])
+    scale.set_yticks([])
+    _quiet(scale)
+    scale.text(0.35, 0.4, "intensity, in the color of the antenna", fontsize=8, color=_INK, va="center")
     return figure
 
 
@@ -88,7 +138,7 @@ class Picture:
     def __init__(self, options: Options) -> None:
         self.options = options
         self.figure, self.axes = _figure(6.0)
-        _draw_field(self.axes, options, 240)
+        _draw_field(self.axes, options, ground_truth(options, 240))
         self._title = self.axes.set_title("", fontsize=10, color=_INK, loc="left", family="monospace")
         (self._ahead,) = self.axes.plot([], [], color="white", lw=2.2, ls=(0, (1.2, 1.2)), zorder=4)
         (self._behind,) = self.axes.plot([], [], color=_INK, lw=2.2, zorder=4, solid_capstyle="round")
@@ -185,26 +235,53 @@ class Window:
         self._pygame.display.quit()
 
 
-def _figure(size: float) -> tuple[Figure, Axes]:
+def _figure(size: float, below: float = 0.0) -> tuple[Figure, Axes]:
+    """Return a figure `size` inches wide with axes for the field, and `below` inches of room under them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(size, size + 0.3), dpi=100, facecolor="white")
+    height = size + 0.3 + below
+    figure = Figure(figsize=(size, height), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.06, 0.06, 0.91, 0.91 * size / (size + 0.3)))
+    bottom = (0.06 * (size + 0.3) + below) / height
+    axes = figure.add_axes((0.06, bottom, 0.91, 0.91 * size / height))
     return figure, axes
 
 
-def _draw_field(axes: Axes, options: Options, resolution: int) -> None:
+def _regions(antenna: NDArray[np.intp], cell: float, least: float) -> list[tuple[float, float, int]]:
+    """Return place (x, y) and antenna of every connected region above a share `least` of the field.
+
+    The place is the one farthest from the region's border, so that a label has room there.
+    """
+    from scipy import ndimage
+
+    found = []
+    for i in np.unique(antenna).tolist():
+        labels, count = ndimage.label(antenna == i)
+        for region in range(1, count + 1):
+            inside = labels == region
+            if inside.mean() > least:
+                room = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
+                row, column = np.unravel_index(int(room.argmax()), room.shape)
+                found.append(((float(column) + 0.5) * cell, (float(row) + 0.5) * cell, i))
+    return found
+
+
+def _shaded(color: NDArray[np.float64], intensity: FloatArray) -> FloatArray:
+    """Return colors (..., 3) that are the deeper the higher `intensity` (...) is."""
+    strength = np.log(intensity / _FAINT) / np.log(_STRONG / _FAINT)
+    share = (0.08 + 0.80 * np.clip(strength, 0.0, 1.0))[..., None]
+    shaded: FloatArray = 1.0 - share * (1.0 - color)
+    return shaded
+
+
+def _draw_field(axes: Axes, options: Options, truth: GroundTruth) -> None:
     """Draw the ground truth and the antennas, each with the axis of its array as a bar."""
     from matplotlib.colors import to_rgb
 
-    antenna, intensity = ground_truth(options, resolution)
     palette = np.array([to_rgb(COLORS[i % len(COLORS)]) for i in range(len(options.antennas))])
-    strength = np.log(intensity / _FAINT) / np.log(_STRONG / _FAINT)
-    share = (0.08 + 0.80 * np.clip(strength, 0.0, 1.0))[:, :, None]
     axes.imshow(
-        1.0 - share * (1.0 - palette[antenna]),
+        _shaded(palette[truth.antenna], truth.intensity),
         origin="lower",
         extent=(0.0, FIELD, 0.0, FIELD),
         interpolation="bilinear",
@@ -212,14 +289,29 @@ def _draw_field(axes: Axes, options: Options, resolution: int) -> None:
     )
     for i, ((x, y), (d_x, d_y)) in enumerate(options.antennas):
         bar = np.array([-0.34, 0.34])
-        axes.plot(x + bar * d_x, y + bar * d_y, color="white", lw=6.5, zorder=6, solid_capstyle="round")
-        axes.plot(x + bar * d_x, y + bar * d_y, color=_INK, lw=3.5, zorder=6, solid_capstyle="round")
-        axes.plot(x, y, "o", ms=15, mfc=COLORS[i % len(COLORS)], mec="white", mew=1.8, zorder=7)
-        axes.text(x, y, str(i), color="white", ha="center", va="center_baseline", weight="bold", zorder=9)
+        color = COLORS[i % len(COLORS)]
+        for width, ink in ((6.5, "white"), (3.5, _INK)):
+            axes.plot(
+                x + bar * d_x,
+                y + bar * d_y,
+                color=ink,
+                lw=width,
+                zorder=6,
+                solid_capstyle="round",
+                clip_on=False,
+            )
+        axes.plot(x, y, "o", ms=15, mfc=color, mec="white", mew=1.8, zorder=7, clip_on=False)
+        ink = "white" if color in _DARK else _INK
+        axes.text(x, y, str(i), color=ink, ha="center", va="center_baseline", weight="bold", zorder=9)
     axes.set_xlim(0.0, FIELD)
     axes.set_ylim(0.0, FIELD)
     axes.set_xticks(range(int(FIELD) + 1))
     axes.set_yticks(range(int(FIELD) + 1))
+    _quiet(axes)
+
+
+def _quiet(axes: Axes) -> None:
+    """Draw ticks and frame in gray."""
     axes.tick_params(length=0, labelsize=8, colors="#606468")
     for spine in axes.spines.values():
         spine.set_edgecolor("#a0a4a8")
