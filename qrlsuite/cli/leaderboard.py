@@ -20,11 +20,18 @@ class Format(StrEnum):
     table = "table"
     markdown = "markdown"
     json = "json"
+    html = "html"
 
 
 def leaderboard(
     task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="For html; default: leaderboard.html in the results folder."
+        ),
+    ] = None,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Rank the entries of each task by significant outperformance.
@@ -37,10 +44,12 @@ def leaderboard(
     """
     import json
 
-    from qrlsuite.errors import UnknownNameError
+    from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import board as boards
     from qrlsuite.leaderboard import collect
 
+    if output is not None and format_ is not Format.html:
+        raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     found, refused = collect.collect(runs, task)
     board = boards.build(found, refused)
     if format_ is Format.json:
@@ -52,11 +61,22 @@ def leaderboard(
         raise UnknownNameError(
             f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run"
         )
-    if format_ is Format.markdown:
+    if format_ is Format.html:
+        _page(board, output or runs / "leaderboard.html")
+    elif format_ is Format.markdown:
         typer.echo(_markdown(board))
     else:
         for section in board.sections:
             _table(section)
+
+
+def _page(board: Leaderboard, path: Path) -> None:
+    """Write one self-contained page, which works offline."""
+    from qrlsuite.leaderboard import report
+    from qrlsuite.store import write_atomically
+
+    write_atomically(path, report.render(board).encode())
+    typer.echo(f"wrote {path}")
 
 
 COLUMNS = ("tier", "entry", "parameters", "seeds", "S_hat (5%-95%)", "score", "beats", "beaten by", "hours")
