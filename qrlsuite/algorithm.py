@@ -42,7 +42,10 @@ class Algorithm(Protocol):
         """Restore `state_dict`, also onto a group cut from or merged of others at the same epoch."""
 
     def policy_state(self) -> dict[str, Tensor]:
-        """Return the parameters that `act` uses, seed-first: what is published as the trained agents."""
+        """Return the parameters that `act` uses, seed-first: what is published as the trained agents.
+
+        The tensors themselves, not copies: `qrlsuite evaluate` loads trained parameters into them.
+        """
 
 
 AlgorithmFactory = Callable[..., Any]

@@ -79,12 +79,18 @@ class EnvironmentSpec(Spec):
     vector:
         Reference to `factory(options, num_envs) -> qrlsuite.environment.LaneEnv`; None uses a generic one
         over `gymnasium.make`.
+    policies:
+        Reference policies for `qrlsuite evaluate`, by name: each a reference to `factory(envs) -> policy`,
+        called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
+        observations (num_envs, ...) to actions (num_envs,). It may look into `envs`, and so know what no
+        agent is shown. Uniformly random actions need no policy.
     """
 
     options: str
     gymnasium_id: str
     entry_point: str | None = None
     vector: str | None = None
+    policies: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

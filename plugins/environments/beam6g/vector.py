@@ -94,7 +94,7 @@ class BeamLanes(LaneEnv):
             raise InvalidAction(
                 f"actions must lie in 0..{antennas - 1}, not {actions.min()}..{actions.max()}"
             )
-        tables = self._tabulate()
+        tables = self.tabulate()
         self._step += 1
         steps = self.options.steps
         index = (self._lane * antennas + actions) * (steps + 1) + self._step
@@ -171,9 +171,34 @@ class BeamLanes(LaneEnv):
         self._observations[lanes] = np.tile(first, (1, self.options.stack))
         self._pending[lanes] = True
 
-    def _tabulate(self) -> Tables:
-        """Return the tables of all lanes, those of newly begun episodes computed now."""
-        assert self._support is not None  # the callers made it
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Actions so far of every lane's episode (L,)."""
+        return self._step.copy()
+
+    @property
+    def support_points(self) -> NDArray[np.float64]:
+        """Support points of every lane's path (L, degree, 2).
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        """
+        if self._support is None:
+            raise ResetNeeded("call reset() before support_points")
+        return self._support.copy()
+
+    def tabulate(self) -> Tables:
+        """Return the tables of all lanes, those of newly begun episodes computed now.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If there was no reset.
+        """
+        if self._support is None:
+            raise ResetNeeded("call reset() before tabulate()")
         if self._tables is None:
             self._tables = Tables.empty(self.num_envs, len(self.options.antennas), self.options.steps)
         if self._pending.any():
