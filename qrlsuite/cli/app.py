@@ -15,7 +15,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
-    from qrlsuite.cli import compare, import_, leaderboard, listing, plot, run, runs, show, status
+    from qrlsuite.cli import compare, evaluate, import_, leaderboard, listing, plot, run, runs, show, status
 
     app = typer.Typer(
         name="qrlsuite",
@@ -36,6 +36,7 @@ def build() -> typer.Typer:
     app.command("leaderboard")(leaderboard.leaderboard)
     app.command("compare")(compare.compare)
     app.command("plot")(plot.plot)
+    app.command("evaluate")(evaluate.evaluate)
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
