@@ -31,12 +31,12 @@ class Picture:
     module:
         The module with its `Options` and `draw`.
     of:
-        What `draw` takes first: the entries of a task, or nothing.
+        What `draw` takes first: entries, nothing, or episode values by policy.
     """
 
     summary: str
     module: str
-    of: Literal["entries", "nothing"] = "entries"
+    of: Literal["entries", "episodes", "nothing"] = "entries"
 
     @property
     def options(self) -> str:
@@ -47,6 +47,20 @@ class Picture:
 _HERE = "qrlsuite.leaderboard.pictures"
 KINDS: dict[str, Picture] = {
     "curves": Picture("learning curves: median, 5th to 95th percentile, single runs", f"{_HERE}.curves"),
+    "surface": Picture(
+        "sample complexity over epsilon and delta, a map per entry, or 3d as the paper", f"{_HERE}.surface"
+    ),
+    "bars": Picture(
+        "sample complexity per cell, with percentile whiskers; faded where it is at the cap", f"{_HERE}.bars"
+    ),
+    "histogram": Picture(
+        "episode sums of trained policies against optimal and random (drawn by `qrlsuite evaluate`)",
+        f"{_HERE}.histogram",
+        of="episodes",
+    ),
+    "estimator": Picture(
+        "how likely P_hat falls below delta, with the central-limit curve", f"{_HERE}.estimator", of="nothing"
+    ),
 }
 """Pictures by name."""
 

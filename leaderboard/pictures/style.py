@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -9,7 +10,9 @@ from typing import TYPE_CHECKING
 from qrlsuite.leaderboard.collect import EntryCurves
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe & Ito's palette: distinguishable with color-deficient sight."""
@@ -85,3 +88,54 @@ def tidy(axes: Axes) -> None:
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def labels(entries: Sequence[EntryCurves]) -> list[str]:
+    """Return what legends call entries: without the algorithm where all share it, never twice the same."""
+    algorithms = {entry.algorithm for entry in entries}
+    short = [
+        entry.label.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else entry.label
+        for entry in entries
+    ]
+    return [
+        plain(text if short.count(text) == 1 else f"{text} {entry.name.rpartition('-')[2]}")
+        for text, entry in zip(short, entries)
+    ]
+
+
+def parameters_text(entry: EntryCurves) -> str:
+    """Write parameter counts: `387`, or `73 + 240` with the quantum ones second."""
+    classical, quantum = entry.parameters
+    return f"{classical} + {quantum}" if quantum else f"{classical}"
+
+
+def heading(entries: Sequence[EntryCurves]) -> str:
+    """Return what entries have in common: the task, and the algorithm where it is one."""
+    tasks, algorithms = ({getattr(entry, what) for entry in entries} for what in ("task", "algorithm"))
+    return plain(", ".join([*sorted(tasks)[:1], *(algorithms if len(algorithms) == 1 else [])]))
+
+
+def footnotes(figure: Figure, *lines: str) -> None:
+    """Write remarks below a picture, where there are any, in as many lines as its width needs."""
+    text = ";  ".join(line for line in lines if line)
+    if text:
+        wrapped = textwrap.fill(text, int(16.5 * figure.get_figwidth()))
+        figure.supxlabel(wrapped, x=0.01, ha="left", fontsize=8, color="#505050")
+
+
+def legend(figure: Figure, title: str, handles: Sequence[Artist]) -> None:
+    """Write a picture's title and, below it, its legend in as many columns as there is room for."""
+    longest = max((len(str(handle.get_label())) for handle in handles), default=1)
+    columns = max(1, int(figure.get_figwidth() / (0.5 + 0.083 * longest)))
+    found = figure.legend(
+        handles=list(handles),
+        loc="outside upper left",
+        title=title,
+        title_fontsize="medium",
+        alignment="left",
+        frameon=False,
+        ncols=min(columns, 2 if len(handles) == 4 else 3),
+        fontsize=8.5,
+        borderaxespad=0.2,
+    )
+    found.get_title().set_ha("left")

@@ -1,0 +1,128 @@
+"""What pictures of sample complexity share: which cells, up to which horizon, with what certainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.board import grid_of, learning_curves
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.pictures import style
+from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled_at
+from qrlsuite.statistics.grid import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """S_hat of one entry on E x D cells.
+
+    Attributes
+    ----------
+    points:
+        Shape (E, D), environment steps.
+    intervals:
+        Shape (E, D, 2), the 5th and 95th percentile.
+    at_cap, unsettled:
+        Shape (E, D), the two marks.
+    """
+
+    points: FloatArray
+    intervals: FloatArray
+    at_cap: BoolArray
+    unsettled: BoolArray
+
+
+def measure(entry: EntryCurves, grid: Grid, horizon: int) -> Cells:
+    """Return an entry's sample complexity, with its interval and marks, at all its seeds."""
+    curves = learning_curves(entry).cut(horizon)
+    evidence = Evidence(curves, grid, curves.n_runs)
+    intervals = evidence.interval()
+    marks = unsettled_at(curves.values, grid.thresholds, [float(delta) for delta in grid.deltas])
+    return Cells(evidence.point, intervals, at_cap(intervals, horizon), marks)
+
+
+def one_task(entries: Sequence[EntryCurves], kind: str) -> None:
+    """Raise OptionError unless there are entries, all of one task."""
+    if not entries:
+        raise OptionError(f"picture '{kind}' needs at least one entry")
+    for entry in entries[1:]:
+        if entry.task_hash != entries[0].task_hash:
+            first = entries[0]
+            raise OptionError(
+                f"picture '{kind}' shows one task: '{first.label}' was run on {first.task} ({first.task_hash}) "
+                f"and '{entry.label}' on {entry.task} ({entry.task_hash})"
+            )
+
+
+def choose_grid(
+    entry: EntryCurves,
+    epsilons: Sequence[float] | None,
+    deltas: Sequence[float] | None,
+    thresholds: Sequence[float] | None = None,
+) -> Grid:
+    """Return the cells that were asked for; where nothing was, those of the task's ranking grid.
+
+    Raises
+    ------
+    OptionError
+        If epsilons are asked for on a task without a known maximum, or thresholds and epsilons together.
+    """
+    ranking = entry.task_file.ranking
+    wanted = deltas if deltas is not None else ranking.deltas
+    if epsilons is not None and thresholds is not None:
+        raise OptionError("give epsilons or thresholds, not both")
+    if thresholds is not None:
+        return Grid.absolute(thresholds, wanted)
+    if epsilons is not None:
+        if ranking.epsilons is None:
+            raise OptionError(
+                f"task '{entry.task}' has no known maximum: give thresholds instead of epsilons"
+            )
+        return Grid.relative(epsilons, wanted)
+    own = grid_of(ranking)
+    if deltas is None:
+        return own
+    if ranking.epsilons is not None:
+        return Grid.relative(ranking.epsilons, deltas)
+    return Grid.absolute(own.thresholds, deltas)
+
+
+def choose_horizon(entries: Sequence[EntryCurves], wanted: int | None = None) -> int:
+    """Return the steps to which all entries are cut: the task's longest horizon that all of them reach.
+
+    Where one is shorter than all of the task's horizons, its length.
+    """
+    lengths = {entry.label: int(entry.curves.shape[1]) * entry.steps_per_epoch for entry in entries}
+    shortest = min(lengths.values())
+    if wanted is not None:
+        if wanted > shortest:
+            label = next(label for label, length in lengths.items() if length == shortest)
+            raise OptionError(f"horizon = {wanted}: '{label}' ends at {shortest} steps")
+        return wanted
+    reached = [steps for steps in entries[0].task_file.ranking.horizons if steps <= shortest]
+    return max(reached, default=shortest)
+
+
+def level_name(grid: Grid) -> str:
+    """Return what the rows of a grid are called."""
+    return "ε" if grid.epsilons is not None else "return"
+
+
+def levels(grid: Grid) -> list[str]:
+    """Return the rows of a grid as they are written: epsilons, or thresholds on the return."""
+    return [f"{value:g}" for value in (grid.epsilons or grid.thresholds)]
+
+
+def probabilities(grid: Grid) -> list[str]:
+    """Return the columns of a grid as they are written."""
+    return [f"{float(value):g}" for value in grid.deltas]
+
+
+def cut_note(entries: Sequence[EntryCurves], horizon: int) -> str:
+    """Say that the picture ends before the task's horizon, where it does."""
+    if horizon in entries[0].task_file.ranking.horizons:
+        return ""
+    short = min(entries, key=lambda entry: int(entry.curves.shape[1]) * entry.steps_per_epoch)
+    why = f", the length of {short.label}" if len(entries) > 1 else ""
+    return f"all cut to {style.thousands(horizon)} steps{why}"
