@@ -8,6 +8,10 @@ Gymnasium was imported before it, every environment of the suite and its plugins
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from qrlsuite.hookspecs import hookimpl as hookimpl
 
 __version__ = "0.1.0"
 

@@ -15,7 +15,19 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
-    from qrlsuite.cli import compare, evaluate, import_, leaderboard, listing, plot, run, runs, show, status
+    from qrlsuite.cli import (
+        compare,
+        evaluate,
+        import_,
+        leaderboard,
+        listing,
+        new,
+        plot,
+        run,
+        runs,
+        show,
+        status,
+    )
 
     app = typer.Typer(
         name="qrlsuite",
@@ -40,6 +52,7 @@ def build() -> typer.Typer:
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
+    app.add_typer(new.app, name="new")
 
     @app.callback()
     def common(

@@ -1,0 +1,61 @@
+"""`qrlsuite new plugin`: a package to begin with."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qrlsuite.cli.app import JsonOption
+from qrlsuite.scaffold import Kind
+
+app = typer.Typer(
+    help="Write a new plugin package.\n\nExample: qrlsuite new plugin acme-ring --kind ansatz",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@app.callback()
+def new() -> None:
+    """Write a new plugin package.
+
+    Example: qrlsuite new plugin acme-ring --kind ansatz
+    """
+
+
+@app.command("plugin")
+def plugin(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="The package's name, also that of what it registers: acme-ring."),
+    ],
+    kind: Annotated[Kind, typer.Option("--kind", help="What it adds.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write it into.")] = Path(),
+    json_output: JsonOption = False,
+) -> None:
+    """Write a package that works at once: pyproject.toml, code to edit, a test, a README.
+
+    Nothing is overwritten. What is in it can be installed (`pip install -e .`), passes `qrlsuite check`, and can be
+    run; edit it from there.
+
+    Example: qrlsuite new plugin acme-ring --kind ansatz
+    """
+    import json
+
+    from qrlsuite import scaffold
+
+    made = scaffold.package(name, kind)
+    folder = scaffold.write(made, out)
+    if json_output:
+        content = {"folder": str(folder), "files": sorted(made.files), "next": list(made.commands)}
+        typer.echo(json.dumps(content))
+        return
+    typer.echo(f"wrote {folder}:")
+    for path in made.files:
+        typer.echo(f"  {path}")
+    typer.echo("next:")
+    for line in (f"cd {shlex.quote(str(folder))}", "pip install -e '.[test]'", *made.commands):
+        typer.echo(f"  {line}")

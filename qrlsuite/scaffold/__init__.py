@@ -1,0 +1,232 @@
+"""New plugin packages, written from the templates beside this file.
+
+A template `templates/KIND/NAME.jinja` becomes the file NAME of the package; those of `templates/common` become
+files of every package.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+from qrlsuite.errors import QrlSuiteError
+
+TEMPLATES = Path(__file__).parent / "templates"
+NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+LONGEST = 40
+
+
+class ScaffoldError(QrlSuiteError):
+    """A plugin package cannot be written under that name or at that place."""
+
+
+class Kind(StrEnum):
+    """What a new plugin adds."""
+
+    ansatz = "ansatz"
+    model = "model"
+    environment = "environment"
+    algorithm = "algorithm"
+    task = "task"
+    tracker = "tracker"
+
+
+@dataclass(frozen=True)
+class _Words:
+    """What is said about a kind: a summary, what to type after installing, and the files besides registration."""
+
+    summary: str
+    commands: tuple[str, ...]
+    files: dict[str, str] = field(default_factory=dict)
+
+
+_WORDS = {
+    Kind.ansatz: _Words(
+        "data re-uploading on a ring of qubits",
+        (
+            "qrlsuite show ansatz {thing}",
+            "qrlsuite run --task beam6g --model vqc-native --set ansatz={thing} --quick",
+        ),
+        {"ansatz.py": "the circuit: edit this"},
+    ),
+    Kind.model: _Words(
+        "a network with one hidden layer",
+        ("qrlsuite show model {thing}", "qrlsuite run --task beam6g --model {thing} --quick"),
+        {"model.py": "the network: edit this"},
+    ),
+    Kind.environment: _Words(
+        "walk along a line to a place",
+        ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --seeds 20"),
+        {"environment.py": "the environment: edit this", "task.toml": "a task with it: protocol and ranking"},
+    ),
+    Kind.algorithm: _Words(
+        "policy gradient with a mean baseline",
+        (
+            "qrlsuite show algorithm {thing}",
+            "qrlsuite run --task cartpole --model mlp --algorithm {thing} --quick",
+        ),
+        {"algorithm.py": "the algorithm: edit this"},
+    ),
+    Kind.task: _Words(
+        "balance a pole for 200 steps",
+        ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --quick"),
+        {"task.toml": "environment, protocol and ranking: edit this"},
+    ),
+    Kind.tracker: _Words(
+        "every epoch as a line of a CSV file",
+        ("{upper}_FILE=epochs.csv qrlsuite run --task beam6g --model mlp --quick",),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Package:
+    """A plugin package that can be written.
+
+    Attributes
+    ----------
+    name:
+        Of the distribution: `acme-ring`.
+    module:
+        What is imported: `acme_ring`.
+    thing:
+        What is registered: the name without a leading `qrlsuite-`.
+    commands:
+        What to type once it is installed.
+    files:
+        Text by path within the package.
+    """
+
+    name: str
+    module: str
+    thing: str
+    commands: tuple[str, ...]
+    files: dict[str, str]
+
+
+def package(name: str, kind: Kind) -> Package:
+    """Render a plugin package.
+
+    Parameters
+    ----------
+    name:
+        Of the distribution, `acme-ring`: lower-case words and digits with single hyphens between them.
+    kind:
+        What it adds.
+
+    Raises
+    ------
+    ScaffoldError
+        If a package cannot have the name, or something is installed or registered under it.
+    """
+    import jinja2
+
+    module, thing = _names(name, kind)
+    words = _WORDS[kind]
+    commands = tuple(
+        line.format(thing=thing, upper=module.upper())
+        for line in ("pytest", f"qrlsuite check {name}", *words.commands)
+    )
+    source = f"src/{module}"
+    registered = "the tracker: edit this" if kind is Kind.tracker else f"registers the {kind} with qrlsuite"
+    contents = {
+        f"{source}/__init__.py": registered,
+        **{f"{source}/{file}": meaning for file, meaning in words.files.items()},
+        f"tests/test_{module}.py": "runs qrlsuite's checks",
+    }
+    values = {
+        "name": name,
+        "module": module,
+        "thing": thing,
+        "upper": module.upper(),
+        "kind": str(kind),
+        "article": "an" if kind[0] in "ae" else "a",
+        "summary": words.summary,
+        "commands": commands,
+        "contents": list(contents.items()),
+        "files": any(file.endswith(".toml") for file in words.files),
+        "versions": compatible_versions(),
+    }
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        autoescape=False,  # Python and TOML, of names that `_names` has checked
+    )
+
+    def render(template: str) -> str:
+        return environment.get_template(template).render(values)
+
+    files = {name: render(f"common/{name}.jinja") for name in ("pyproject.toml", "README.md")}
+    for path in contents:
+        template = "test.py" if path.startswith("tests/") else Path(path).name
+        files[path] = render(f"{kind}/{template}.jinja")
+    files[f"{source}/py.typed"] = ""
+    return Package(name, module, thing, commands, files)
+
+
+def _names(name: str, kind: Kind) -> tuple[str, str]:
+    """Check a distribution's name; returns the module's name and the registered name."""
+    from qrlsuite import registry
+
+    if not NAME.fullmatch(name) or len(name) > LONGEST:
+        usable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")[:LONGEST].rstrip("-")
+        raise ScaffoldError(
+            f"'{name}' cannot be the name of a package: lower-case letters, digits and single hyphens, beginning with "
+            f"a letter, {LONGEST} characters at most" + (f"; for example {usable}" if usable else "")
+        )
+    module, thing = name.replace("-", "_"), name.removeprefix("qrlsuite-")
+    if keyword.iskeyword(module) or module in sys.stdlib_module_names:
+        raise ScaffoldError(f"'{module}' is a word of Python; for example acme-{name}")
+    if importlib.util.find_spec(module) is not None:
+        raise ScaffoldError(
+            f"a module '{module}' is installed already: choose another name, for example acme-{name}"
+        )
+    kinds = {many for many, single in registry.SINGULAR.items() if single == kind}
+    for many in kinds | ({"tasks"} if kind is Kind.environment else set()):
+        if thing in registry.load().entries[many]:
+            raise ScaffoldError(
+                f"there is {'an' if many[0] in 'ae' else 'a'} {registry.SINGULAR[many]} '{thing}' already "
+                f"(`qrlsuite list {many}`): choose another name, for example acme-{thing}"
+            )
+    return module, thing
+
+
+def compatible_versions() -> str:
+    """Return the version range that a plugin written for this version asks for: `>=0.1,<0.2`, or `>=1.2,<2`."""
+    from qrlsuite import __version__
+
+    major, minor = (int(number) for number in __version__.split(".")[:2])
+    return f">={major}.{minor},<{major + 1}" if major else f">=0.{minor},<0.{minor + 1}"
+
+
+def write(made: Package, out: Path) -> Path:
+    """Write a package below a folder; returns the package's folder.
+
+    Raises
+    ------
+    ScaffoldError
+        If the package's folder is there already, or cannot be written. Nothing is changed then.
+    """
+    folder = out / made.name
+    if folder.exists() or folder.is_symlink():
+        raise ScaffoldError(f"{folder} is there already and is left as it is: choose another name or --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{made.name}-", dir=out) as temporary:
+            draft = Path(temporary) / made.name
+            for path, text in made.files.items():
+                file = draft / path
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(text, encoding="utf-8")
+            shutil.move(draft, folder)
+    except OSError as error:
+        raise ScaffoldError(f"{folder} cannot be written: {error.strerror or error}") from None
+    return folder

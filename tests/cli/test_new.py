@@ -1,0 +1,202 @@
+"""`qrlsuite new plugin`: every kind of package installs, passes its own test, and is clean for linters."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import __version__, scaffold
+from qrlsuite.cli import main
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.scaffold import Kind
+
+ROOT = Path(__file__).parents[2]
+MYPY = """
+[mypy]
+strict = true
+allow_subclassing_any = true
+# torch and pydantic take a checker a minute, and add nothing to what is looked at here
+[mypy-torch.*,pydantic.*]
+follow_imports = skip
+[mypy-qrlsuite.*,gymnasium.*]
+follow_imports = silent
+"""
+
+
+def qrlsuite(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """Run a command in this process; returns exit code, output, errors."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["qrlsuite", *words])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+    out, err = capsys.readouterr()
+    return int(stopped.value.code or 0), out, err
+
+
+def run(*words: str, **more: object) -> str:
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=600, **more)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stdout + done.stderr
+    return str(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a new package of every kind, all of them installed into its subfolder `site`."""
+    folder = tmp_path_factory.mktemp("packages")
+    for kind in Kind:
+        scaffold.write(scaffold.package(f"acme-{kind}", kind), folder)
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+    ]
+    run(*install, "--target", str(folder / "site"), *(f"./acme-{kind}" for kind in Kind), cwd=folder)
+    return folder
+
+
+def test_new_packages_pass_their_own_tests(packages: Path) -> None:
+    path = os.pathsep.join([str(packages / "site"), os.environ.get("PYTHONPATH", "")])
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-W",
+        "error",
+        "--import-mode=importlib",
+        "-p",
+        "no:cacheprovider",
+    ]
+    out = run(*words, "acme-ansatz", "acme-model", "acme-environment", "acme-algorithm", "acme-task",
+              "acme-tracker", cwd=packages, env={**os.environ, "PYTHONPATH": path})  # fmt: skip
+    assert "8 passed" in out
+
+
+def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> None:
+    path = os.pathsep.join([str(packages / "site"), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path}
+    rows = json.loads(run(sys.executable, "-m", "qrlsuite", "list", "--json", env=env, cwd=packages))
+    found = {(row["kind"], row["name"]) for row in rows if row["distribution"].startswith("acme-")}
+    assert found == {
+        ("ansatzes", "acme-ansatz"),
+        ("models", "acme-model"),
+        ("environments", "acme-environment"),
+        ("tasks", "acme-environment"),
+        ("algorithms", "acme-algorithm"),
+        ("tasks", "acme-task"),
+    }
+
+
+def test_new_packages_are_clean(packages: Path) -> None:
+    for kind in Kind:
+        folder = packages / f"acme-{kind}"
+        src = f'src = ["{folder / "src"}"]'
+        run("ruff", "check", "--isolated", "--config", src, "--select", "E,F,W,I,UP,B,RUF", str(folder))
+        run("ruff", "format", "--isolated", "--check", str(folder))
+    (packages / "mypy.ini").write_text(MYPY)
+    sources = [str(packages / f"acme-{kind}" / "src") for kind in Kind]
+    env = {**os.environ, "MYPYPATH": str(ROOT)}
+    run(sys.executable, "-m", "mypy", "--config-file", "mypy.ini", *sources, cwd=packages, env=env)
+
+
+def test_the_command_writes_a_package_and_says_what_to_type_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = qrlsuite(
+        capsys, "new", "plugin", "acme-ring", "--kind", "ansatz", "--out", str(tmp_path / "a b")
+    )
+    assert code == 0
+    folder = tmp_path / "a b" / "acme-ring"
+    written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert written == {
+        "README.md",
+        "pyproject.toml",
+        "src/acme_ring/__init__.py",
+        "src/acme_ring/ansatz.py",
+        "src/acme_ring/py.typed",
+        "tests/test_acme_ring.py",
+    }
+    assert all(path in out for path in written)
+    assert out.index("pip install -e") < out.index("\n  pytest\n") < out.index("qrlsuite check acme-ring")
+    assert f"cd '{folder}'" in out
+    readme = (folder / "README.md").read_text()
+    assert "qrlsuite run --task beam6g --model vqc-native --set ansatz=acme-ring --quick" in readme
+    assert [path.name for path in folder.parent.iterdir()] == ["acme-ring"]  # no draft is left
+
+
+def test_json_names_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["new", "plugin", "qrlsuite-csv", "--kind", "tracker", "--out", str(tmp_path), "--json"]
+    code, out, _ = qrlsuite(capsys, *words)
+    assert code == 0
+    content = json.loads(out)
+    assert content["folder"] == str(tmp_path / "qrlsuite-csv")
+    assert "src/qrlsuite_csv/__init__.py" in content["files"]
+    assert "QRLSUITE_CSV_FILE=epochs.csv" in content["next"][-1]
+
+
+def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "acme-ring").mkdir()
+    (tmp_path / "acme-ring" / "notes.txt").write_text("mine")
+    code, _, err = qrlsuite(capsys, "new", "plugin", "acme-ring", "--kind", "model", "--out", str(tmp_path))
+    assert code == 2
+    assert "is there already and is left as it is" in err
+    assert [path.name for path in (tmp_path / "acme-ring").iterdir()] == ["notes.txt"]
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(QrlSuiteError, match="acme-ring cannot be written: "):
+        scaffold.write(scaffold.package("acme-ring", Kind.task), tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [
+        ("Acme_Ring", Kind.ansatz, "cannot be the name of a package: .*for example acme-ring"),
+        ("../escape", Kind.ansatz, "cannot be the name of a package: .*for example escape"),
+        ("a" * 41, Kind.ansatz, "40 characters at most"),
+        ("", Kind.ansatz, "'' cannot be the name of a package"),
+        ("x\n", Kind.ansatz, "cannot be the name of a package"),
+        ("class", Kind.ansatz, "'class' is a word of Python; for example acme-class"),
+        ("json", Kind.ansatz, "'json' is a word of Python"),
+        ("torch", Kind.model, "a module 'torch' is installed already"),
+        ("qrlsuite", Kind.model, "a module 'qrlsuite' is installed already"),
+        ("mlp", Kind.model, "there is a model 'mlp' already .`qrlsuite list models`.*acme-mlp"),
+        ("qrlsuite-iqp", Kind.ansatz, "there is an ansatz 'iqp' already"),
+        ("acrobot", Kind.environment, "there is a task 'acrobot' already"),
+    ],
+)
+def test_unusable_names_are_refused_with_one_that_would_do(name: str, kind: Kind, message: str) -> None:
+    with pytest.raises(QrlSuiteError, match=message):
+        scaffold.package(name, kind)
+
+
+@pytest.mark.parametrize(
+    ("version", "expected"),
+    [("0.1.0", ">=0.1,<0.2"), ("0.9.3", ">=0.9,<0.10"), ("1.2.0", ">=1.2,<2"), ("12.0.1", ">=12.0,<13")],
+)
+def test_the_version_range_is_what_stays_compatible(
+    version: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("qrlsuite.__version__", version)
+    assert scaffold.compatible_versions() == expected
+    assert (
+        f'dependencies = ["qrlsuite{expected}"]'
+        in scaffold.package("acme-x", Kind.model).files["pyproject.toml"]
+    )
+
+
+def test_the_suites_own_version_is_in_the_range() -> None:
+    from packaging.specifiers import SpecifierSet
+
+    assert __version__ in SpecifierSet(scaffold.compatible_versions())
