@@ -53,6 +53,14 @@ KINDS: dict[str, Picture] = {
     "bars": Picture(
         "sample complexity per cell, with percentile whiskers; faded where it is at the cap", f"{_HERE}.bars"
     ),
+    "scaling": Picture(
+        "sample complexity against size (width, qubits, ..., or the task's degree), with parameter counts",
+        f"{_HERE}.scaling",
+    ),
+    "tiers": Picture("who outperforms whom, tier by tier", f"{_HERE}.tiers"),
+    "few-runs": Picture(
+        "how 5 seeds mislead against many: one entry against itself, or two entries", f"{_HERE}.few_runs"
+    ),
     "histogram": Picture(
         "episode sums of trained policies against optimal and random (drawn by `qrlsuite evaluate`)",
         f"{_HERE}.histogram",
