@@ -64,6 +64,23 @@ class Spec:
 
 
 @dataclass(frozen=True, slots=True)
+class PictureSpec(Spec):
+    """A picture of an environment, drawn by `qrlsuite plot NAME --task TASK`.
+
+    Attributes
+    ----------
+    draw:
+        Reference to `draw(worlds, options) -> matplotlib.figure.Figure`: `worlds` maps the name of each task
+        that was asked for to the options of its environment.
+    options:
+        Reference to a pydantic dataclass: the picture's own settings, all with defaults.
+    """
+
+    draw: str
+    options: str
+
+
+@dataclass(frozen=True, slots=True)
 class EnvironmentSpec(Spec):
     """An environment.
 
@@ -84,6 +101,8 @@ class EnvironmentSpec(Spec):
         called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
         observations (num_envs, ...) to actions (num_envs,). It may look into `envs`, and so know what no
         agent is shown. Uniformly random actions need no policy.
+    pictures:
+        What `qrlsuite plot` can draw of it.
     """
 
     options: str
@@ -91,6 +110,7 @@ class EnvironmentSpec(Spec):
     entry_point: str | None = None
     vector: str | None = None
     policies: dict[str, str] = field(default_factory=dict)
+    pictures: tuple[PictureSpec, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

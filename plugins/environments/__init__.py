@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.specs import EnvironmentSpec
+from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
 _HERE = "qrlsuite.plugins.environments"
 _BEAM6G = f"{_HERE}.beam6g"
@@ -26,6 +26,20 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
                 "optimal": f"{_BEAM6G}.policies:Optimal",
                 "nearest antenna": f"{_BEAM6G}.policies:NearestAntenna",
             },
+            pictures=(
+                PictureSpec(
+                    name="trajectories",
+                    summary="random paths of the user, for one degree or several side by side",
+                    draw=f"{_BEAM6G}.pictures:trajectories",
+                    options=f"{_BEAM6G}.pictures:TrajectoryOptions",
+                ),
+                PictureSpec(
+                    name="field",
+                    summary="the map of the best antenna and its intensity, or the beams' interference",
+                    draw=f"{_BEAM6G}.pictures:field",
+                    options=f"{_BEAM6G}.pictures:FieldOptions",
+                ),
+            ),
         )
     )
     register(

@@ -110,7 +110,7 @@ def ground_truth_figure(options: Options, resolution: int = 500) -> Figure:
     """
     figure, axes = _figure(5.6, below=0.55)
     truth = ground_truth(options, resolution)
-    _draw_field(axes, options, truth)
+    draw_field(axes, options, truth)
     cell = FIELD / resolution
     for x, y, antenna in _regions(truth.antenna, cell, 0.02):
         if min(np.hypot(x - place[0], y - place[1]) for place, _ in options.antennas) > 0.45:
@@ -138,7 +138,7 @@ class Picture:
     def __init__(self, options: Options) -> None:
         self.options = options
         self.figure, self.axes = _figure(6.0)
-        _draw_field(self.axes, options, ground_truth(options, 240))
+        draw_field(self.axes, options, ground_truth(options, 240))
         self._title = self.axes.set_title("", fontsize=10, color=_INK, loc="left", family="monospace")
         (self._ahead,) = self.axes.plot([], [], color="white", lw=2.2, ls=(0, (1.2, 1.2)), zorder=4)
         (self._behind,) = self.axes.plot([], [], color=_INK, lw=2.2, zorder=4, solid_capstyle="round")
@@ -275,7 +275,7 @@ def _shaded(color: NDArray[np.float64], intensity: FloatArray) -> FloatArray:
     return shaded
 
 
-def _draw_field(axes: Axes, options: Options, truth: GroundTruth) -> None:
+def draw_field(axes: Axes, options: Options, truth: GroundTruth) -> None:
     """Draw the ground truth and the antennas, each with the axis of its array as a bar."""
     from matplotlib.colors import to_rgb
 
