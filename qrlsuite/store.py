@@ -378,8 +378,8 @@ class EntryStore:
         self.claims = path / "claims"
 
     @classmethod
-    def create(cls, runs: Path, entry: Entry) -> EntryStore:
-        """Return the entry's folder below a results folder, made if it is not there.
+    def find(cls, runs: Path, entry: Entry) -> EntryStore:
+        """Return the entry's folder below a results folder, whether it is there or not.
 
         Raises
         ------
@@ -387,12 +387,21 @@ class EntryStore:
             If a folder of another format version or another entry is in its place.
         """
         store = cls(runs / entry.task.name / entry.name)
-        if (store.path / "entry.json").exists():
-            if store.record().get("hash") != entry.hash:
-                raise StoreError(
-                    f"{store.path} belongs to another entry; choose another folder with --runs DIR"
-                )
-        else:
+        if (store.path / "entry.json").exists() and store.record().get("hash") != entry.hash:
+            raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
+        return store
+
+    @classmethod
+    def create(cls, runs: Path, entry: Entry) -> EntryStore:
+        """Return the entry's folder below a results folder, made if it is not there.
+
+        Raises
+        ------
+        StoreError
+            If a folder of another format version or another entry is in its place, or it cannot be made.
+        """
+        store = cls.find(runs, entry)
+        if not (store.path / "entry.json").exists():
             write_json(store.path / "entry.json", entry.record())
         return store
 

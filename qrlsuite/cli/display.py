@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class RunDisplay:
         """Say what will be done."""
         task = self.entry.task
         self.console.print(
-            f"[bold]{self.entry.label}[/bold] on [bold]{task.name}[/bold]  ({self.store.path})"
+            f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  ({escape(str(self.store.path))})"
         )
         if busy:
             self.console.print(

@@ -8,6 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.training import (
+    DeviceOption,
+    EngineOption,
+    EngineOptionsOption,
+    PartitionOption,
+    TimeOption,
+    WorkersOption,
+)
 
 if TYPE_CHECKING:
     from qrlsuite.entry import Entry
@@ -52,29 +60,12 @@ def run(
             help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
         ),
     ] = False,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers", min=1, help="Processes, or array tasks; default: one per core, or 10 tasks."
-        ),
-    ] = None,
-    engine: Annotated[
-        str, typer.Option("--engine", help="Where the work is done (see `qrlsuite list engines`).")
-    ] = "local",
-    partition: Annotated[
-        str | None, typer.Option("--partition", help="For --engine slurm: the partition.")
-    ] = None,
-    time: Annotated[
-        str | None,
-        typer.Option(
-            "--time", help="For --engine slurm: the time limit, 90 (minutes), 2:00:00 or 1-12:00:00."
-        ),
-    ] = None,
-    engine_options: Annotated[
-        list[str] | None,
-        typer.Option("--engine-set", metavar="NAME=VALUE", help="A further option of the engine."),
-    ] = None,
-    device: Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda.")] = "cpu",
+    workers: WorkersOption = None,
+    engine: EngineOption = "local",
+    partition: PartitionOption = None,
+    time: TimeOption = None,
+    engine_options: EngineOptionsOption = None,
+    device: DeviceOption = "cpu",
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -89,10 +80,9 @@ def run(
 
     from qrlsuite import entry as entries
     from qrlsuite import options
-    from qrlsuite.claims import living
     from qrlsuite.cli.display import RunDisplay
-    from qrlsuite.engine import api, groups
-    from qrlsuite.store import EntryStore
+    from qrlsuite.cli.training import place, plan, train
+    from qrlsuite.engine import groups
 
     words = [options.parse_setting(word) for word in settings or []]
     if quick:
@@ -101,31 +91,15 @@ def run(
     protocol = entry.task.file.protocol
     wanted = groups.parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
     last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))
-    given = {setting.name: setting.value for setting in map(options.parse_setting, engine_options or [])}
-    place = api.create(engine, {"partition": partition, "time": time, **given})
-    count = place.workers(workers)
+    where = place(engine, workers, partition, time, engine_options, device)
 
-    store = EntryStore.create(runs, entry)
-    busy = {seed for claim in living(store) for seed in claim.seeds} | place.queued(store)
-    busy &= set(wanted)
-    missing = groups.plan(store, sorted(set(wanted) - busy), last, count)
-    display = RunDisplay(entry, store, wanted, last, missing, count, quiet=json_output)
-    display.begin(busy)
-    if missing:
-        try:
-            outcome = place.run(api.Work(store, missing, last, count, device), display.update)
-        except KeyboardInterrupt:
-            display.interrupted()
-            raise typer.Exit(130) from None
-        finally:
-            display.close()
-        api.raise_failures(outcome)
-        for message in outcome.taken.values():
-            display.console.print(f"left out: {message}")
-        if outcome.submitted is not None:
-            typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
-            return
-    summary = summarize(entry, store, wanted, last)
+    work = plan(runs, entry, wanted, last, where)
+    display = RunDisplay(entry, work.store, wanted, last, work.groups, where.workers, quiet=json_output)
+    outcome = train(work, where, display)
+    if outcome.submitted is not None:
+        typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
+        return
+    summary = summarize(entry, work.store, wanted, last)
     if json_output:
         typer.echo(json.dumps(summary))
     else:

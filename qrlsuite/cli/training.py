@@ -1,0 +1,149 @@
+"""What every command that trains shares: the options of engines, a plan, the engine at work, the progress display."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from qrlsuite.cli.display import RunDisplay
+    from qrlsuite.engine.api import Engine, Outcome
+    from qrlsuite.engine.groups import Group
+    from qrlsuite.entry import Entry
+    from qrlsuite.store import EntryStore
+
+WorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, help="Processes, or array tasks; default: one per core, or 10 tasks."),
+]
+EngineOption = Annotated[
+    str, typer.Option("--engine", help="Where the work is done (see `qrlsuite list engines`).")
+]
+PartitionOption = Annotated[
+    str | None, typer.Option("--partition", help="For --engine slurm: the partition.")
+]
+TimeOption = Annotated[
+    str | None,
+    typer.Option("--time", help="For --engine slurm: the time limit, 90 (minutes), 2:00:00 or 1-12:00:00."),
+]
+EngineOptionsOption = Annotated[
+    list[str] | None,
+    typer.Option("--engine-set", metavar="NAME=VALUE", help="A further option of the engine."),
+]
+DeviceOption = Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda.")]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where training is done: an engine, as many groups at a time as `workers`, and their device."""
+
+    engine: Engine
+    workers: int
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be trained of an entry.
+
+    Attributes
+    ----------
+    seeds:
+        All seeds that were asked for.
+    epochs:
+        The epoch to which each is to be trained.
+    busy:
+        Those that another process trains, or that wait in a queue.
+    groups:
+        The rest of those that are missing.
+    """
+
+    entry: Entry
+    store: EntryStore
+    seeds: Sequence[int]
+    epochs: int
+    busy: frozenset[int] = frozenset()
+    groups: Sequence[Group] = field(default_factory=list)
+
+    @property
+    def missing(self) -> list[int]:
+        """The seeds of the groups, sorted."""
+        return sorted(seed for group in self.groups for seed in group.seeds)
+
+
+def place(
+    engine: str,
+    workers: int | None = None,
+    partition: str | None = None,
+    time: str | None = None,
+    settings: Sequence[str] | None = None,
+    device: str = "cpu",
+) -> Place:
+    """Build an engine from a command's options.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, QrlSuiteError
+        If there is no such engine, it has no such option or value, or a package is not installed.
+    """
+    from qrlsuite import options
+    from qrlsuite.engine import api
+
+    given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
+    built = api.create(engine, {"partition": partition, "time": time, **given})
+    return Place(built, built.workers(workers), device)
+
+
+def plan(runs: Path, entry: Entry, seeds: Sequence[int], epochs: int, where: Place) -> Plan:
+    """Find out what of an entry is missing in a results folder; writes nothing.
+
+    Raises
+    ------
+    StoreError
+        If the entry's folder is damaged, or belongs to another entry.
+    """
+    from qrlsuite.claims import living
+    from qrlsuite.engine import groups
+    from qrlsuite.store import EntryStore
+
+    store = EntryStore.find(runs, entry)
+    busy = {seed for claim in living(store) for seed in claim.seeds} | where.engine.queued(store)
+    busy &= set(seeds)
+    missing = groups.plan(store, sorted(set(seeds) - busy), epochs, where.workers)
+    return Plan(entry, store, seeds, epochs, frozenset(busy), missing)
+
+
+def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
+    """Train what is planned, showing progress; returns how it ended.
+
+    Raises
+    ------
+    typer.Exit
+        With code 130 after Ctrl-C, when every worker has saved and ended.
+    QrlSuiteError
+        If a group failed; finished epochs are kept.
+    """
+    from qrlsuite.engine import api
+    from qrlsuite.store import EntryStore
+
+    EntryStore.create(work.store.path.parent.parent, work.entry)
+    display.begin(work.busy)
+    if not work.groups:
+        return api.Outcome()
+    try:
+        outcome = where.engine.run(
+            api.Work(work.store, work.groups, work.epochs, where.workers, where.device), display.update
+        )
+    except KeyboardInterrupt:
+        display.interrupted()
+        raise typer.Exit(130) from None
+    finally:
+        display.close()
+    api.raise_failures(outcome)
+    for message in outcome.taken.values():
+        display.console.print(f"left out: {message}", markup=False)
+    return outcome
