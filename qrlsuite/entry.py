@@ -7,12 +7,14 @@ engine, workers or versions. More epochs extend an entry, more seeds widen it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pydantic
 
 from qrlsuite import options, registry, specs
+from qrlsuite import preset as presets
 from qrlsuite.errors import StoreError
 from qrlsuite.options import Setting
 from qrlsuite.task import Task, TaskFile, digest, load
@@ -26,6 +28,8 @@ class Entry:
     ----------
     preset:
         The preset that supplied defaults; not part of the identity, its values are.
+    tuning:
+        How the settings were found, where a preset file says so; not part of the identity either.
     """
 
     task: Task
@@ -34,6 +38,7 @@ class Entry:
     algorithm_options: Any
     model_options: Any
     preset: str | None
+    tuning: dict[str, Any] | None = field(default=None, compare=False)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -74,11 +79,13 @@ class Entry:
 
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
+        tuned = {} if self.tuning is None else {"tuning": self.tuning}
         return {
             "name": self.name,
             "hash": self.hash,
             "label": self.label,
             "preset": self.preset,
+            **tuned,
             "task_name": self.task.name,
             "task_hash": self.task.hash,
             "task_file": self.task.file.model_dump(mode="json"),
@@ -95,13 +102,21 @@ def resolve(
 ) -> Entry:
     """Build an entry from names and settings.
 
+    Parameters
+    ----------
+    preset:
+        One of the task's presets, or a preset file's path (anything that ends in `.toml`). A file's values come
+        before those of the task's default preset; `settings` come before both.
+
     Raises
     ------
     QrlSuiteError
         For an unknown name or option, or a value that an option cannot have.
     """
     task = load(task_name)
-    algorithm = registry.algorithm(algorithm_name or task.file.default_algorithm)
+    file = presets.load(Path(preset)) if preset is not None and preset.endswith(".toml") else None
+    wanted = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
+    algorithm = registry.algorithm(wanted)
     model = registry.model(model_name)
     sides = {
         "environment": specs.resolve(task.environment.options),
@@ -110,7 +125,17 @@ def resolve(
     }
     values = options.assign(settings, sides)
     task = task.with_environment(values["environment"])
-    chosen, defaults = task.preset(preset, algorithm.name, model.family)
+    chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
+    model_defaults: Mapping[str, Any] = {}
+    if file is not None and preset is not None:
+        presets.require(file, preset, algorithm.name, model.name)
+        for side, given in (("algorithm", file.algorithm_options), ("model", file.model_options)):
+            options.build(sides[side], given, f"preset file {preset}: {side} '{getattr(file, side)}'")
+        chosen, defaults, model_defaults = (
+            Path(preset).name,
+            {**defaults, **file.algorithm_options},
+            file.model_options,
+        )
     return Entry(
         task=task,
         algorithm=algorithm,
@@ -118,8 +143,11 @@ def resolve(
         algorithm_options=options.build(
             sides["algorithm"], {**defaults, **values["algorithm"]}, f"algorithm '{algorithm.name}'"
         ),
-        model_options=options.build(sides["model"], values["model"], f"model '{model.name}'"),
+        model_options=options.build(
+            sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
+        ),
         preset=chosen,
+        tuning=None if file is None or chosen is None else presets.record_of(file, chosen, values),
     )
 
 
@@ -149,6 +177,7 @@ def from_record(record: Mapping[str, Any], source: str) -> Entry:
         algorithm_options=options.build(specs.resolve(algorithm.options), values[0], source),
         model_options=options.build(specs.resolve(model.options), values[1], source),
         preset=preset,
+        tuning=record.get("tuning"),
     )
     if entry.hash != expected:
         raise StoreError(

@@ -1,0 +1,106 @@
+"""What a trial is worth: sample complexity on the tuning seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.statistics import sample_complexity, sample_complexity_at, unsettled, unsettled_at
+from qrlsuite.statistics.grid import BoolArray, IntArray
+from qrlsuite.task import RankingSection
+
+Objective = Literal["cell", "area"]
+
+
+@dataclass(frozen=True)
+class Merit:
+    """A trial's worth; smaller steps are better.
+
+    Attributes
+    ----------
+    objective:
+        Which of the two is minimized.
+    cell:
+        S_hat at the task's reference cell, environment steps.
+    area:
+        Mean of S_hat over the task's ranking grid, environment steps.
+    unsettled:
+        Whether the reference cell's S_hat is only a lower bound.
+    score:
+        Mean validation score over all runs and epochs: settles ties, which are common where runs are too short
+        to reach the threshold.
+    quantum:
+        The smallest difference that the objective can show, environment steps.
+    """
+
+    objective: Objective
+    cell: int
+    area: float
+    unsettled: bool
+    score: float
+    quantum: float
+
+    @property
+    def value(self) -> float:
+        """The objective, environment steps."""
+        return float(self.cell) if self.objective == "cell" else self.area
+
+    @property
+    def order(self) -> tuple[float, float, float]:
+        """Sorts trials from best to worst."""
+        first, second = (self.cell, self.area) if self.objective == "cell" else (self.area, self.cell)
+        return (first, second, -self.score)
+
+    @property
+    def signal(self) -> float:
+        """The objective for samplers that learn: ties are settled by the score, below the smallest difference."""
+        return self.value + self.quantum * (0.5 - min(max(self.score, 0.0), 1.0)) / 2
+
+
+def merit(
+    curves: NDArray[np.float64], ranking: RankingSection, steps_per_epoch: int, objective: Objective
+) -> Merit:
+    """Return the worth of learning curves (N, T).
+
+    Raises
+    ------
+    OptionError
+        If the curves cannot be read as scores.
+    """
+    cell, grid = ranking.reference, ranking.epsilons or ranking.thresholds or []
+    level = cell.epsilon if cell.epsilon is not None else cell.threshold
+    at_cell, open_end = _measure(curves, [level], [cell.delta], steps_per_epoch, ranking)
+    everywhere, _ = _measure(curves, grid, ranking.deltas, steps_per_epoch, ranking)
+    return Merit(
+        objective=objective,
+        cell=int(at_cell[0, 0]),
+        area=float(everywhere.mean()),
+        unsettled=bool(open_end[0, 0]),
+        score=float(curves.mean()),
+        quantum=float(steps_per_epoch) / (1 if objective == "cell" else everywhere.size),
+    )
+
+
+def _measure(
+    curves: NDArray[np.float64],
+    levels: list[float] | list[float | None],
+    deltas: list[float],
+    steps: int,
+    ranking: RankingSection,
+) -> tuple[IntArray, BoolArray]:
+    if ranking.epsilons is not None:
+        return sample_complexity(curves, levels, deltas, steps), unsettled(curves, levels, deltas)
+    return sample_complexity_at(curves, levels, deltas, steps), unsettled_at(curves, levels, deltas)
+
+
+def cell_text(ranking: RankingSection, objective: Objective) -> str:
+    """Say in words what is minimized."""
+    cell = ranking.reference
+    level = f"epsilon {cell.epsilon:g}" if cell.epsilon is not None else f"return {cell.threshold:g}"
+    if objective == "cell":
+        return f"S_hat at {level}, delta {cell.delta:g}"
+    count = len(ranking.epsilons or ranking.thresholds or []) * len(ranking.deltas)
+    return f"mean of S_hat over the {count} cells of the ranking grid"

@@ -1,0 +1,325 @@
+"""A search: trial by trial, each an ordinary set of runs below `<runs>/tuning/`, until the best is a preset file.
+
+A search keeps no state of its own. Interrupted and begun again, it proposes the same trials, finds those that have
+finished on the disk, and ends with the same preset (but for the measured hours).
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite import options, preset, provenance, registry
+from qrlsuite.engine.groups import format_seeds, parse_seeds
+from qrlsuite.entry import Entry, resolve
+from qrlsuite.errors import OptionError
+from qrlsuite.options import Setting
+from qrlsuite.preset import TUNING_SEEDS
+from qrlsuite.store import EntryStore, entries, write_atomically
+from qrlsuite.task import digest
+from qrlsuite.tuning import samplers, space
+from qrlsuite.tuning.objective import Merit, Objective, cell_text, merit
+
+FOLDER = "tuning"
+"""Trials lie in a results folder of their own, so that leaderboards do not rank them."""
+
+Train = Callable[[Entry, Sequence[int], int], EntryStore]
+"""Trains the missing ones of some seeds to an epoch and returns the entry's folder, finished or not."""
+
+
+def tuning_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds that `--seeds` means: a number counts from 1,000,000.
+
+    Raises
+    ------
+    OptionError
+        If the text is malformed, or a seed belongs to the protocol.
+    """
+    if text.isdecimal():
+        return tuple(TUNING_SEEDS + seed for seed in parse_seeds(text))
+    seeds = tuple(parse_seeds(text))
+    if seeds[0] < TUNING_SEEDS:
+        raise OptionError(
+            f"--seeds {text}: tuning uses seeds from {TUNING_SEEDS} up, or its settings would be judged by the runs "
+            f"they were chosen on; write --seeds {len(seeds)} for {TUNING_SEEDS} to {TUNING_SEEDS + len(seeds) - 1}"
+        )
+    return seeds
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be searched.
+
+    Attributes
+    ----------
+    settings:
+        Values that all trials share.
+    grid, varied:
+        What is varied: a grid file, and options with lists of values of their own.
+    trials, sampler_seed:
+        See `qrlsuite.tuning.samplers`.
+    seeds:
+        Tuning seeds.
+    epochs:
+        Of every trial; None for the task's protocol.
+    """
+
+    task: str
+    model: str
+    algorithm: str | None = None
+    settings: tuple[Setting, ...] = ()
+    grid: space.GridFile | None = None
+    varied: tuple[Setting, ...] = ()
+    sampler: str = "grid"
+    trials: int | None = None
+    sampler_seed: int = 0
+    seeds: tuple[int, ...] = ()
+    epochs: int | None = None
+    objective: Objective = "cell"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A finished trial."""
+
+    number: int
+    point: space.Point
+    entry: Entry
+    merit: Merit
+    core_seconds: float
+
+
+class Search:
+    """One search over the settings of a model and an algorithm.
+
+    Parameters
+    ----------
+    runs:
+        The results folder.
+
+    Raises
+    ------
+    QrlSuiteError
+        If a name, an option or a value of the request cannot be used.
+    """
+
+    def __init__(self, request: Request, runs: Path) -> None:
+        self.request = request
+        self.runs = runs / FOLDER
+        self.base = resolve(request.task, request.model, request.algorithm, request.settings)
+        self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
+        self.space = space.space(self.base, request.grid, request.varied, request.settings)
+        self.sampler = samplers.create(
+            request.sampler,
+            self.space,
+            request.trials,
+            request.sampler_seed,
+            space.base(self.space, self.base),
+        )
+        self.trials: list[Trial] = []
+        self.pending: list[Entry] = []
+        self.asked = 0
+
+    @property
+    def planned(self) -> int:
+        """How many trials there are to be."""
+        return self.sampler.total
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all planned trials."""
+        return self.planned * self._steps_per_trial
+
+    @property
+    def _steps_per_trial(self) -> int:
+        return len(self.request.seeds) * self.epochs * self.base.task.file.protocol.interactions
+
+    @property
+    def best(self) -> Trial | None:
+        """The best finished trial, the earliest of equals; None before any."""
+        return min(self.trials, key=lambda trial: (trial.merit.order, trial.number), default=None)
+
+    @property
+    def over(self) -> bool:
+        """Whether no further trial can be begun: all are, or the next one needs to know one that waits."""
+        return self.asked == self.planned or (self.sampler.adaptive and bool(self.pending))
+
+    def step(self, train: Train) -> Trial | None:
+        """Run the next trial; returns None where some of its runs are left to another process or a queue.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, with everything saved.
+        QrlSuiteError
+            If a trial cannot be run.
+        """
+        point = self.sampler.ask()
+        self.asked += 1
+        request = self.request
+        entry = resolve(
+            request.task, request.model, request.algorithm, [*request.settings, *space.settings(point)]
+        )
+        store = train(entry, request.seeds, self.epochs)
+        curves = self._curves(store)
+        if curves is None:
+            self.pending.append(entry)
+            return None
+        worth = merit(
+            curves, entry.task.file.ranking, entry.task.file.protocol.interactions, request.objective
+        )
+        self.sampler.tell(worth.signal)
+        seconds = sum(store.seed(seed).seconds() for seed in request.seeds)
+        trial = Trial(self.asked, point, entry, worth, seconds)
+        self.trials.append(trial)
+        return trial
+
+    def _curves(self, store: EntryStore) -> NDArray[np.float64] | None:
+        """Return the learning curves (N, T) of the tuning seeds; None while some are missing."""
+        if store.finished(self.request.seeds, self.epochs) != set(self.request.seeds):
+            return None
+        return np.stack([store.seed(seed).curve().curve[: self.epochs] for seed in self.request.seeds])
+
+    @property
+    def core_seconds(self) -> float:
+        """Core-seconds spent on the finished trials; equal settings count once."""
+        return sum({trial.entry.hash: trial.core_seconds for trial in self.trials}.values())
+
+    @property
+    def path(self) -> Path:
+        """Where the preset file goes unless told otherwise: the name holds a digest of the request."""
+        request, base = self.request, self.base
+        key = digest(
+            {
+                "identity": base.identity,
+                "space": {dimension.name: dimension.plain() for dimension in self.space},
+                "sampler": [request.sampler, self.planned, request.sampler_seed],
+                "runs": [list(request.seeds), self.epochs, request.objective],
+            }
+        )
+        return self.runs / f"{base.task.name}-{base.algorithm.name}-{base.model.name}-{key[:8]}.toml"
+
+    def preset(self) -> preset.PresetFile:
+        """Return the best settings, and how they were found.
+
+        Raises
+        ------
+        OptionError
+            If no trial has finished.
+        """
+        best = self.best
+        if best is None:
+            raise OptionError("no trial has finished yet, so there are no settings to write down")
+        distinct = len({trial.entry.hash for trial in self.trials})
+        plugins = [
+            registry.load().get(kind, name).distribution
+            for kind, name in (("models", best.entry.model.name), ("algorithms", best.entry.algorithm.name))
+        ]
+        extra = ["optuna"] if self.sampler.adaptive else []
+        return preset.PresetFile(
+            format_version=1,
+            algorithm=best.entry.algorithm.name,
+            model=best.entry.model.name,
+            algorithm_options=options.plain(best.entry.algorithm_options),
+            model_options=options.plain(best.entry.model_options),
+            tuning=preset.TuningRecord(
+                task=best.entry.task.name,
+                objective=self.request.objective,
+                value=best.merit.value,
+                sampler=self.request.sampler,
+                trials=len(self.trials),
+                planned=self.planned,
+                seeds=format_seeds(self.request.seeds),
+                epochs=self.epochs,
+                steps=distinct * self._steps_per_trial,
+                space={dimension.name: dimension.plain() for dimension in self.space},
+                versions=dict(provenance.collect([*plugins, *extra])["versions"]),
+                core_hours=float(f"{self.core_seconds / 3600:.3g}"),
+            ),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the best settings to a preset file, atomically.
+
+        Raises
+        ------
+        OptionError
+            If no trial has finished.
+        StoreError
+            If the file cannot be written.
+        """
+        found = self.preset()
+        base = self.base
+        comment = (
+            f"Settings found by `qrlsuite tune` ({cell_text(base.task.file.ranking, self.request.objective)}); to use "
+            f"them:\n  qrlsuite run --task {base.task.name} --model {base.model.name} --preset {path.name}"
+        )
+        write_atomically(path, preset.dumps(found, comment).encode())
+
+
+def as_dict(search: Search) -> dict[str, Any]:
+    """Return a search as plain values, for JSON: trials from best to worst."""
+    ordered = sorted(search.trials, key=lambda trial: (trial.merit.order, trial.number))
+    return {
+        "task": search.base.task.name,
+        "algorithm": search.base.algorithm.name,
+        "model": search.base.model.name,
+        "objective": cell_text(search.base.task.file.ranking, search.request.objective),
+        "sampler": search.request.sampler,
+        "space": {dimension.name: dimension.plain() for dimension in search.space},
+        "planned": search.planned,
+        "pending": len(search.pending),
+        "seeds": format_seeds(search.request.seeds),
+        "epochs": search.epochs,
+        "core_hours": search.core_seconds / 3600,
+        "trials": [
+            {
+                "number": trial.number,
+                "settings": trial.point,
+                "entry": trial.entry.name,
+                "value": trial.merit.value,
+                "sample_complexity": trial.merit.cell,
+                "unsettled": trial.merit.unsettled,
+                "area": trial.merit.area,
+                "mean_score": trial.merit.score,
+                "core_hours": trial.core_seconds / 3600,
+            }
+            for trial in ordered
+        ],
+    }
+
+
+def pace(folders: Sequence[Path], entry: Entry) -> float | None:
+    """Return the core-seconds per epoch and seed that runs like an entry's have taken here; None where there are none.
+
+    Runs with the same model options count, else all with the same model and algorithm on the task.
+    """
+    like: list[float] = []
+    same: list[float] = []
+    for folder in folders:
+        for store in entries(folder, entry.task.name) if folder.is_dir() else []:
+            identity = store.record()["identity"]
+            if [identity["algorithm"], identity["model"]] != [entry.algorithm.name, entry.model.name]:
+                continue
+            measured = _measured(store)
+            like += measured
+            if identity.get("model_options") == options.plain(entry.model_options):
+                same += measured
+    found = same or like
+    return statistics.median(found) if found else None
+
+
+def _measured(store: EntryStore) -> list[float]:
+    """Return seconds per epoch of a few of an entry's runs."""
+    found = []
+    for seed in store.seeds()[:5]:
+        epochs = int((store.seed(seed).record() or {}).get("epochs", 0))
+        if epochs:
+            found.append(store.seed(seed).seconds() / epochs)
+    return found

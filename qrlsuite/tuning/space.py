@@ -1,0 +1,278 @@
+"""Search spaces: which values of which options are tried.
+
+A grid is a TOML file, `[search.ALGORITHM.FAMILY]` with lists of values by option, each of the two a name or
+`all`:
+
+    format_version = 1
+
+    [search.ddqn.all]
+    lr = [1e-3, 5e-4]
+    gamma = { low = 0.9, high = 0.99 }
+
+    [search.ddqn.classical]
+    width = [16, 64]
+
+A range (`low`, `high`, and `log = true` for learning rates) is for samplers that draw. Option names are those of
+`--set`, with `algorithm.` or `model.` before them where both have one; `"activation_in+activation_out"` gives both
+options the same value. Grids of a name lie in a folder `search`
+beside the task files, the suite's and those of plugins.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from qrlsuite import options, registry, specs
+from qrlsuite.entry import Entry
+from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite.options import Setting
+
+FOLDER = "search"
+Point = dict[str, Any]
+"""A value for every dimension, by its full name (`algorithm.lr`)."""
+
+
+class Range(BaseModel):
+    """All numbers from `low` to `high`: integers if both are."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    low: int | float
+    high: int | float
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Range:
+        if not self.low < self.high or (self.log and self.low <= 0):
+            raise ValueError("low < high is needed, and 0 < low with log")
+        return self
+
+    @property
+    def integer(self) -> bool:
+        """Whether only integers are meant."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """An option's full name, and either its values or its range."""
+
+    name: str
+    values: tuple[Any, ...] = ()
+    range: Range | None = None
+
+    def plain(self) -> Any:
+        """Return it as it stands in a grid file."""
+        if self.range is None:
+            return list(self.values)
+        log = {"log": True} if self.range.log else {}
+        return {"low": self.range.low, "high": self.range.high, **log}
+
+
+Space = tuple[Dimension, ...]
+Tables = dict[str, dict[Literal["all", "classical", "quantum"], dict[str, list[Any] | Range]]]
+
+
+class GridFile(BaseModel):
+    """A whole grid file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format_version: Literal[1]
+    summary: str = ""
+    search: Annotated[Tables, Field(min_length=1)]
+
+
+def grids() -> dict[str, Path]:
+    """Return the grids beside the registered tasks by name; the suite's own come first where two share one."""
+    folders = dict.fromkeys(
+        Path(item.spec.path).parent / FOLDER
+        for kind, item in registry.load()
+        if kind == "tasks" and isinstance(item.spec, specs.TaskSpec)
+    )
+    found: dict[str, Path] = {}
+    for folder in folders:
+        for path in sorted(folder.glob("*.toml")):
+            found.setdefault(path.stem, path)
+    return found
+
+
+def load(name: str) -> GridFile:
+    """Read a grid by name, or by path (anything that ends in `.toml`).
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no grid of that name.
+    TaskError
+        If the file cannot be read or is malformed; the message lists every problem.
+    """
+    known = grids()
+    if not name.endswith(".toml") and name not in known:
+        raise UnknownNameError(f"unknown grid '{name}'{nearest(name, known)}; or give a file, my-grid.toml")
+    path = Path(name) if name.endswith(".toml") else known[name]
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise TaskError(f"grid file {path} cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise TaskError(f"grid file {path}: not valid TOML: {error}") from None
+    try:
+        return GridFile.model_validate(data)
+    except pydantic.ValidationError as error:
+        lines = "; ".join(options.validation_lines(error))
+        raise TaskError(
+            f"grid file {path}: {lines}; a grid holds format_version = 1 and [search.ALGORITHM.FAMILY] tables with "
+            "a list of values for each option"
+        ) from None
+
+
+def space(
+    entry: Entry, grid: GridFile | None, varied: Sequence[Setting] = (), fixed: Sequence[Setting] = ()
+) -> Space:
+    """Return what is varied for an entry.
+
+    Parameters
+    ----------
+    entry:
+        Algorithm, model and the values of all options that are not varied.
+    grid:
+        A grid file; its tables for the entry's algorithm and family are taken, `all` first.
+    varied:
+        Further options with lists of values (or ranges) of their own; they replace the grid's.
+    fixed:
+        Options that the grid shall not vary.
+
+    Raises
+    ------
+    OptionError
+        If nothing is left to vary, an option is unknown, or a value cannot be used.
+    """
+    sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
+    found: dict[str, list[Any] | Range] = {}
+    tables = grid.search if grid is not None else {}
+    for algorithm in ("all", entry.algorithm.name):
+        for family in ("all", entry.model.family):
+            for word, values in tables.get(algorithm, {}).get(family, {}).items():
+                found[_full_name(word, sides)] = values
+    for setting in varied:
+        name = _full_name(_word(setting), sides)
+        _forget(found, name)
+        found[name] = _values(name, setting.value)
+    for setting in fixed:
+        if setting.side != "environment" and (setting.side or _owned(setting.name, sides)):
+            _forget(found, _full_name(_word(setting), sides))
+    if not found:
+        raise OptionError(
+            f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: give --grid NAME, --grid FILE.toml "
+            "or --vary 'lr=[1e-3, 5e-4]'"
+        )
+    result = tuple(_dimension(name, values) for name, values in found.items())
+    for dimension in result:
+        _check(dimension, sides, entry)
+    return result
+
+
+def _word(setting: Setting) -> str:
+    return setting.name if setting.side is None else f"{setting.side}.{setting.name}"
+
+
+def _owned(name: str, sides: Mapping[str, type[Any]]) -> bool:
+    """Tell whether an option belongs to the model or the algorithm, and not to the environment."""
+    return any(name in options.field_names(cls) for cls in sides.values())
+
+
+def _full_name(word: str, sides: Mapping[str, type[Any]]) -> str:
+    """Return option names with their sides: `lr` as `algorithm.lr`, `a+b` as `model.a+model.b`."""
+    parts = []
+    for part in word.split("+"):
+        side, dot, name = part.strip().partition(".")
+        setting = Setting(side, name, None) if dot else Setting(None, side, None)
+        for owner, values in options.assign([setting], sides).items():
+            parts += [f"{owner}.{option}" for option in values]
+    return "+".join(parts)
+
+
+def _forget(found: dict[str, Any], name: str) -> None:
+    """Drop every dimension that shares an option with a name."""
+    for known in list(found):
+        if set(known.split("+")) & set(name.split("+")):
+            del found[known]
+
+
+def _values(name: str, value: Any) -> list[Any] | Range:
+    """Read what `--vary` gives: a list, or a range as an inline table."""
+    if isinstance(value, list):
+        return value
+    if isinstance(value, dict):
+        try:
+            return Range.model_validate(value)
+        except pydantic.ValidationError as error:
+            raise OptionError(f"--vary {name}: {'; '.join(options.validation_lines(error))}") from None
+    raise OptionError(
+        f"--vary {name}: write a list of values, --vary '{name}=[1, 2]', or {{low = 1, high = 2}}"
+    )
+
+
+def _dimension(name: str, values: list[Any] | Range) -> Dimension:
+    if isinstance(values, Range):
+        return Dimension(name, range=values)
+    distinct = [value for i, value in enumerate(values) if value not in values[:i]]
+    if not distinct:
+        raise OptionError(f"{name}: the list of values to try is empty")
+    return Dimension(name, tuple(distinct))
+
+
+def _check(dimension: Dimension, sides: Mapping[str, type[Any]], entry: Entry) -> None:
+    """Raise OptionError unless the option can have every value (or both ends of its range)."""
+    ends = dimension.range
+    for part in dimension.name.split("+"):
+        side, _, name = part.partition(".")
+        if side not in sides or name not in options.field_names(sides[side]):
+            known = sides if side not in sides else options.field_names(sides[side])
+            raise OptionError(
+                f"{part}: no option of that name{nearest(name if side in sides else side, known)}"
+            )
+        own = options.plain(entry.model_options if side == "model" else entry.algorithm_options)
+        for value in dimension.values if ends is None else (ends.low, ends.high):
+            options.build(sides[side], {**own, name: value}, f"a trial with {part} = {value!r}")
+
+
+def base(space: Space, entry: Entry) -> Point:
+    """Return the point of an entry's own values; of several options that vary as one, the first's."""
+    own = {
+        "algorithm": options.plain(entry.algorithm_options),
+        "model": options.plain(entry.model_options),
+    }
+    point = {}
+    for dimension in space:
+        side, _, name = dimension.name.partition("+")[0].partition(".")
+        point[dimension.name] = own[side][name]
+    return point
+
+
+def settings(point: Mapping[str, Any]) -> list[Setting]:
+    """Return a point as settings, as `--set` would give them."""
+    words = []
+    for full, value in point.items():
+        for part in full.split("+"):
+            side, _, name = part.partition(".")
+            words.append(Setting(side, name, value))
+    return words
+
+
+def text(point: Mapping[str, Any]) -> str:
+    """Write a point in a line: `lr=0.001 gamma=0.9`."""
+    short = ["+".join(part.partition(".")[2] for part in full.split("+")) for full in point]
+    names = [s if short.count(s) == 1 else full for full, s in zip(point, short)]
+    return " ".join(
+        f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}"
+        for name, value in zip(names, point.values())
+    )
