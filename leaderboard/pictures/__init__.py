@@ -44,30 +44,20 @@ class Picture:
         return f"{self.module}:Options"
 
 
+FORMATS = ("png", "pdf", "svg")
 _HERE = "qrlsuite.leaderboard.pictures"
 KINDS: dict[str, Picture] = {
-    "curves": Picture("learning curves: median, 5th to 95th percentile, single runs", f"{_HERE}.curves"),
-    "surface": Picture(
-        "sample complexity over epsilon and delta, a map per entry, or 3d as the paper", f"{_HERE}.surface"
-    ),
-    "bars": Picture(
-        "sample complexity per cell, with percentile whiskers; faded where it is at the cap", f"{_HERE}.bars"
-    ),
-    "scaling": Picture(
-        "sample complexity against size (width, qubits, ..., or the task's degree), with parameter counts",
-        f"{_HERE}.scaling",
-    ),
+    "curves": Picture("learning curves: median, 5th to 95th percentile", f"{_HERE}.curves"),
+    "surface": Picture("sample complexity over epsilon and delta, a map per entry", f"{_HERE}.surface"),
+    "bars": Picture("sample complexity per cell, with percentile whiskers", f"{_HERE}.bars"),
+    "scaling": Picture("sample complexity against width, qubits, degree, ...", f"{_HERE}.scaling"),
     "tiers": Picture("who outperforms whom, tier by tier", f"{_HERE}.tiers"),
-    "few-runs": Picture(
-        "how 5 seeds mislead against many: one entry against itself, or two entries", f"{_HERE}.few_runs"
-    ),
+    "few-runs": Picture("how 5 seeds mislead: two entries, or one against itself", f"{_HERE}.few_runs"),
     "histogram": Picture(
-        "episode sums of trained policies against optimal and random (drawn by `qrlsuite evaluate`)",
-        f"{_HERE}.histogram",
-        of="episodes",
+        "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", of="episodes"
     ),
     "estimator": Picture(
-        "how likely P_hat falls below delta, with the central-limit curve", f"{_HERE}.estimator", of="nothing"
+        "how likely P_hat falls below delta, given P and 100 runs", f"{_HERE}.estimator", of="nothing"
     ),
 }
 """Pictures by name."""

@@ -29,13 +29,13 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             pictures=(
                 PictureSpec(
                     name="trajectories",
-                    summary="random paths of the user, for one degree or several side by side",
+                    summary="random paths of the user, by degree",
                     draw=f"{_BEAM6G}.pictures:trajectories",
                     options=f"{_BEAM6G}.pictures:TrajectoryOptions",
                 ),
                 PictureSpec(
                     name="field",
-                    summary="the map of the best antenna and its intensity, or the beams' interference",
+                    summary="the best antenna of every place, and its intensity",
                     draw=f"{_BEAM6G}.pictures:field",
                     options=f"{_BEAM6G}.pictures:FieldOptions",
                 ),

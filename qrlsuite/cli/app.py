@@ -47,7 +47,7 @@ def build() -> typer.Typer:
     app.command("runs")(runs.runs)
     app.command("leaderboard")(leaderboard.leaderboard)
     app.command("compare")(compare.compare)
-    app.command("plot")(plot.plot)
+    app.command("plot", cls=plot.Command)(plot.plot)
     app.command("evaluate")(evaluate.evaluate)
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
