@@ -88,7 +88,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
                     alpha=max(alpha, 0.55),
                 )
             if found.unsettled[i, j]:
-                axes.text(places[i, j], high + 0.012 * horizon, "≥", ha="center", fontsize=9, zorder=5)
+                axes.text(float(places[i, j]), high + 0.012 * horizon, "≥", ha="center", fontsize=9, zorder=5)
     axes.axhline(horizon, color="#505050", lw=0.9, ls=":")
     axes.set_xticks(
         centers.T.ravel(), [f"{cells.level_name(grid)} = {v}" for v in cells.levels(grid)] * n_deltas

@@ -127,7 +127,7 @@ def legend(figure: Figure, title: str, handles: Sequence[Artist]) -> None:
     """Write a picture's title and, below it, its legend in as many columns as there is room for."""
     longest = max((len(str(handle.get_label())) for handle in handles), default=1)
     columns = max(1, int(figure.get_figwidth() / (0.5 + 0.083 * longest)))
-    found = figure.legend(
+    figure.legend(
         handles=list(handles),
         loc="outside upper left",
         title=title,
@@ -138,4 +138,3 @@ def legend(figure: Figure, title: str, handles: Sequence[Artist]) -> None:
         fontsize=8.5,
         borderaxespad=0.2,
     )
-    found.get_title().set_ha("left")

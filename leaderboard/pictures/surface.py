@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.leaderboard.collect import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.statistics import Grid
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
 def _maps(
     entries: Sequence[EntryCurves],
     measured: Sequence[cells.Cells],
-    grid: cells.Grid,
+    grid: Grid,
     title: str,
     horizon: int,
     chosen: Options,
@@ -121,7 +122,7 @@ def _maps(
 def _box(
     entries: Sequence[EntryCurves],
     measured: Sequence[cells.Cells],
-    grid: cells.Grid,
+    grid: Grid,
     title: str,
     horizon: int,
     chosen: Options,

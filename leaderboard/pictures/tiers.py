@@ -18,7 +18,7 @@ from qrlsuite.leaderboard.collect import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.statistics import Board, outperformance
 
-LOOKS = {
+LOOKS: dict[str, dict[str, Any]] = {
     "win": {"facecolor": style.COLORS[0], "edgecolor": "white"},
     "loss": {"facecolor": "#f3c9a8", "edgecolor": "white", "hatch": "////"},
     "neither": {"facecolor": "#f2f2f2", "edgecolor": "white"},

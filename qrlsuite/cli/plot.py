@@ -11,7 +11,6 @@ from typer.core import TyperCommand
 from qrlsuite.cli.app import JsonOption, RunsOption
 
 if TYPE_CHECKING:
-    import click
     from matplotlib.figure import Figure
 
     from qrlsuite.leaderboard.collect import EntryCurves
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 class Command(TyperCommand):
     """The command with the list of pictures at the end of its help."""
 
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Write every kind of picture with one line."""
         with formatter.section("Kinds"):
             formatter.write_dl(list(_summaries().items()))
