@@ -1,0 +1,286 @@
+"""Learning on CartPole, side by side with Stable-Baselines3's DQN and PPO at equal settings.
+
+    pip install 'qrlsuite[bench]'
+    python benchmarks/learning.py [--algorithms ddqn ppo] [--seeds 10] [--epochs 100] [--json out.json]
+
+Every agent has the same network, learning rate, discount, batch, replay buffer, target updates, exploration and
+gradient steps per interaction; it learns from 10 environments, and every 1000 interactions it plays the same 100
+greedy episodes as its peers. Settings are those of the task's preset `tuned`, but for PPO's minibatches: 50 divides
+1000 samples, so that both make equally many. What Stable-Baselines3 does otherwise by default is switched to what the
+suite does: no clipping of gradients, constant exploration, no warm-up, ReLU and torch's own initialization, Adam's
+eps 1e-8. Two differences remain in its DQN and cannot be switched: targets are not double, and the error is
+Huber's; with several environments it also flips one coin for all of them where the suite flips one each. The third
+row, `SB3 DQN, our update`, is the same class with these three replaced, as the suite has them.
+
+Printed are medians over seeds and, in brackets, their 5th to 95th bootstrap percentiles (whole runs resampled, 10,000
+times): interactions until a mean score first reaches 0.5 and 0.95 of the optimum, the mean score of the whole curve,
+the score at the end, and seconds of processor time per seed spent on learning, without evaluation. Differences are
+ours minus theirs. One thread; all 10 seeds of the suite are trained together, those of its peer one after another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from qrlsuite.entry import Entry, resolve
+from qrlsuite.options import parse_setting
+from qrlsuite.run import ModelBuilder, build_envs
+from qrlsuite.seeding import Streams
+from qrlsuite.specs import resolve as reference
+
+FloatArray = NDArray[np.float64]
+Act = Callable[[NDArray[np.float32]], NDArray[np.int64]]
+EPISODES, ENVIRONMENTS, INTERACTIONS = 100, 10, 1000
+SETTINGS = {"ddqn": [], "ppo": ["batch=50"]}
+
+
+class Runs:
+    """The runs of one implementation.
+
+    Attributes
+    ----------
+    scores:
+        Mean score of the greedy episodes after every epoch, (seeds, epochs).
+    seconds:
+        Processor time of learning per seed.
+    """
+
+    def __init__(self, name: str, scores: FloatArray, seconds: float) -> None:
+        self.name, self.scores, self.seconds = name, scores, seconds
+
+    def measures(self) -> dict[str, FloatArray]:
+        """Return each measure per seed; a threshold never reached counts as one epoch more than there are."""
+        reached = {
+            f"steps to {t:g}": INTERACTIONS
+            * (1.0 + np.where((self.scores >= t).any(1), (self.scores >= t).argmax(1), self.scores.shape[1]))
+            for t in (0.5, 0.95)
+        }
+        return {**reached, "mean score": self.scores.mean(1), "final score": self.scores[:, -1]}
+
+
+def ours(entry: Entry, seeds: range, epochs: int) -> Runs:
+    """Train a population."""
+    streams = [Streams(entry.task.hash, seed) for seed in seeds]
+    envs = build_envs(entry, ENVIRONMENTS * len(seeds), lambda: None)
+    envs.seed_lanes([s.numpy("environment", lane) for s in streams for lane in range(ENVIRONMENTS)])
+    agents = reference(entry.algorithm.factory)(
+        envs, ModelBuilder(entry, 4, streams), entry.algorithm_options, streams, torch.device("cpu")
+    )
+    agents.start()
+    play = Evaluation(entry, streams)
+    seconds, scores = 0.0, []
+    for epoch in range(epochs):
+        begun = time.process_time()
+        agents.train_epoch(INTERACTIONS // ENVIRONMENTS)
+        seconds += time.process_time() - begun
+        scores.append(play(agents.act, epoch + 1))
+    return Runs(f"qrlsuite {entry.algorithm.name}", np.stack(scores, axis=1), seconds / len(seeds))
+
+
+def theirs(name: str, make: Callable[[Any, int], Any], entry: Entry, seeds: range, epochs: int) -> Runs:
+    """Train a peer's agents one by one; `make` builds one from its environments and a seed."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    seconds, curves = 0.0, []
+    for seed in seeds:
+        play = Evaluation(entry, [Streams(entry.task.hash, seed)])
+        environments = DummyVecEnv([lambda: gymnasium.make("CartPole-v1")] * ENVIRONMENTS)
+        agent = make(environments, seed)
+
+        def act(observations: NDArray[np.float32], agent: Any = agent) -> NDArray[np.int64]:
+            actions, _ = agent.predict(observations[0], deterministic=True)
+            return np.asarray(actions)[None]
+
+        scores = []
+        for epoch in range(epochs):
+            begun = time.process_time()
+            agent.learn(INTERACTIONS, reset_num_timesteps=False)
+            seconds += time.process_time() - begun
+            scores.append(float(play(act, epoch + 1)[0]))
+        curves.append(scores)
+    return Runs(name, np.array(curves), seconds / len(seeds))
+
+
+class Evaluation:
+    """Plays the task's greedy validation episodes of some seeds."""
+
+    def __init__(self, entry: Entry, streams: list[Streams]) -> None:
+        self.streams = streams
+        self.envs = build_envs(entry, EPISODES * len(streams), lambda: None)
+        self.envs.inner.autoreset = False
+
+    def __call__(self, act: Act, epoch: int) -> FloatArray:
+        """Return the mean score of each seed's episodes of an epoch (seeds,)."""
+        lanes = EPISODES * len(self.streams)
+        self.envs.seed_lanes([s.numpy("validation", epoch) for s in self.streams])
+        observations, _ = self.envs.reset()
+        returns, running = np.zeros(lanes), np.ones(lanes, dtype=np.bool_)
+        while running.any():
+            stacked = np.ascontiguousarray(observations, np.float32).reshape(len(self.streams), EPISODES, -1)
+            observations, rewards, terminated, truncated, _ = self.envs.step(act(stacked).reshape(-1))
+            returns += np.where(running, rewards, 0.0)
+            running &= ~(terminated | truncated)
+        scores: FloatArray = returns.reshape(len(self.streams), EPISODES).mean(1) / 500.0
+        return scores
+
+
+def sb3_dqn(entry: Entry, equal: bool) -> Callable[[Any, int], Any]:
+    """Return a maker of DQN agents at an entry's settings; `equal` also replaces what cannot be switched."""
+    from stable_baselines3 import DQN
+    from torch.nn import functional
+
+    class OurUpdate(DQN):
+        """Double targets, squared error, a coin per environment."""
+
+        def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+            for _ in range(gradient_steps):
+                data = self.replay_buffer.sample(batch_size)  # type: ignore[union-attr]
+                with torch.no_grad():
+                    best = self.q_net(data.next_observations).argmax(1, keepdim=True)
+                    following = self.q_net_target(data.next_observations).gather(1, best)
+                    target = data.rewards + (1 - data.dones) * self.gamma * following
+                loss = functional.mse_loss(self.q_net(data.observations).gather(1, data.actions), target)
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                self.policy.optimizer.step()
+
+        def predict(
+            self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+        ) -> Any:
+            actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+            if not deterministic:
+                drawn = np.random.rand(len(actions)) < self.exploration_rate  # noqa: NPY002
+                actions = np.where(drawn, np.random.randint(2, size=len(actions)), actions)  # noqa: NPY002
+            return actions, state
+
+    o, network = entry.algorithm_options, entry.model_options
+
+    def make(environments: Any, seed: int) -> Any:
+        return (OurUpdate if equal else DQN)(
+            "MlpPolicy",
+            environments,
+            learning_rate=o.lr,
+            buffer_size=o.buffer,
+            learning_starts=0,
+            batch_size=o.batch,
+            gamma=o.gamma,
+            train_freq=1,  # a step of all environments
+            gradient_steps=1,
+            target_update_interval=o.target_steps * ENVIRONMENTS,  # counted in interactions
+            exploration_initial_eps=o.epsilon,
+            exploration_final_eps=o.epsilon,
+            max_grad_norm=float("inf"),
+            policy_kwargs={"net_arch": [network.width] * network.depth, "activation_fn": torch.nn.ReLU},
+            seed=seed,
+            device="cpu",
+        )
+
+    return make
+
+
+def sb3_ppo(entry: Entry) -> Callable[[Any, int], Any]:
+    """Return a maker of PPO agents at an entry's settings."""
+    from stable_baselines3 import PPO
+
+    o, network = entry.algorithm_options, entry.model_options
+    layers = [network.width] * network.depth
+
+    def make(environments: Any, seed: int) -> Any:
+        return PPO(
+            "MlpPolicy",
+            environments,
+            learning_rate=o.lr,
+            n_steps=INTERACTIONS // ENVIRONMENTS,
+            batch_size=o.batch,
+            n_epochs=o.repeats,
+            gamma=o.gamma,
+            gae_lambda=o.gae_lambda,
+            clip_range=o.clip,
+            normalize_advantage=True,
+            ent_coef=o.entropy_coefficient,
+            vf_coef=o.value_coefficient,
+            max_grad_norm=float("inf"),
+            policy_kwargs={
+                "net_arch": {"pi": layers, "vf": layers},
+                "activation_fn": torch.nn.ReLU,
+                "ortho_init": False,
+                "optimizer_kwargs": {"eps": 1e-8},
+            },
+            seed=seed,
+            device="cpu",
+        )
+
+    return make
+
+
+def draws(values: FloatArray, source: int, resamples: int = 10_000) -> FloatArray:
+    """Return the medians of resamples of `values` (seeds,)."""
+    picked = np.random.default_rng(source).integers(len(values), size=(resamples, len(values)))
+    medians: FloatArray = np.median(values[picked], axis=1)
+    return medians
+
+
+def report(all_runs: list[Runs]) -> None:
+    """Print every implementation's measures, and the differences of the first to the others."""
+    mine = all_runs[0]
+    for source, runs in enumerate(all_runs):
+        print(f"\n{runs.name}: {runs.seconds:.2f} s per seed ({runs.seconds / mine.seconds:.1f} times ours)")
+        for measure, values in runs.measures().items():
+            form = (lambda v: f"{v:,.0f}") if measure.startswith("steps") else (lambda v: f"{v:.3f}")
+            low, high = np.percentile(draws(values, source), [5, 95])
+            line = f"  {measure:14}{form(np.median(values)):>9} ({form(low)} to {form(high)})"
+            if measure.startswith("steps"):
+                never = int((values > INTERACTIONS * runs.scores.shape[1]).sum())
+                line += f", never by {never} of {len(values)}" if never else ""
+            if runs is not mine:
+                difference = draws(mine.measures()[measure], 0) - draws(values, source)
+                low, high = np.percentile(difference, [5, 95])
+                line += f"   ours - theirs: {form(low)} to {form(high)}"
+            print(line)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--algorithms", nargs="+", choices=sorted(SETTINGS), default=sorted(SETTINGS))
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--epochs", type=int, default=100, help="of 1000 interactions each")
+    parser.add_argument("--preset", default="tuned", help="the task's preset that both learn with")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another setting")
+    parser.add_argument("--json", type=Path, help="also write every curve to this file")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds, stored = range(given.seeds), {}
+    for algorithm in given.algorithms:
+        settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *given.set]]
+        entry = resolve("cartpole", "mlp", algorithm, settings, given.preset)
+        all_runs = [ours(entry, seeds, given.epochs)]
+        peers: dict[str, Callable[[Any, int], Any]] = {"SB3 PPO": sb3_ppo(entry)}
+        if algorithm == "ddqn":
+            peers = {"SB3 DQN": sb3_dqn(entry, False), "SB3 DQN, our update": sb3_dqn(entry, True)}
+        all_runs += [theirs(name, make, entry, seeds, given.epochs) for name, make in peers.items()]
+        report(all_runs)
+        stored[algorithm] = {
+            r.name: {"scores": r.scores.tolist(), "seconds_per_seed": r.seconds} for r in all_runs
+        }
+        if given.json:
+            given.json.write_text(json.dumps(stored), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
