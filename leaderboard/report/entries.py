@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +72,20 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
 
 
 def _options(entry: EntryCurves) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
-    return []
+    tables = []
+    for part in ("algorithm", "model"):
+        values = entry.identity.get(f"{part}_options", {})
+        lines = tuple((clean(name), clean(_plain(value))) for name, value in values.items())
+        if lines:
+            tables.append((f"Options of the {part}", lines))
+    return tables
+
+
+def _plain(value: Any) -> str:
+    """Write an option's value as a settings file does."""
+    if isinstance(value, float):
+        return f"{value:g}"
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def curves_data(entries: Sequence[EntryView]) -> list[dict[str, Any]]:

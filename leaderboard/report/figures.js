@@ -51,8 +51,9 @@
       const tone = color(`c${place % 7}`);
       const [low, middle, high] = entry.band.map((band) => unpack(band, entry).slice(0, length));
       const common = { type: "scatter", mode: "lines", hoverinfo: "skip" };
+      const crowd = shown.size > 2; // overlapping bands turn gray: then their edges say more than their fill
       traces.push({ ...common, x: [...x, ...x.slice().reverse()], y: [...high, ...low.slice().reverse()],
-        fill: "toself", fillcolor: faint(tone, 0.13), line: { width: 0 } });
+        fill: "toself", fillcolor: faint(tone, crowd ? 0.06 : 0.13), line: { color: faint(tone, 0.4), width: crowd ? 0.8 : 0 } });
       if (singles) {
         const all = unpack(entry.single, entry);
         const [xs, ys] = [[], []];
@@ -141,9 +142,12 @@
       legend.append(element("label", {}, box, swatch, element("span", {}, data.entries[section.entries[place]].label)));
     });
     singles.addEventListener("change", draw);
-    const save = element("button", { type: "button" }, "Save as SVG");
-    save.addEventListener("click", () => window.Plotly.downloadImage(curves, { format: "svg", filename: `curves-${number + 1}` }));
-    legend.append(element("label", { class: "push" }, singles, "Single runs"), save);
+    legend.append(element("label", { class: "push" }, singles, "Single runs"));
+    for (const [node, kind] of [[curves, "curves"], [bars, "bars"]]) {
+      const save = node.closest("figure").querySelector(".save");
+      save.addEventListener("click", () => window.Plotly.downloadImage(node, { format: "svg", filename: `${kind}-${number + 1}` }));
+      save.hidden = false;
+    }
     const thin = section.entries.map((index) => data.entries[index]).find((entry) => entry.kept < entry.runs);
     if (thin) {
       curves.closest("figure").querySelector(".thinned").textContent =

@@ -20,7 +20,7 @@
       return select;
     };
     const [first, second] = [choice("First entry"), choice("Second entry")];
-    const result = element("div", { "aria-live": "polite" });
+    const result = element("div", { class: "result", "aria-live": "polite" });
     panel.append(element("div", { class: "choice" }, first, "against", second), result);
 
     const show = () => {
@@ -29,7 +29,7 @@
       const index = section.pairs.findIndex(([i, j]) => i === Math.min(a, b) && j === Math.max(a, b));
       if (index < 0) return result.replaceChildren(element("p", { class: "note" }, "Choose two different entries."));
       const [i, , runs, cells] = section.pairs[index];
-      const words = section.words[index][a === i ? 0 : 1];
+      const words = matrix.tBodies[0].rows[a].cells[b + 1].title;
       const [one, other] = [a, b].map((place) => section.evidence[`${place}/${runs}`]);
       const interval = (numbers, k) => `${short(numbers.s[k])} (${short(numbers.l[k])} to ${short(numbers.h[k])})`;
       const head = element("tr", {}, element("th", { scope: "col" }, section.levelName));
@@ -47,14 +47,16 @@
         });
         body.append(row);
       });
-      const top = element("tr", {}, element("td"), element("th", { scope: "colgroup", colspan: section.deltas.length }, "delta"));
+      const top = element("tr", {}, element("td"), element("th", { scope: "colgroup", colspan: section.deltas.length }, "δ"));
       const table = element("table", { class: "cells" }, element("thead", {}, top, head), body);
       const unit = section.horizon >= 20000 ? "in thousands of steps" : "in steps";
       return result.replaceChildren(
-        element("p", { class: "verdict" }, `${words[0].toUpperCase()}${words.slice(1)}.`),
         element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Cells of the pair" }, table),
-        element("p", { class: "note" }, `${runs} runs each, ${short(section.horizon)} steps. + significantly fewer samples, ` +
-          `− significantly more, · no significant difference, ^ both at cap. Below the sign: Ŝ of both ${unit}.`),
+        element("div", {},
+          element("p", { class: "verdict" }, `${words[0].toUpperCase()}${words.slice(1)}.`),
+          element("p", { class: "note" }, `${runs} runs each, ${short(section.horizon)} steps. In every cell (ε, δ): ` +
+            "+ significantly fewer samples, − significantly more, · no significant difference, ^ both at cap; " +
+            `below, Ŝ of both ${unit}.`)),
       );
     };
     for (const [a, row] of [...matrix.tBodies[0].rows].entries()) {

@@ -71,6 +71,8 @@ class SectionView:
     bar_names: tuple[str, ...]
     thresholds: tuple[str, ...]
     threshold_name: str
+    threshold_symbol: str
+    framed: bool
     deltas: tuple[str, ...]
     unit: str
     data: dict[str, Any]
@@ -105,6 +107,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
     names = [f"{float(value):g}" for value in grid.epsilons or grid.thresholds]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
+    surfaces = tuple(_surface(judgement.own(place), ranking, unit) for place in range(len(rows)))
     return SectionView(
         id=f"board-{number}",
         number=number,
@@ -118,7 +121,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         matrix=tuple(
             tuple(_matrix_cell(judgement, i, j) for j in range(len(rows))) for i in range(len(rows))
         ),
-        surfaces=tuple(_surface(judgement.own(place), ranking, unit) for place in range(len(rows))),
+        surfaces=surfaces,
         bars=tuple(
             tuple(cell for line in _surface(evidence, ranking, unit) for cell in line)
             for evidence in bar_evidence
@@ -130,6 +133,8 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         ),
         thresholds=tuple(names),
         threshold_name="epsilon" if grid.epsilons else "return",
+        threshold_symbol=_symbol(grid),
+        framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
         unit="thousands of environment steps" if unit == 1000 else "environment steps",
         data=_data(section, judgement, rows, bars, bar_evidence, ranking),
@@ -256,11 +261,10 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "level": level,
         "score": "validation score (received / optimal)" if relative else "validation score",
-        "levelName": "epsilon" if judgement.grid.epsilons else "return",
+        "levelName": _symbol(judgement.grid),
         "levels": [f"{float(value):g}" for value in judgement.grid.epsilons or judgement.grid.thresholds],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],
         "pairs": [[pair.first, pair.second, pair.n_runs, pair.cells] for pair in judgement.pairs],
-        "words": [[pair.words(pair.first), pair.words(pair.second)] for pair in judgement.pairs],
         "evidence": {
             f"{place}/{n_runs}": _numbers(evidence)
             for (place, n_runs), evidence in judgement.evidence.items()

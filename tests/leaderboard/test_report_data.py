@@ -1,0 +1,168 @@
+"""What the report says is what the statistics say, and what it packs can be read again."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite.cli import app
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.board import grid_of, learning_curves
+from qrlsuite.leaderboard.report import encode, entries, ladder, render, words
+from qrlsuite.leaderboard.report.judge import judge
+from qrlsuite.statistics import Outcome, Verdict, compare
+from tests.leaderboard import boards
+
+NAMES = {
+    Verdict.WIN: "+",
+    Verdict.LOSS: "-",
+    Verdict.TIE: ".",
+    Verdict.BOTH_AT_CAP: "^",
+    Verdict.UNDECIDED: "?",
+}
+
+
+def test_pairs_are_those_of_the_statistics() -> None:
+    members = [
+        boards.entry("fast", 100, speed=2),
+        boards.entry("slow", 30, speed=0.4),
+        boards.entry("slower", 25, 120, speed=0.3),
+        boards.entry("few", 8),
+    ]
+    found = judge(members, 200_000)
+    grid = grid_of(members[0].task_file.ranking)
+    for pair in found.pairs:
+        one, other = (learning_curves(members[place]) for place in (pair.first, pair.second))
+        wanted = compare(one, other, grid, horizon=200_000)
+        assert pair.cells == "".join(NAMES[verdict] for row in wanted.verdicts for verdict in row)
+        assert (pair.n_runs, pair.outcome(pair.first)) == (wanted.n_runs, wanted.outcome)
+        np.testing.assert_array_equal(found.evidence[pair.first, pair.n_runs].point, wanted.points[0])
+        np.testing.assert_array_equal(
+            found.evidence[pair.second, pair.n_runs].interval(), wanted.intervals[1]
+        )
+    assert {pair.outcome(0) for pair in found.pairs if pair.first == 0} == {
+        Outcome.OUTPERFORMS,
+        Outcome.UNDECIDED,
+    }
+    assert "^" in found.pair(1, 2).cells
+
+
+def test_a_page_agrees_with_its_board() -> None:
+    board = boards.of([*boards.graded(6), boards.entry("few", 8)])
+    rows = board.sections[0].rows
+    beats = judge([row.entry for row in rows], board.sections[0].horizon).beats()
+    for place, row in enumerate(rows):
+        assert {rows[other].entry.label for other in np.flatnonzero(beats[place])} == set(row.outperforms)
+
+
+def test_a_pair_speaks_from_both_sides() -> None:
+    pair = judge([boards.entry("fast", speed=2), boards.entry("slow", speed=0.5)], 200_000).pairs[0]
+    assert pair.words(0).startswith("outperforms: significantly fewer samples in ")
+    assert pair.words(1).startswith("is outperformed: significantly more samples in ")
+
+
+def test_arcs_that_a_chain_stands_for_are_left_out() -> None:
+    chain = np.triu(np.ones((4, 4), dtype=bool), 1)
+    drawn = ladder.draw(chain, [1, 2, 3, 4])
+    assert [(arc.start, arc.end) for arc in drawn.arcs] == [(0, 1), (1, 2), (2, 3)]
+    assert (drawn.implied, drawn.chains_without_win) == (3, 0)
+
+
+def test_a_chain_without_a_direct_win_is_counted() -> None:
+    beats = np.triu(np.ones((3, 3), dtype=bool), 1)
+    beats[0, 2] = False
+    drawn = ladder.draw(beats, [1, 2, 3])
+    assert (len(drawn.arcs), drawn.implied, drawn.chains_without_win) == (2, 0, 1)
+
+
+def test_a_circle_keeps_all_its_arcs() -> None:
+    circle = np.array([[0, 1, 0, 1], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 0]], dtype=bool)
+    drawn = ladder.draw(circle, [1, 1, 1, 2])
+    assert [(arc.start, arc.end) for arc in drawn.arcs if arc.circle] == [(0, 1), (1, 2), (2, 0)]
+    assert [(arc.start, arc.end) for arc in drawn.arcs if not arc.circle] == [(0, 3)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_packed_curves_read_back(count: int) -> None:
+    values = np.linspace(-3.0, 5.0, count)
+    text = encode.pack(values, -3.0, 5.0)
+    octets = base64.b64decode(text + "AA" * (count % 2))
+    bits = np.unpackbits(np.frombuffer(octets, np.uint8)).reshape(-1, 12)
+    codes = bits @ (1 << np.arange(11, -1, -1))
+    assert len(text) == 2 * count
+    np.testing.assert_allclose(-3.0 + 8.0 * codes[:count] / 4094, values, atol=8 / 4094 / 2)
+
+
+def test_what_is_not_a_number_is_packed_as_missing() -> None:
+    assert encode.pack(np.array([np.nan, 0.0, np.inf]), 0.0, 1.0) == "//AA//"
+
+
+def test_thinned_runs_span_the_last_scores() -> None:
+    curves = np.random.default_rng(0).random((40, 3))
+    kept = encode.thinned(curves, 5)
+    assert kept.shape == (5, 3)
+    assert {kept[:, -1].min(), kept[:, -1].max()} == {curves[:, -1].min(), curves[:, -1].max()}
+
+
+def test_a_large_board_carries_a_selection_of_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(entries, "SINGLE_RUNS", 1000)
+    data = entries.curves_data(entries.views(boards.graded(4)))
+    assert [entry["kept"] for entry in data] == [2] * 4
+    assert sum(len(entry["single"]) for entry in data) <= 2 * 1000
+
+
+@pytest.mark.parametrize("name", boards.HOSTILE)
+def test_nothing_ends_the_data_element(name: str) -> None:
+    text = encode.script_json({"name": encode.clean(name)})
+    assert not set("<>&\u2028\u2029") & set(text)
+    assert json.loads(text)["name"] == encode.clean(name)
+    text.encode("utf-8")
+
+
+def test_names_are_cut_and_lose_what_no_escaping_helps_against() -> None:
+    assert encode.clean("a\u202eb\x1b[31m\u200bc\n d") == "a\ufffdb\ufffd[31m\ufffdc d"
+    assert len(encode.clean("x" * 10_000)) == encode.LONGEST
+
+
+def test_equal_labels_are_told_apart() -> None:
+    twins = [boards.entry("same", 20), boards.entry("same", 21)]
+    named = [dataclasses.replace(twin, name=f"same-{i}") for i, twin in enumerate(twins, 1)]
+    assert [view.label for view in entries.views(named)] == ["same (same-1)", "same (same-2)"]
+
+
+def test_numbers_in_words() -> None:
+    assert [words.short(steps) for steps in (60, 62_000, 58_150, 1_000_000)] == ["60", "62k", "58.15k", "1M"]
+    assert words.ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
+    assert (words.counted(1, "entry"), words.counted(1200, "run")) == ("1 entry", "1,200 runs")
+
+
+def test_the_page_names_no_other_place_but_the_paper() -> None:
+    text = render(boards.of(boards.graded(2)))
+    without_scripts = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert set(re.findall(r"""(?:src|href)=["']?(?!#|data:)([^"'> ]+)""", without_scripts)) == {
+        "https://arxiv.org/abs/2501.15893"
+    }
+    assert "@import" not in without_scripts
+    assert "url(" not in without_scripts
+
+
+def test_an_empty_board_is_still_a_page() -> None:
+    assert "runs/x: damaged" in render(boards.of([], ["runs/x: damaged"]))
+
+
+def test_the_command_writes_a_page(tmp_path: Path, train: Callable[..., Path]) -> None:
+    folder = train("runs", [0], epochs=1).parents[1]
+    result = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--format", "html"])
+    assert (result.exit_code, result.stdout) == (0, f"wrote {folder / 'leaderboard.html'}\n")
+    assert "<h1>Sample complexity leaderboard</h1>" in (folder / "leaderboard.html").read_text()
+    wrong = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--out", "page.html"])
+    assert isinstance(wrong.exception, OptionError)
+    assert "--format html" in str(wrong.exception)
