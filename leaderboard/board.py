@@ -7,18 +7,21 @@ a provisional section of their own length.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.rules import DEFAULT
 from qrlsuite.statistics import (
     MIN_RUNS,
     Comparison,
     Grid,
+    IntervalRule,
     LearningCurves,
+    SignificanceRule,
     at_cap,
     bootstrap_interval,
     bootstrap_interval_at,
@@ -77,6 +80,10 @@ class Leaderboard:
 
     sections: tuple[Section, ...]
     refused: tuple[str, ...]
+    rule: str = DEFAULT
+    """Name of the significance rule that judged."""
+    promise: str = ""
+    """What that rule controls."""
 
 
 def grid_of(ranking: RankingSection) -> Grid:
@@ -91,11 +98,28 @@ def learning_curves(entry: EntryCurves) -> LearningCurves:
     return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
 
 
-def build(entries: Sequence[EntryCurves], refused: Sequence[str] = ()) -> Leaderboard:
+def build(
+    entries: Sequence[EntryCurves], refused: Sequence[str] = (), rule: SignificanceRule | None = None
+) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
     Entries of one task that were made under another definition of it are refused: the majority's stands.
+
+    Parameters
+    ----------
+    entries:
+        Of any tasks.
+    refused:
+        Lines about what could not be read, passed on.
+    rule:
+        What counts as significant, see `qrlsuite.rules.load`; None means the paper's.
+
+    Raises
+    ------
+    PluginError
+        If a plugin's rule fails.
     """
+    chosen = rule or IntervalRule()
     sections: list[Section] = []
     problems = list(refused)
     for task in sorted({entry.task for entry in entries}):
@@ -110,10 +134,12 @@ def build(entries: Sequence[EntryCurves], refused: Sequence[str] = ()) -> Leader
         ]
         for horizon, provisional, group in _by_horizon(good):
             try:
-                sections.append(_section(task, horizon, provisional, group))
+                sections.append(_section(task, horizon, provisional, group, chosen))
+            except PluginError:
+                raise
             except QrlSuiteError as error:
                 problems.append(f"task '{task}' at {horizon} steps: {error}")
-    return Leaderboard(tuple(sections), tuple(problems))
+    return Leaderboard(tuple(sections), tuple(problems), chosen.name, chosen.promise)
 
 
 def _by_horizon(entries: Sequence[EntryCurves]) -> list[tuple[int, bool, list[EntryCurves]]]:
@@ -135,9 +161,15 @@ def _length(entry: EntryCurves) -> int:
     return int(entry.curves.shape[1]) * entry.steps_per_epoch
 
 
-def _section(task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves]) -> Section:
+def _section(
+    task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves], rule: SignificanceRule
+) -> Section:
     ranking = entries[0].task_file.ranking
-    board = outperformance([learning_curves(entry) for entry in entries], grid_of(ranking), horizon=horizon)
+    if getattr(rule, "paired", False):
+        _require_equal_seeds(entries, rule.name)
+    board = outperformance(
+        [learning_curves(entry) for entry in entries], grid_of(ranking), rule, horizon=horizon
+    )
     by_name = {entry.name: entry for entry in entries}
     labels = {entry.name: entry.label for entry in entries}
     wanted = entries[0].task_file.protocol.seeds
@@ -192,20 +224,56 @@ def complexity_at(
     return Complexity(int(steps[0, 0]), low, high, capped, bool(open_end[0, 0]))
 
 
-def compare_entries(first: EntryCurves, second: EntryCurves) -> Comparison:
+def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
+    """Raise OptionError unless all entries have the same seeds, as a paired rule presupposes."""
+    for entry in entries[1:]:
+        if entry.seeds != entries[0].seeds:
+            raise OptionError(
+                f"rule '{rule}' pairs runs of the same seed: '{entries[0].label}' ({len(entries[0].seeds)}) and "
+                f"'{entry.label}' ({len(entry.seeds)}) have different seeds; `qrlsuite compare` pairs those that "
+                "two entries share"
+            )
+
+
+def compare_entries(
+    first: EntryCurves, second: EntryCurves, rule: SignificanceRule | None = None
+) -> Comparison:
     """Compare two entries of one task on its ranking grid.
+
+    Parameters
+    ----------
+    first, second:
+        The entries.
+    rule:
+        What counts as significant; None means the paper's. For a paired rule both are reduced to the seeds that
+        they share.
 
     Raises
     ------
     QrlSuiteError
-        If they belong to different tasks, or their lengths have no common horizon.
+        If they belong to different tasks, their lengths have no common horizon, or a paired rule finds no
+        common seed.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
-    return compare(learning_curves(first), learning_curves(second), grid_of(first.task_file.ranking))
+    if getattr(rule, "paired", False):
+        first, second = _common_seeds(first, second)
+    return compare(learning_curves(first), learning_curves(second), grid_of(first.task_file.ranking), rule)
+
+
+def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:
+    """Return both entries with the runs of the seeds that they share, in one order."""
+    shared = sorted(set(first.seeds) & set(second.seeds))
+    if not shared:
+        raise OptionError(f"'{first.label}' and '{second.label}' share no seed: their runs cannot be paired")
+    one, other = (
+        replace(entry, curves=entry.curves[[entry.seeds.index(seed) for seed in shared]], seeds=tuple(shared))
+        for entry in (first, second)
+    )
+    return one, other
 
 
 def undecided_reason(row: Row) -> str:
@@ -231,6 +299,7 @@ def complexity_text(complexity: Complexity) -> str:
 def as_dict(board: Leaderboard) -> dict[str, Any]:
     """Return a leaderboard as plain values, for JSON."""
     return {
+        "rule": board.rule,
         "sections": [
             {
                 "task": section.task,

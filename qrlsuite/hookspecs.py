@@ -65,7 +65,29 @@ def register_circuit_backends(register: Callable[[specs.CircuitBackendSpec], Non
 
 @hookspec
 def register_significance_tests(register: Callable[[specs.SignificanceTestSpec], None]) -> None:
-    """Register rules that decide whether one entry needs significantly fewer samples than another."""
+    """Register rules that decide whether one entry needs significantly fewer samples than another.
+
+    They appear as `qrlsuite leaderboard --rule NAME`, `compare --rule NAME` and `calibrate --rule NAME`. A rule has
+    a `name`, a `promise` (one sentence: which error probability it controls, and which it does not), and is
+    called with two `qrlsuite.statistics.Evidence` objects, already at equal numbers of runs and one horizon. It
+    returns an array (epsilons, deltas) of +1 where the first needs significantly fewer samples, -1 where it
+    needs more and 0 elsewhere, with `rule(a, b) == -rule(b, a)`::
+
+        class Half:
+            name = "half"
+            promise = "none: whoever needs less than half is declared the winner"
+
+            def __call__(self, first, second):
+                fewer, more = 2 * first.point < second.point, 2 * second.point < first.point
+                return fewer.astype("int8") - more.astype("int8")
+
+        @hookimpl
+        def register_significance_tests(register):
+            register(SignificanceTestSpec(name="half", summary="...", factory="my_package:Half"))
+
+    Equal numbers, the limit of 20 runs, outperformance and ranking hold for every rule. A rule whose attribute
+    `paired` is true is given entries with the same seeds in the same order.
+    """
 
 
 @hookspec

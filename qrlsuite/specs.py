@@ -187,7 +187,14 @@ class CircuitBackendSpec(Spec):
 
 @dataclass(frozen=True, slots=True)
 class SignificanceTestSpec(Spec):
-    """A rule that decides, per (epsilon, delta) cell, whether one entry needs significantly fewer samples."""
+    """A rule that decides, per (epsilon, delta) cell, whether one entry needs significantly fewer samples.
+
+    Attributes
+    ----------
+    factory:
+        Reference to a class or function that, called without arguments, returns a rule: see
+        `qrlsuite.statistics.SignificanceRule`.
+    """
 
     factory: str
 

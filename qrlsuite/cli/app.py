@@ -10,6 +10,14 @@ import typer
 RunsOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")
 ]
+RuleOption = Annotated[
+    str,
+    typer.Option(
+        "--rule",
+        metavar="NAME",
+        help="What counts as significant: qrlsuite list significance-tests; qrlsuite show NAME.",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 

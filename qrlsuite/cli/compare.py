@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite import rules
+from qrlsuite.cli.app import JsonOption, RuleOption, RunsOption
 
 if TYPE_CHECKING:
     from qrlsuite.statistics import Comparison
@@ -24,6 +25,7 @@ SYMBOLS = {
 def compare(
     first: Annotated[str, typer.Argument(metavar="ENTRY", help="An entry's name, or the beginning of it.")],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
+    rule: RuleOption = rules.DEFAULT,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -38,13 +40,15 @@ def compare(
     from qrlsuite.leaderboard import board, collect
 
     one, other = collect.find(runs, first), collect.find(runs, second)
-    comparison = board.compare_entries(one, other)
+    comparison = board.compare_entries(one, other, rules.load(rule))
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))
         return
     _matrix(comparison)
     typer.echo(
-        f"{one.label} against {other.label}, {comparison.n_runs} seeds each, {comparison.horizon} steps:"
+        f"{one.label} against {other.label}, {comparison.n_runs} seeds each, {comparison.horizon} steps"
+        + ("" if rule == rules.DEFAULT else f", rule '{rule}'")
+        + ":"
     )
     typer.echo(comparison.sentence)
 

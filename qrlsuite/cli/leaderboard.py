@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.app import RunsOption
+from qrlsuite import rules
+from qrlsuite.cli.app import RuleOption, RunsOption
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
@@ -32,6 +33,7 @@ def leaderboard(
             "--out", metavar="FILE", help="For html; default: leaderboard.html in the results folder."
         ),
     ] = None,
+    rule: RuleOption = rules.DEFAULT,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Rank the entries of each task by significant outperformance.
@@ -51,7 +53,7 @@ def leaderboard(
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     found, refused = collect.collect(runs, task)
-    board = boards.build(found, refused)
+    board = boards.build(found, refused, rules.load(rule))
     if format_ is Format.json:
         typer.echo(json.dumps(boards.as_dict(board)))
         return
@@ -68,6 +70,8 @@ def leaderboard(
     else:
         for section in board.sections:
             _table(section)
+    if board.rule != rules.DEFAULT and format_ is not Format.html:
+        typer.echo(f"rule '{board.rule}': {board.promise}")
 
 
 def _page(board: Leaderboard, path: Path) -> None:

@@ -128,6 +128,10 @@ def _content(kind: str, name: str) -> dict[str, Any]:
             **task.file.model_dump(mode="json", exclude={"name", "summary"}),
         }
         return content
+    if isinstance(spec, specs.SignificanceTestSpec):
+        from qrlsuite import rules
+
+        content["promises"] = rules.load(name).promise
     for field in dataclasses.fields(spec):
         if field.name == "family":
             content["family"] = getattr(spec, field.name)

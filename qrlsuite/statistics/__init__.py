@@ -37,7 +37,6 @@ from qrlsuite.statistics.estimator import (
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.significance import (
-    BUILT_IN_RULES,
     DifferenceRule,
     Evidence,
     IntervalRule,
@@ -47,7 +46,6 @@ from qrlsuite.statistics.significance import (
 )
 
 __all__ = [
-    "BUILT_IN_RULES",
     "MIN_RUNS",
     "Board",
     "Comparison",

@@ -16,7 +16,7 @@ Two rules are built in:
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -139,7 +139,8 @@ class SignificanceRule(Protocol):
     """A rule for one pair of entries; register one with the hook `register_significance_tests`.
 
     A rule must be antisymmetric: `rule(a, b) == -rule(b, a)`. A rule that can judge one entry against many
-    at once may also have a method `against(first, others) -> (M, E, D)`; boards use it where it exists.
+    at once may also have a method `against(first, others) -> (M, E, D)`; boards use it where it exists. A rule
+    whose attribute `paired` is true takes run i of both entries to belong together.
 
     >>> class HalfRule:
     ...     name = "half"
@@ -294,14 +295,6 @@ class DifferenceRule:
 def paired_difference_rule() -> DifferenceRule:
     """Return `DifferenceRule(paired=True)`, as a factory that a registration can refer to by name."""
     return DifferenceRule(paired=True)
-
-
-BUILT_IN_RULES: dict[str, Callable[[], SignificanceRule]] = {
-    "intervals": IntervalRule,
-    "difference": DifferenceRule,
-    "difference-paired": paired_difference_rule,
-}
-"""The built-in rules by name; each value is called without arguments."""
 
 
 def check_signs(signs: object, shape: tuple[int, ...], rule: SignificanceRule) -> IntArray:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from qrlsuite import rules
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
-    BUILT_IN_RULES,
     MIN_RUNS,
     DifferenceRule,
     Evidence,
@@ -26,13 +26,14 @@ from qrlsuite.statistics import (
     common_horizon,
     compare,
     estimator,
+    paired_difference_rule,
     sample_complexity,
     significance,
 )
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE
 
 CELL = Grid.relative([0.1], [0.5])
-RULES = [make() for make in BUILT_IN_RULES.values()]
+RULES: list[SignificanceRule] = [IntervalRule(), DifferenceRule(), paired_difference_rule()]
 
 
 def learner(
@@ -280,7 +281,8 @@ def test_seeds_decide(wide: LearningCurves, narrow: LearningCurves) -> None:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_built_in_rules_keep_to_the_interface(rule: SignificanceRule) -> None:
     assert isinstance(rule, SignificanceRule)
-    assert BUILT_IN_RULES[rule.name]().name == rule.name
+    assert rules.load(rule.name).name == rule.name
+    assert type(rules.load(rule.name)) is type(rule), "the suite's own rules are not fenced"
     assert rule.promise
 
 

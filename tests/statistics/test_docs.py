@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import qrlsuite.statistics
-from qrlsuite.statistics import BUILT_IN_RULES, Outcome, Verdict
+from qrlsuite import registry
+from qrlsuite.statistics import Outcome, Verdict
 
 PAGE = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
 
@@ -41,7 +42,7 @@ def test_functions_on_the_page_exist(name: str) -> None:
 
 
 def test_rules_verdicts_and_outcomes_are_on_the_page() -> None:
-    for name in (*BUILT_IN_RULES, *Verdict, *Outcome):
+    for name in (*registry.load().names("significance_tests"), *Verdict, *Outcome):
         assert name in PAGE
 
 

@@ -1,0 +1,126 @@
+"""The rules that say which difference in sample complexity is significant: registered, looked up, fenced.
+
+The built-in rules are in `qrlsuite.statistics.significance`, which knows nothing of plugins; they enter here, by
+the same door as anyone's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+from qrlsuite.hookspecs import hookimpl
+from qrlsuite.specs import SignificanceTestSpec
+
+if TYPE_CHECKING:
+    from qrlsuite.statistics import Evidence, SignificanceRule
+    from qrlsuite.statistics.grid import IntArray
+
+DEFAULT = "intervals"
+"""The paper's rule."""
+
+_HERE = "qrlsuite.statistics.significance"
+
+
+@hookimpl
+def register_significance_tests(register: Callable[[SignificanceTestSpec], None]) -> None:
+    """Register the paper's rule and the bootstrap of the difference, unpaired and paired."""
+    register(
+        SignificanceTestSpec(
+            name=DEFAULT,
+            summary="the paper's: 5th to 95th percentile intervals do not overlap; per cell (default)",
+            factory=f"{_HERE}:IntervalRule",
+        )
+    )
+    register(
+        SignificanceTestSpec(
+            name="difference",
+            summary="bootstrap of the difference; error probability 5 percent over a pair's whole grid",
+            factory=f"{_HERE}:DifferenceRule",
+        )
+    )
+    register(
+        SignificanceTestSpec(
+            name="difference-paired",
+            summary="the same, run by run of the same seed: sharper where equal seeds do similarly",
+            factory=f"{_HERE}:paired_difference_rule",
+        )
+    )
+
+
+def load(name: str = DEFAULT) -> SignificanceRule:
+    """Return a registered rule, ready to judge.
+
+    Raises
+    ------
+    UnknownNameError
+        If no rule has the name.
+    PluginError
+        If a plugin's factory raises, or what it returns lacks what a rule must have; the message names the
+        distribution. The rule's later answers are checked in the same way.
+    """
+    from qrlsuite import registry
+    from qrlsuite.errors import PluginError
+    from qrlsuite.specs import resolve
+    from qrlsuite.statistics import SignificanceRule
+
+    registered = registry.load().get("significance_tests", name)
+    spec = cast(SignificanceTestSpec, registered.spec)
+    where = f"significance test '{name}' of distribution '{registered.distribution}'"
+    try:
+        rule = resolve(spec.factory)()
+    except Exception as error:
+        raise PluginError(f"{where}: {spec.factory} fails: {type(error).__name__}: {error}") from error
+    if registered.distribution == "qrlsuite":
+        return cast(SignificanceRule, rule)
+    if not isinstance(rule, SignificanceRule) or not callable(rule):
+        raise PluginError(
+            f"{where}: {type(rule).__name__} is no rule: it needs a name, a promise and "
+            "__call__(first, second), see qrlsuite.statistics.SignificanceRule"
+        )
+    promise = rule.promise
+    if not isinstance(promise, str) or not promise.strip():
+        raise PluginError(f"{where}: its promise must be a sentence, not {promise!r}")
+    return _Fenced(rule, name, promise, where)
+
+
+class _Fenced:
+    """A third party's rule: whatever goes wrong in it is one error that names the distribution.
+
+    Parameters
+    ----------
+    rule:
+        The rule itself.
+    name:
+        Under which it was registered.
+    promise:
+        Its promise.
+    where:
+        What to call it in messages.
+    """
+
+    def __init__(self, rule: SignificanceRule, name: str, promise: str, where: str) -> None:
+        self._rule, self._where = rule, where
+        self.name = name
+        self.promise = promise
+        self.paired = bool(getattr(rule, "paired", False))
+        if hasattr(rule, "against"):  # boards ask for it where it exists
+            self.against = self._against
+
+    def __call__(self, first: Evidence, second: Evidence) -> Any:
+        return self._checked(lambda: self._rule(first, second), first.grid.shape)
+
+    def _against(self, first: Evidence, others: Sequence[Evidence]) -> Any:
+        judge = cast(Any, self._rule).against
+        return self._checked(lambda: judge(first, others), (len(others), *first.grid.shape))
+
+    def _checked(self, judge: Callable[[], Any], shape: tuple[int, ...]) -> IntArray:
+        from qrlsuite.errors import OptionError, PluginError
+        from qrlsuite.statistics.significance import check_signs
+
+        try:
+            return check_signs(judge(), shape, self)
+        except OptionError as error:
+            raise PluginError(f"{self._where}: {error}") from error
+        except Exception as error:
+            raise PluginError(f"{self._where} fails: {type(error).__name__}: {error}") from error
