@@ -161,7 +161,11 @@ def test_an_empty_board_is_still_a_page() -> None:
 def test_the_command_writes_a_page(tmp_path: Path, train: Callable[..., Path]) -> None:
     folder = train("runs", [0], epochs=1).parents[1]
     result = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--format", "html"])
-    assert (result.exit_code, result.stdout) == (0, f"wrote {folder / 'leaderboard.html'}\n")
+    assert (result.exit_code, result.stdout, result.exception) == (
+        0,
+        f"wrote {folder / 'leaderboard.html'}\n",
+        None,
+    )
     assert "<h1>Sample complexity leaderboard</h1>" in (folder / "leaderboard.html").read_text()
     wrong = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--out", "page.html"])
     assert isinstance(wrong.exception, OptionError)

@@ -42,7 +42,7 @@ def test_a_shipped_sized_board_loads_offline_and_is_small(opened: Open) -> None:
 
 def test_the_table_sorts_by_click(opened: Open, page: str) -> None:
     tab = opened(page)
-    assert column(tab, "tier") == sorted(column(tab, "tier")[:-1]) + [""]
+    assert column(tab, "tier") == [*sorted(column(tab, "tier")[:-1]), ""]
     header = tab.locator("#board-0-table th[data-key=steps]")
     header.get_by_role("button").click()
     up = [int(value) for value in column(tab, "steps")]
@@ -57,7 +57,7 @@ def test_the_table_sorts_by_click(opened: Open, page: str) -> None:
 def test_an_undecided_entry_stays_last_whichever_way_tiers_are_sorted(opened: Open, page: str) -> None:
     tab = opened(page)
     tab.locator("#board-0-table th[data-key=tier] button").click()
-    assert column(tab, "tier") == sorted(column(tab, "tier")[:-1], reverse=True) + [""]
+    assert column(tab, "tier") == [*sorted(column(tab, "tier")[:-1], reverse=True), ""]
 
 
 def test_the_table_sorts_by_keyboard(opened: Open, page: str) -> None:
