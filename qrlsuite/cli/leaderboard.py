@@ -107,6 +107,7 @@ def _cells(row: Row) -> tuple[str, ...]:
 def _notes(section: Section) -> list[str]:
     """Explain the marks that occur in a section."""
     from qrlsuite.leaderboard import board as boards
+    from qrlsuite.leaderboard.absent import absent
 
     notes = sorted({boards.undecided_reason(row) for row in section.rows if row.tier is None})
     if any(row.provisional for row in section.rows):
@@ -116,6 +117,9 @@ def _notes(section: Section) -> list[str]:
         notes.append(">= : still below delta at the last epoch; the sample complexity is at least this")
     if any(row.entry.parameters[1] for row in section.rows):
         notes.append("q: quantum parameters")
+    missing = sorted({name for row in section.rows for name in absent(row.entry)})
+    if missing:
+        notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
     return [*notes, "score: median over seeds after the last epoch; hours: core-hours"]
 
 

@@ -1,0 +1,200 @@
+"""A stranger's package: built, installed beside the suite's wheel, used, ranked, and uninstalled again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SUITE = ("pyproject.toml", "README.md", "LICENSE", "qrlsuite", "plugins", "tasks", "leaderboard")
+PIP = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
+
+
+def run(*words: str | Path, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(word) for word in words],
+        cwd=cwd,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert done.returncode == code, f"{words}\n{done.stdout}{done.stderr}"
+    return done
+
+
+class Installation:
+    """A virtual environment with the suite and the package from wheels; heavy packages are borrowed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.python = folder / "venv" / "bin" / "python"
+        run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
+        sources = folder / "sources"
+        junk = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
+        for name in SUITE:
+            copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+            more: dict[str, Any] = {"ignore": junk} if copy is shutil.copytree else {}
+            (sources / "qrlsuite").mkdir(parents=True, exist_ok=True)
+            copy(ROOT / name, sources / "qrlsuite" / name, **more)
+        shutil.copytree(Path(__file__).parent / "acme-qrl", sources / "acme-qrl", ignore=junk)
+        packages = (sources / "qrlsuite", sources / "acme-qrl")
+        wheels = folder / "wheels"
+        run(
+            sys.executable,
+            "-m",
+            "pip",
+            "wheel",
+            *PIP,
+            "--no-build-isolation",
+            "-w",
+            wheels,
+            *packages,
+            cwd=folder,
+        )
+        self.pip("install", *PIP, *wheels.glob("*.whl"))
+        # after pip has run, which would otherwise take the borrowed packages for installed ones
+        site = Path(
+            run(
+                self.python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder
+            ).stdout.strip()
+        )
+        borrowed = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
+        (site / "borrowed.pth").write_text("\n".join(borrowed) + "\n")
+        self.site = site
+
+    def pip(self, *words: str | Path) -> None:
+        run(sys.executable, "-m", "pip", "--python", self.python, *words, cwd=self.folder)
+
+    def qrlsuite(self, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+        return run(self.folder / "venv" / "bin" / "qrlsuite", *words, cwd=self.folder, code=code)
+
+    def listed(self) -> dict[str, set[str]]:
+        """Return the names that are registered by distributions other than the suite, by kind."""
+        found: dict[str, set[str]] = {}
+        for row in json.loads(self.qrlsuite("list", "--json").stdout):
+            if row["distribution"] == "acme-qrl":
+                found.setdefault(row["kind"], set()).add(row["name"])
+        return found
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    return Installation(tmp_path_factory.mktemp("stranger"))
+
+
+def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Installation) -> None:
+    found = run(
+        installed.python, "-P", "-c", "import qrlsuite; print(qrlsuite.__file__)", cwd=installed.folder
+    )
+    assert Path(found.stdout.strip()).is_relative_to(installed.site), "the suite must come from its wheel"
+    assert installed.listed() == {
+        "ansatzes": {"rzz-ring"},
+        "circuit_backends": {"damped"},
+        "environments": {"channel-hop"},
+        "models": {"fourier", "vqc-damped"},
+        "significance_tests": {"half"},
+        "tasks": {"channel-hop"},
+    }
+    assert installed.qrlsuite("rzz-cost", "--qubits", "3", "--layers", "2").stdout == "12\n"
+    assert "RZZ" in installed.qrlsuite("show", "ansatz", "rzz-ring", "--qubits", "3").stdout
+
+
+def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
+    installed.qrlsuite("new", "plugin", "acme-next", "--kind", "model")
+    assert (installed.folder / "acme-next" / "src" / "acme_next" / "model.py").exists()
+
+
+def test_it_passes_the_checks(installed: Installation) -> None:
+    """Its own test file, as its author runs it: every kind in it."""
+    tests = Path(__file__).parent / "acme-qrl" / "tests"
+    shutil.copytree(tests, installed.folder / "tests")
+    words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
+    assert "8 passed" in run(*words, cwd=installed.folder).stdout
+
+
+TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
+
+
+@pytest.mark.parametrize("model", ["vqc-pennylane", "vqc-damped"])
+def test_its_circuit_is_trained_on_its_task(installed: Installation, model: str) -> None:
+    words = (
+        "run",
+        "--task",
+        "channel-hop",
+        "--model",
+        model,
+        "--set",
+        "ansatz=rzz-ring",
+        "--set",
+        "qubits=2",
+    )
+    done = installed.qrlsuite(*words, "--set", "layers=1", *TINY, "--runs", "circuits", "--json")
+    summary = json.loads(done.stdout)
+    assert summary["seeds"] == 1
+    assert "ansatz=rzz-ring" in summary["label"]
+
+
+def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> None:
+    words = (
+        "run",
+        "--task",
+        "beam6g",
+        "--model",
+        "vqc-native",
+        "--set",
+        "ansatz=rzz-ring",
+        "--set",
+        "qubits=2",
+    )
+    done = installed.qrlsuite(*words, *TINY, "--runs", "circuits", "--json")
+    record = json.loads(
+        (Path(installed.folder, json.loads(done.stdout)["folder"]) / "seed-0000" / "run.json").read_text()
+    )
+    assert record["provenance"][0]["versions"]["qrlsuite"]
+
+
+def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Installation) -> None:
+    budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "runs")
+    for model in ("fourier", "mlp"):
+        installed.qrlsuite("run", "--task", "channel-hop", "--model", model, *budget)
+
+    def board() -> dict[str, Any]:
+        out = installed.qrlsuite("leaderboard", "--runs", "runs", "--format", "json").stdout
+        (section,) = json.loads(out)["sections"]
+        return {row["label"]: row for row in section["rows"]}
+
+    before = board()
+    assert set(before) == {"ddqn fourier features=24", "ddqn mlp width=64"}
+    assert {row["tier"] for row in before.values()} <= {1, 2}  # decided: 20 seeds each
+    assert "not installed" not in installed.qrlsuite("leaderboard", "--runs", "runs").stdout
+
+    installed.pip("uninstall", "--yes", "--quiet", "acme-qrl")
+    assert installed.listed() == {}
+    assert board() == before
+    table = " ".join(installed.qrlsuite("leaderboard", "--runs", "runs").stdout.split())
+    assert (
+        "not installed here: environment 'channel-hop', model 'fourier'; ranked from the stored curves"
+        in table
+    )
+    circuits = installed.qrlsuite("leaderboard", "--runs", "circuits", "--format", "markdown").stdout
+    assert "ansatz 'rzz-ring'" in circuits
+    assert "fourier" in installed.qrlsuite("runs", "--runs", "runs").stdout
+    compared = installed.qrlsuite("compare", "fourier", "mlp", "--runs", "runs").stdout
+    assert "fourier" in compared
+
+    gone = installed.qrlsuite("run", "--task", "channel-hop", "--model", "fourier", "--runs", "runs", code=2)
+    assert "unknown task 'channel-hop'" in gone.stderr
+    gone = installed.qrlsuite("run", "--task", "beam6g", "--model", "fourier", "--runs", "runs", code=2)
+    assert "unknown model 'fourier'" in gone.stderr
+    installed.qrlsuite("run", "--task", "cartpole", "--model", "mlp", *TINY, "--runs", "others")
