@@ -54,6 +54,14 @@ def register_tasks(register: Callable[[specs.TaskSpec], None]) -> None:
 
 
 @hookspec
+def register_studies(register: Callable[[specs.StudySpec], None]) -> None:
+    """Register studies: `register(StudySpec(name=..., summary=..., path=".../my-study.toml"))`.
+
+    They appear as `qrlsuite study run NAME`.
+    """
+
+
+@hookspec
 def register_ansatzes(register: Callable[[specs.AnsatzSpec], None]) -> None:
     """Register circuit families: they appear as `--set ansatz=NAME` of every `vqc-*` model."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import pydantic
 
@@ -101,6 +101,40 @@ def validation_lines(error: pydantic.ValidationError) -> list[str]:
         message = str(item["msg"]).removeprefix("Value error, ")
         lines.append(f"{path}{shown}: {message}" if path else message)
     return lines
+
+
+def file_problems(error: pydantic.ValidationError, model: type[pydantic.BaseModel]) -> list[str]:
+    """Turn the error of a whole file into lines with paths, and the nearest known key for each unknown one.
+
+    Parameters
+    ----------
+    model:
+        What the file was validated as.
+    """
+    lines = []
+    for item, line in zip(error.errors(include_url=False), validation_lines(error)):
+        path = [str(part) for part in item["loc"]]
+        if item["type"] == "extra_forbidden":
+            *parents, key = path
+            where = f" in [{'.'.join(parents)}]" if parents else ""
+            lines.append(f"unknown key '{key}'{where}{nearest(key, _keys(model, parents))}")
+        elif item["type"] == "missing":
+            lines.append(f"missing key '{'.'.join(path)}'")
+        else:
+            lines.append(line)
+    return lines
+
+
+def _keys(model: Any, path: Sequence[str]) -> list[str]:
+    """Return the known keys of a (nested) section of a file; `path` may lead through lists and optional sections."""
+    for part in path:
+        if part.isdecimal():
+            continue
+        info = getattr(model, "model_fields", {}).get(part)
+        model = info.annotation if info is not None else None
+        while arguments := [each for each in get_args(model) if each is not type(None)]:
+            model = arguments[-1] if get_origin(model) is dict else arguments[0]
+    return list(getattr(model, "model_fields", {}))
 
 
 def _short(value: Any) -> str:

@@ -28,10 +28,11 @@ KINDS: dict[str, type[specs.Spec]] = {
     "circuit_backends": specs.CircuitBackendSpec,
     "significance_tests": specs.SignificanceTestSpec,
     "engines": specs.EngineSpec,
+    "studies": specs.StudySpec,
 }
 """Kinds of registered things, in the plural: hook `register_<kind>`, and the spec that it takes."""
 
-SINGULAR = {kind: kind[:-2] if kind == "ansatzes" else kind[:-1] for kind in KINDS}
+SINGULAR = {kind: kind[:-1] for kind in KINDS} | {"ansatzes": "ansatz", "studies": "study"}
 
 
 class PluginWarning(UserWarning):
@@ -198,6 +199,11 @@ def algorithm(name: str) -> specs.AlgorithmSpec:
 def task(name: str) -> specs.TaskSpec:
     """Look up a task by name."""
     return cast(specs.TaskSpec, load().get("tasks", name).spec)
+
+
+def study(name: str) -> specs.StudySpec:
+    """Look up a study by name."""
+    return cast(specs.StudySpec, load().get("studies", name).spec)
 
 
 def ansatz(name: str) -> specs.AnsatzSpec:

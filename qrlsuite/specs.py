@@ -162,6 +162,22 @@ class TaskSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
+class StudySpec(Spec):
+    """A study: entries and their pictures, for `qrlsuite study run NAME`.
+
+    Attributes
+    ----------
+    path:
+        Its TOML file (see `qrlsuite.study`).
+    speeds:
+        A TOML file of reference speeds (see `qrlsuite.speed`), for estimates before anything was measured.
+    """
+
+    path: str
+    speeds: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class AnsatzSpec(Spec):
     """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`."""
 

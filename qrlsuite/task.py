@@ -255,7 +255,7 @@ def parse(text: str, source: str) -> Task:
     try:
         file = TaskFile.model_validate(data)
     except pydantic.ValidationError as error:
-        raise TaskError(f"{source}: " + "; ".join(_lines(error, data))) from None
+        raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, TaskFile))) from None
     return Task(file, source)
 
 
@@ -283,27 +283,3 @@ def load(name: str) -> Task:
     except (OSError, UnicodeDecodeError) as error:
         raise TaskError(f"task file {path} cannot be read: {error}") from None
     return parse(text, path.name)
-
-
-def _lines(error: pydantic.ValidationError, data: dict[str, Any]) -> list[str]:
-    """Validation lines, with the nearest known key for each unknown one."""
-    lines = []
-    for item, line in zip(error.errors(include_url=False), options.validation_lines(error)):
-        if item["type"] == "extra_forbidden":
-            *parents, key = (str(part) for part in item["loc"])
-            where = f" in [{'.'.join(parents)}]" if parents else ""
-            lines.append(f"unknown key '{key}'{where}{nearest(key, _keys(parents))}")
-        elif item["type"] == "missing":
-            lines.append(f"missing key '{'.'.join(str(part) for part in item['loc'])}'")
-        else:
-            lines.append(line)
-    return lines
-
-
-def _keys(path: list[str]) -> list[str]:
-    """Known keys of a (nested) section of the task file."""
-    model: Any = TaskFile
-    for part in path:
-        info = getattr(model, "model_fields", {}).get(part)
-        model = info.annotation if info is not None else None
-    return list(getattr(model, "model_fields", {}))

@@ -1,4 +1,4 @@
-"""The built-in tasks: one TOML file each, beside this module."""
+"""The built-in tasks, one TOML file each beside this module, and the built-in studies in `studies/`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.specs import TaskSpec
+from qrlsuite.specs import StudySpec, TaskSpec
 
 
 @hookimpl
@@ -16,3 +16,13 @@ def register_tasks(register: Callable[[TaskSpec], None]) -> None:
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         head = tomllib.loads(path.read_text(encoding="utf-8"))
         register(TaskSpec(name=head["name"], summary=head["summary"], path=str(path)))
+
+
+@hookimpl
+def register_studies(register: Callable[[StudySpec], None]) -> None:
+    """Register every TOML file of `studies/`, with the speeds measured for their entries."""
+    folder = Path(__file__).parent
+    speeds = str(folder / "speeds" / "reference.toml")
+    for path in sorted((folder / "studies").glob("*.toml")):
+        head = tomllib.loads(path.read_text(encoding="utf-8"))
+        register(StudySpec(name=head["name"], summary=head["summary"], path=str(path), speeds=speeds))

@@ -35,6 +35,7 @@ def build() -> typer.Typer:
         runs,
         show,
         status,
+        study,
     )
 
     app = typer.Typer(
@@ -60,6 +61,7 @@ def build() -> typer.Typer:
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
+    app.add_typer(study.app, name="study")
     app.add_typer(new.app, name="new")
 
     @app.callback()

@@ -1,0 +1,176 @@
+"""The pictures of a study, drawn from whatever of its entries a results folder holds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qrlsuite import options, specs
+from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.collect import EntryCurves, read_entry
+from qrlsuite.preset import TUNING_SEEDS
+from qrlsuite.store import EntryStore
+from qrlsuite.study import Member, PictureSection, Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A picture of a study, or why there is none.
+
+    Attributes
+    ----------
+    seeds:
+        Seeds that each point rests on: (task, label, number) in the study's order, 0 where nothing is there yet.
+    figure:
+        None where the picture cannot be drawn of what is there.
+    problem:
+        Then the reason.
+    """
+
+    name: str
+    kind: str
+    seeds: tuple[tuple[str, str, int], ...]
+    figure: Figure | None = None
+    problem: str = ""
+
+
+def check(study: Study) -> None:
+    """Check that a study's pictures exist and take its settings.
+
+    Raises
+    ------
+    UnknownNameError, OptionError
+        If a picture is unknown, or a setting is unknown or has a bad value.
+    """
+    for place, picture in enumerate(study.file.pictures):
+        where = f"{study.source}: pictures.{place}"
+        if picture.kind not in pictures.KINDS:
+            raise UnknownNameError(
+                f"{where}.kind: unknown picture '{picture.kind}'{nearest(picture.kind, pictures.KINDS)}"
+            )
+        kind = pictures.KINDS[picture.kind]
+        options.build(specs.resolve(kind.options), picture.settings, f"{where}.settings")
+        if kind.of == "nothing" and picture.entries:
+            raise OptionError(f"{where}.entries: picture '{picture.kind}' shows no entries")
+        if (picture.evaluation is not None) != (kind.of == "episodes"):
+            rule = "needs" if kind.of == "episodes" else "takes no"
+            raise OptionError(f"{where}.evaluation: picture '{picture.kind}' {rule} evaluation")
+
+
+def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
+    """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
+
+    Raises
+    ------
+    StoreError
+        If an entry's folder is damaged.
+    """
+    found = {}
+    for member in members:
+        store = EntryStore.find(runs, member.entry)
+        if member.entry.name in found or not (store.path / "entry.json").exists():
+            continue
+        curves = read_entry(store)
+        if curves is None:
+            continue
+        kept = [seed < TUNING_SEEDS for seed in curves.seeds]
+        if any(kept):
+            found[member.entry.name] = dataclasses.replace(
+                curves,
+                curves=curves.curves[np.array(kept)],
+                seeds=tuple(seed for seed in curves.seeds if seed < TUNING_SEEDS),
+            )
+    return found
+
+
+def draw(
+    study: Study,
+    members: Sequence[Member],
+    runs: Path,
+    report: Report | None = None,
+) -> list[Drawn]:
+    """Draw every picture of a study from what is there.
+
+    Parameters
+    ----------
+    report:
+        Told of the progress of episodes that a picture needs: policy, played, total.
+
+    Raises
+    ------
+    StoreError
+        If an entry's folder is damaged.
+    """
+    check(study)
+    there = read(runs, members)
+    drawn = []
+    for picture in study.file.pictures:
+        shown = [m for m in members if not picture.entries or m.group in picture.entries]
+        unique = {member.entry.name: member for member in shown}
+        seeds = tuple(
+            (m.entry.task.name, m.entry.label, len(there[name].seeds) if name in there else 0)
+            for name, m in unique.items()
+        )
+        entries = [there[name] for name in unique if name in there]
+        kind = pictures.KINDS[picture.kind]
+        if kind.of == "nothing":
+            drawn.append(
+                Drawn(picture.name, picture.kind, (), pictures.draw(picture.kind, **picture.settings))
+            )
+        elif not entries:
+            drawn.append(Drawn(picture.name, picture.kind, seeds, None, "nothing is trained yet"))
+        else:
+            drawn.append(_attempt(picture, entries, seeds, report))
+    return drawn
+
+
+def _attempt(
+    picture: PictureSection,
+    entries: Sequence[EntryCurves],
+    seeds: tuple[tuple[str, str, int], ...],
+    report: Report | None,
+) -> Drawn:
+    """Draw one picture; what is there may not suffice for it."""
+    try:
+        if pictures.KINDS[picture.kind].of == "episodes":
+            figure = _episodes(picture, entries, report)
+        else:
+            figure = pictures.draw(picture.kind, entries, **picture.settings)
+    except QrlSuiteError as error:
+        return Drawn(picture.name, picture.kind, seeds, None, str(error))
+    return Drawn(picture.name, picture.kind, seeds, figure)
+
+
+def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
+    """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
+    from qrlsuite import evaluation
+
+    tasks = {entry.task_hash for entry in entries}
+    if len(tasks) > 1 or picture.evaluation is None:
+        raise OptionError(f"picture '{picture.kind}' shows entries of one task")
+    best, episodes = picture.evaluation.best, picture.evaluation.episodes
+    stores = [EntryStore(entry.folder) for entry in entries]
+    more: Mapping[str, Any] = {} if report is None else {"report": report}
+    played = [evaluation.trained(store, best, episodes, **more) for store in stores]
+    played += evaluation.references(stores[0].entry(), episodes, **more)
+    values = {each.name: each.returns if each.seeds else each.returns[0] for each in played}
+    chosen = min(len(each.seeds) for each in played if each.seeds)
+    settings = {
+        "quantity": "sum of rewards over an episode",
+        "title": entries[0].task,
+        "note": f"agents: the {chosen} best runs by last validation score; episodes: fresh, the same for all policies",
+        **picture.settings,
+    }
+    histogram: Callable[..., Figure] = specs.resolve(f"{pictures.KINDS[picture.kind].module}:draw")
+    return histogram(values, **settings)
