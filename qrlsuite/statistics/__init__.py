@@ -22,6 +22,7 @@ from qrlsuite.statistics.calibration import (
     board_false_winners,
     false_winners,
     power,
+    slower,
     split_halves,
 )
 from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
@@ -78,6 +79,7 @@ __all__ = [
     "rank",
     "sample_complexity",
     "sample_complexity_at",
+    "slower",
     "split_halves",
     "unsettled",
     "unsettled_at",

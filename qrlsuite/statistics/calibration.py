@@ -13,7 +13,7 @@ Rates are reported per cell, per grid (any cell of a pair; and: a pair with an o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,11 +144,13 @@ def split_halves(
     n_splits: int = 100,
     seed: int = 0,
     resampling: Resampling | None = None,
+    tick: Callable[[], object] | None = None,
 ) -> Rates:
     """Compare random halves of one entry's runs; every declared winner is false.
 
     Splits of one entry share its runs, so `Rates.winner_error` does not apply: run this on several entries
-    and quote the spread over them. With an odd number of runs one is left out of each split.
+    and quote the spread over them. With an odd number of runs one is left out of each split. `tick` is called
+    after every pair, here and below.
 
     Raises
     ------
@@ -159,12 +161,15 @@ def split_halves(
     if half < 1:
         raise OptionError(f"'{entry.name}' has a single run: it has no halves")
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
-    pairs = []
-    for _ in range(whole(n_splits, "n_splits", at_least=1)):
-        order = generator.permutation(entry.n_runs)
-        sides = [entry.values[order[:half]], entry.values[order[half : 2 * half]]]
-        pairs.append([LearningCurves(side, entry.steps_per_epoch, entry.name) for side in sides])
-    return _rates(pairs, grid, rule, resampling)
+    splits = whole(n_splits, "n_splits", at_least=1)
+
+    def pairs() -> Iterator[Sequence[LearningCurves]]:
+        for _ in range(splits):
+            order = generator.permutation(entry.n_runs)
+            sides = [entry.values[order[:half]], entry.values[order[half : 2 * half]]]
+            yield [LearningCurves(side, entry.steps_per_epoch, entry.name) for side in sides]
+
+    return _rates(pairs(), (half, half), grid, rule, resampling, tick)
 
 
 def false_winners(
@@ -176,6 +181,7 @@ def false_winners(
     n_pairs: int = 200,
     seed: int = 0,
     resampling: Resampling | None = None,
+    tick: Callable[[], object] | None = None,
 ) -> Rates:
     """Compare pairs of entries drawn from one model; every declared winner is false.
 
@@ -186,7 +192,7 @@ def false_winners(
     OptionError
         If an argument is out of its range.
     """
-    return power(model, model, n_first, n_second, grid, rule, n_pairs, seed, resampling)
+    return power(model, model, n_first, n_second, grid, rule, n_pairs, seed, resampling, tick)
 
 
 def power(
@@ -199,6 +205,7 @@ def power(
     n_pairs: int = 200,
     seed: int = 0,
     resampling: Resampling | None = None,
+    tick: Callable[[], object] | None = None,
 ) -> Rates:
     """Compare pairs drawn from two models: `Rates.first_wins` is the chance to find that the first is better.
 
@@ -213,11 +220,11 @@ def power(
             f"{second.entry.horizon}: cut them to one horizon"
         )
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
-    pairs = [
+    pairs = (
         [first.draw(n_first, generator), second.draw(n_second, generator)]
         for _ in range(whole(n_pairs, "n_pairs", at_least=1))
-    ]
-    return _rates(pairs, grid, rule, resampling)
+    )
+    return _rates(pairs, (n_first, n_second), grid, rule, resampling, tick)
 
 
 def board_false_winners(
@@ -228,6 +235,7 @@ def board_false_winners(
     n_boards: int = 50,
     seed: int = 0,
     resampling: Resampling | None = None,
+    tick: Callable[[], object] | None = None,
 ) -> float:
     """Return the fraction of boards on which any entry outperforms another, though all are equal.
 
@@ -243,6 +251,8 @@ def board_false_winners(
         Simulated boards.
     seed:
         Of the simulation.
+    tick:
+        Called after every board.
 
     Raises
     ------
@@ -255,27 +265,54 @@ def board_false_winners(
     for _ in range(boards):
         entries = [model.draw(count, generator) for count in n_runs]
         found += bool(outperformance(entries, grid, rule, resampling).outperforms.any())
+        if tick is not None:
+            tick()
     return found / boards
 
 
+def slower(entry: LearningCurves, factor: float) -> LearningCurves:
+    """Return runs that take `factor` >= 1 times as long to get as far: an entry known to be worse, for `power`.
+
+    A run's value after epoch t is the original's after epoch t / factor, between epochs interpolated linearly,
+    before the first the first.
+
+    Raises
+    ------
+    OptionError
+        If the factor is below 1.
+    """
+    if not 1 <= factor < np.inf:
+        raise OptionError(f"factor = {factor!r} is not a finite number >= 1")
+    epochs = np.arange(1, entry.values.shape[1] + 1)
+    values = np.array([np.interp(epochs / factor, epochs, run) for run in entry.values])
+    return LearningCurves(values, entry.steps_per_epoch, f"{entry.name}, {factor:g} times slower")
+
+
 def _rates(
-    pairs: Sequence[Sequence[LearningCurves]],
+    pairs: Iterable[Sequence[LearningCurves]],
+    n_runs: tuple[int, int],
     grid: Grid,
     rule: SignificanceRule | None,
     resampling: Resampling | None,
+    tick: Callable[[], object] | None,
 ) -> Rates:
     chosen = rule or IntervalRule()
-    signs = np.stack([_signs(pair, grid, chosen, resampling) for pair in pairs])
+    judged = []
+    for pair in pairs:
+        judged.append(_signs(pair, grid, chosen, resampling))
+        if tick is not None:
+            tick()
+    signs = np.stack(judged)
     outcomes = [overall(int((each > 0).sum()), int((each < 0).sum())) for each in signs]
     return Rates(
         rule=chosen.name,
-        n_runs=(pairs[0][0].n_runs, pairs[0][1].n_runs),
-        n_pairs=len(pairs),
+        n_runs=n_runs,
+        n_pairs=len(judged),
         fewer=(signs > 0).mean(axis=0),
         more=(signs < 0).mean(axis=0),
         any_cell=float((signs != 0).any(axis=(1, 2)).mean()),
-        first_wins=outcomes.count(Outcome.OUTPERFORMS) / len(pairs),
-        second_wins=outcomes.count(Outcome.OUTPERFORMED) / len(pairs),
+        first_wins=outcomes.count(Outcome.OUTPERFORMS) / len(judged),
+        second_wins=outcomes.count(Outcome.OUTPERFORMED) / len(judged),
     )
 
 
