@@ -24,6 +24,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
     from qrlsuite.cli import (
+        calibrate,
         compare,
         evaluate,
         import_,
@@ -57,6 +58,7 @@ def build() -> typer.Typer:
     app.command("leaderboard")(leaderboard.leaderboard)
     app.command("compare")(compare.compare)
     app.command("plot", cls=plot.Command)(plot.plot)
+    app.command("calibrate")(calibrate.calibrate)
     app.command("evaluate")(evaluate.evaluate)
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)

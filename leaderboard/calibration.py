@@ -1,0 +1,251 @@
+"""How often a significance rule errs on given entries: what is simulated, how long that takes, what came out.
+
+The measures themselves are in `qrlsuite.statistics.calibration`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from qrlsuite.statistics import (
+    Grid,
+    LearningCurves,
+    Rates,
+    SignificanceRule,
+    SmoothedRuns,
+    board_false_winners,
+    false_winners,
+    power,
+    slower,
+    split_halves,
+)
+
+Part = Literal["halves", "pairs", "boards", "power"]
+PARTS: tuple[Part, ...] = ("halves", "pairs", "boards", "power")
+NUMBERS = ((100, 100), (20, 20), (30, 100))
+"""Seeds of the two entries of a simulated pair."""
+FACTORS = (1.1, 1.25, 1.5)
+"""How much longer the worse entry takes, for power."""
+BOARD = 5
+"""Entries of a simulated board."""
+HALF_LEAST = 2
+"""Seeds that a half must have."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the result.
+
+    Attributes
+    ----------
+    part:
+        `halves`, `pairs`, `boards` or `power`.
+    entry, rule:
+        What was judged, by which rule.
+    n_runs:
+        Seeds of the first and the second entry, or of each entry of a board.
+    draws:
+        Simulated pairs or boards.
+    winner:
+        Fraction with a winner; for power: in which the better entry was found to be better.
+    cell_mean, cell_worst, any_cell:
+        Fraction of pairs with a significant difference in a cell (mean and largest over the cells), in any cell;
+        None for boards.
+    factor:
+        For power: how much longer the worse entry takes.
+    """
+
+    part: Part
+    entry: str
+    rule: str
+    n_runs: tuple[int, int]
+    draws: int
+    winner: float
+    cell_mean: float | None = None
+    cell_worst: float | None = None
+    any_cell: float | None = None
+    factor: float | None = None
+
+    @property
+    def error(self) -> float:
+        """Monte-Carlo standard error of `winner`, for independent draws; never below that of one in `draws`."""
+        rate = min(max(self.winner, 1 / self.draws), 1 - 1 / self.draws) if self.draws > 1 else 0.5
+        return float((rate * (1 - rate) / self.draws) ** 0.5)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            "part": self.part,
+            "entry": self.entry,
+            "rule": self.rule,
+            "seeds": list(self.n_runs),
+            "draws": self.draws,
+            "winner": self.winner,
+            # splits of one entry share its runs
+            "standard_error": None if self.part == "halves" else self.error,
+            "cell_mean": self.cell_mean,
+            "cell_worst": self.cell_worst,
+            "any_cell": self.any_cell,
+            "factor": self.factor,
+        }
+
+
+@dataclass(frozen=True)
+class Job:
+    """One line to be computed.
+
+    Attributes
+    ----------
+    part, entry, rule:
+        As in `Finding`.
+    draws:
+        Pairs or boards to be simulated.
+    measure:
+        Called with a number of draws and a function to be called after each.
+    """
+
+    part: Part
+    entry: str
+    rule: str
+    draws: int
+    measure: Callable[[int, Callable[[], object] | None], Finding]
+
+    def run(self, tick: Callable[[], object] | None = None) -> Finding:
+        """Compute the line."""
+        return self.measure(self.draws, tick)
+
+
+def plan(
+    entries: Sequence[LearningCurves],
+    grid: Grid,
+    rules: Sequence[SignificanceRule],
+    draws: int,
+    parts: Sequence[Part] = PARTS,
+    numbers: Sequence[tuple[int, int]] = NUMBERS,
+    board: int = BOARD,
+    jitter: float = 0.3,
+) -> list[Job]:
+    """Return what there is to compute, part by part.
+
+    Parameters
+    ----------
+    entries:
+        Entries of one task, cut to one horizon, with two runs or more.
+    grid:
+        The task's ranking grid.
+    rules:
+        The rules that judge. A paired rule is not asked at unequal numbers of seeds.
+    draws:
+        Splits and simulated pairs per line; a quarter of that for boards.
+    parts:
+        Which parts.
+    numbers:
+        Seeds of the two entries of a pair.
+    board:
+        Entries of a board.
+    jitter:
+        Of `qrlsuite.statistics.SmoothedRuns`.
+    """
+    bounds = (0.0, 1.0) if grid.epsilons is not None else None
+    models = [SmoothedRuns(entry, jitter, bounds) for entry in entries]
+    seeds = numbers[0][0]
+    jobs: list[Job] = []
+    if "halves" in parts:
+        real = [entry for entry in entries if entry.n_runs // 2 >= HALF_LEAST]
+        jobs += [_halves(entry, grid, rule, draws) for entry in real for rule in rules]
+    if "pairs" in parts:
+        jobs += [
+            _pairs(model, pair, grid, rule, draws)
+            for model in models
+            for pair in numbers
+            for rule in rules
+            if pair[0] == pair[1] or not getattr(rule, "paired", False)
+        ]
+    if "boards" in parts:
+        jobs += [
+            _boards(model, board, seeds, grid, rule, max(1, draws // 4)) for model in models for rule in rules
+        ]
+    if "power" in parts:
+        for model in models:
+            for factor in FACTORS:
+                other = SmoothedRuns(slower(model.entry, factor), jitter, bounds)
+                jobs += [_power(model, other, factor, seeds, grid, rule, draws) for rule in rules]
+    return jobs
+
+
+def estimate(jobs: Sequence[Job]) -> float:
+    """Return the seconds that the jobs will take: a draw of one job of each part and rule is timed.
+
+    The first draw of each is done twice and not counted once, so that what is prepared once is not multiplied.
+    """
+    seconds: dict[tuple[str, str], float] = {}
+    for job in jobs:
+        key = (job.part, job.rule)
+        if key not in seconds:
+            ticks = [time.perf_counter()]
+            job.measure(3, lambda ticks=ticks: ticks.append(time.perf_counter()))  # type: ignore[misc]
+            seconds[key] = (ticks[-1] - ticks[1]) / 2
+    return sum(job.draws * seconds[job.part, job.rule] for job in jobs)
+
+
+def _of_pairs(part: Part, entry: str, rates: Rates, winner: float, factor: float | None = None) -> Finding:
+    cells = rates.per_cell
+    return Finding(
+        part=part,
+        entry=entry,
+        rule=rates.rule,
+        n_runs=rates.n_runs,
+        draws=rates.n_pairs,
+        winner=winner,
+        cell_mean=float(cells.mean()),
+        cell_worst=float(cells.max()),
+        any_cell=rates.any_cell,
+        factor=factor,
+    )
+
+
+def _halves(entry: LearningCurves, grid: Grid, rule: SignificanceRule, draws: int) -> Job:
+    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+        rates = split_halves(entry, grid, rule, count, tick=tick)
+        return _of_pairs("halves", entry.name, rates, rates.winner)
+
+    return Job("halves", entry.name, rule.name, draws, measure)
+
+
+def _pairs(
+    model: SmoothedRuns, n_runs: tuple[int, int], grid: Grid, rule: SignificanceRule, draws: int
+) -> Job:
+    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+        rates = false_winners(model, *n_runs, grid, rule, count, tick=tick)
+        return _of_pairs("pairs", model.entry.name, rates, rates.winner)
+
+    return Job("pairs", model.entry.name, rule.name, draws, measure)
+
+
+def _boards(
+    model: SmoothedRuns, size: int, n_runs: int, grid: Grid, rule: SignificanceRule, draws: int
+) -> Job:
+    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+        rate = board_false_winners(model, [n_runs] * size, grid, rule, count, tick=tick)
+        return Finding("boards", model.entry.name, rule.name, (n_runs, n_runs), count, rate)
+
+    return Job("boards", model.entry.name, rule.name, draws, measure)
+
+
+def _power(
+    model: SmoothedRuns,
+    other: SmoothedRuns,
+    factor: float,
+    n_runs: int,
+    grid: Grid,
+    rule: SignificanceRule,
+    draws: int,
+) -> Job:
+    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+        rates = power(model, other, n_runs, n_runs, grid, rule, count, tick=tick)
+        return _of_pairs("power", model.entry.name, rates, rates.first_wins, factor)
+
+    return Job("power", model.entry.name, rule.name, draws, measure)
