@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -179,7 +179,7 @@ def _compute(jobs: Sequence[Job], quiet: bool) -> list[Finding]:
     return found
 
 
-HEAD = ["entry", "seeds", "rule", "a cell (worst)", "any cell", "a winner"]
+HEAD = ["entry", "seeds", "rule", "cell, worst", "any cell", "a winner"]
 
 
 def tables(found: Sequence[Finding], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
@@ -200,8 +200,9 @@ def tables(found: Sequence[Finding], cells: int, board: int) -> list[tuple[str, 
     if pairs := parts[PartName.pairs]:
         rows = [[each.entry, _seeds(each), each.rule, *_cells(each), _winner(each)] for each in pairs]
         sentence = (
-            f"Simulated: two entries that are equal, {pairs[0].draws} pairs each. Every winner is false. `a cell`: "
-            f"different in a given one of the {cells} cells; `a winner`: one outperforms the other."
+            f"Simulated: two entries that are equal, {pairs[0].draws} pairs each. Every winner is false. `cell`: "
+            f"different in a given one of the {cells} cells, on average and in the worst; `a winner`: one seems to "
+            "outperform the other."
         )
         result.append((sentence, [HEAD, *rows]))
     if boards := parts[PartName.boards]:
@@ -263,7 +264,7 @@ def _cells(finding: Finding) -> tuple[str, str]:
     mean, worst, anywhere = (
         f"{value or 0:.1%}" for value in (finding.cell_mean, finding.cell_worst, finding.any_cell)
     )
-    return f"{mean} ({worst})", anywhere
+    return f"{mean.removesuffix('%')}, {worst}", anywhere
 
 
 def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:
@@ -274,9 +275,8 @@ def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:
 
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
     for name in rows[0]:
-        table.add_column(
-            Text(name), justify="left" if name in ("entry", "rule") else "right", overflow="fold"
-        )
+        justify: Literal["left", "right"] = "left" if name in ("entry", "rule") else "right"
+        table.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name != "entry")
     before = None
     for row in rows[1:]:
         shown = ["" if row[0] == before else row[0], *row[1:]]

@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from qrlsuite.statistics import Comparison
 
 SYMBOLS = {
-    "win": ("+", "green"),
-    "loss": ("-", "red"),
-    "tie": (".", "dim"),
-    "both-at-cap": ("^", "dim"),
-    "undecided": ("?", "yellow"),
+    "win": ("+", "bold bright_blue", "significantly fewer samples"),
+    "loss": ("-", "bold dark_orange", "significantly more samples"),
+    "tie": (".", "dim", "no significant difference"),
+    "both-at-cap": ("^", "dim", "both at the cap"),
+    "undecided": ("?", "yellow", "undecided"),
 }
+"""What a cell looks like; the sign says everything, the color only helps."""
 
 
 def compare(
@@ -54,19 +55,21 @@ def compare(
 
 
 def _matrix(comparison: Comparison) -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     grid = comparison.grid
-    table = Table(
-        title=Text("+ significantly fewer samples, - more, . no difference, ^ both at cap"),
-        title_justify="left",
-    )
-    table.add_column("epsilon" if grid.epsilons is not None else "threshold")
+    level = "epsilon" if grid.epsilons is not None else "threshold"
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(f"{level} down, delta across"))
+    table.title_justify = "left"
+    table.add_column("", justify="right")
     for delta in grid.deltas:
-        table.add_column(f"delta {float(delta):g}", justify="center")
+        table.add_column(Text(f"{float(delta):g}"), justify="center")
     for name, verdicts in zip(grid.epsilons or grid.thresholds, comparison.verdicts):
-        cells = (Text(*SYMBOLS[str(verdict)]) for verdict in verdicts)
+        cells = (Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts)
         table.add_row(Text(f"{float(name):g}"), *cells)
     Console().print(table)
+    there = {str(verdict) for row in comparison.verdicts for verdict in row}
+    typer.echo(", ".join(f"{sign} {words}" for name, (sign, _, words) in SYMBOLS.items() if name in there))
