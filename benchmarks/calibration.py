@@ -1,9 +1,11 @@
 """How often each rule declares a winner where there is none, and how often it finds one where there is.
 
-    python benchmarks/calibration.py [--pairs 1000] [--boards 200] [--jitter 0.3]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/calibration.py [--draws 1000]
 
-Draws runs from smoothed models of the two networks whose curves the tests keep (30 runs each of an MLP of width
-64 and one of width 16), on the 49 cells of the surface grid. The tables of docs/statistics.md are its output.
+What `qrlsuite calibrate` measures on one's own entries, here on the two networks whose curves the tests keep (30
+runs each of an MLP of width 64 and one of width 16), on the 49 cells of the surface grid; and besides, what few
+runs do to S_hat, what intervals of unequal numbers of runs would do, and a rule for a whole board. The tables of
+docs/statistics.md are its output.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from qrlsuite.cli.calibrate import tables
+from qrlsuite.leaderboard import calibration
 from qrlsuite.statistics import (
     DifferenceRule,
     Grid,
@@ -24,20 +28,11 @@ from qrlsuite.statistics import (
     SmoothedRuns,
     board_false_winners,
     bootstrap_interval,
-    false_winners,
-    power,
     sample_complexity,
 )
 
 CURVES = Path(__file__).parents[1] / "tests" / "golden" / "statistics.json.gz"
 RULES = (IntervalRule(), DifferenceRule())
-
-
-def slower(entry: LearningCurves, factor: float) -> LearningCurves:
-    """Return runs that take `factor` times as long to get as far."""
-    epochs = np.arange(1, entry.values.shape[1] + 1)
-    values = np.array([np.interp(epochs / factor, epochs, run) for run in entry.values])
-    return LearningCurves(values, entry.steps_per_epoch, f"{entry.name}, {factor} times slower")
 
 
 def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, pairs: int) -> float:
@@ -56,9 +51,9 @@ def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, 
     return found / pairs
 
 
-def print_bias(entry: LearningCurves, jitter: float, draws: int) -> None:
+def print_bias(entry: LearningCurves, draws: int) -> None:
     """Print the mean S_hat of entries of few and many runs, in thousands of steps."""
-    model, generator = SmoothedRuns(entry, jitter), np.random.default_rng(0)
+    model, generator = SmoothedRuns(entry), np.random.default_rng(0)
     deltas = [0.5, 0.75, 0.9]
     for n_runs in (5, 10, 20, 50, 100, 1000):
         found = [
@@ -69,12 +64,21 @@ def print_bias(entry: LearningCurves, jitter: float, draws: int) -> None:
         print(f"| {entry.name} | {n_runs} | {means} |", flush=True)
 
 
+def print_tables(jobs: list[calibration.Job], cells: int, board: int) -> None:
+    """Compute and print tables in markdown, as `qrlsuite calibrate` shows them."""
+    for sentence, rows in tables([job.run() for job in jobs], cells, board):
+        print(f"\n{sentence}\n")
+        for k, row in enumerate(rows):
+            print(f"| {' | '.join(row)} |" + (f"\n|{'---|' * len(row)}" if k == 0 else ""), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=1000)
-    parser.add_argument("--boards", type=int, default=200)
-    parser.add_argument("--jitter", type=float, default=0.3)
+    parser.add_argument(
+        "--draws", type=int, default=1000, help="pairs; for power a fifth, for boards a tenth"
+    )
     arguments = parser.parse_args()
+    draws = arguments.draws
     with gzip.open(CURVES) as file:
         cases = json.load(file)
     grid = Grid.relative(cases[0]["epsilons"], cases[0]["deltas"])
@@ -82,56 +86,33 @@ def main() -> None:
 
     print("| network | runs | delta .5 | delta .75 | delta .9 |\n|---|---|---|---|---|")
     for entry in entries:
-        print_bias(entry, arguments.jitter, arguments.pairs)
+        print_bias(entry, draws)
 
-    print("\n| network | runs | rule | a cell, mean | a cell, worst | any cell | a winner |")
-    print("|---|---|---|---|---|---|---|")
-    for entry in entries:
-        model = SmoothedRuns(entry, arguments.jitter)
-        for sizes in ((20, 20), (50, 50), (100, 100), (10, 40), (25, 50), (30, 100)):
-            for rule in RULES:
-                rates = false_winners(model, *sizes, grid, rule, arguments.pairs)
-                cells = rates.per_cell
-                print(
-                    f"| {entry.name} | {sizes[0]}, {sizes[1]} | {rule.name} | {cells.mean():.2%} "
-                    f"| {cells.max():.1%} | {rates.any_cell:.1%} | {rates.winner:.1%} |",
-                    flush=True,
-                )
+    numbers = [(20, 20), (50, 50), (100, 100), (10, 40), (25, 50), (30, 100)]
+    print_tables(calibration.plan(entries, grid, RULES, draws, ["pairs"], numbers), grid.size, 0)
 
     print("\n| network | runs | a winner, each entry keeping its own interval |\n|---|---|---|")
     for entry in entries:
-        for sizes in ((10, 40), (25, 50), (30, 100)):
-            rate = own_intervals(SmoothedRuns(entry, arguments.jitter), *sizes, grid, arguments.pairs)
+        for sizes in numbers[3:]:
+            rate = own_intervals(SmoothedRuns(entry), *sizes, grid, draws)
             print(f"| {entry.name} | {sizes[0]}, {sizes[1]} | {rate:.1%} |", flush=True)
 
-    print("\n| network | board of equals | rule | boards with a winner |\n|---|---|---|---|")
+    for board in (5, 10):
+        print_tables(
+            calibration.plan(entries, grid, RULES, 2 * draws // 5, ["boards"], [(100, 100)], board),
+            grid.size,
+            board,
+        )
+    print("\nrule difference with alpha = .05 / 45 pairs, 10,000 resamples, 40 boards of ten:")
     for entry in entries:
-        model = SmoothedRuns(entry, arguments.jitter)
-        for size in (5, 10):
-            for rule in RULES:
-                rate = board_false_winners(model, [100] * size, grid, rule, arguments.boards)
-                print(f"| {entry.name} | {size} entries of 100 runs | {rule.name} | {rate:.1%} |", flush=True)
-
-    print(
-        "\nten entries of 100 runs, rule difference with alpha = .05 / 45 pairs, 10,000 resamples, 40 boards:"
-    )
-    for entry in entries:
-        model, strict = SmoothedRuns(entry, arguments.jitter), DifferenceRule(alpha=0.05 / 45)
+        strict = DifferenceRule(alpha=0.05 / 45)
+        model = SmoothedRuns(entry)
         rate = board_false_winners(model, [100] * 10, grid, strict, 40, resampling=Resampling(10_000))
         print(f"{entry.name}: {rate:.1%}", flush=True)
 
-    print("\n| network | slower by | runs | rule | found |\n|---|---|---|---|---|")
-    for entry in entries:
-        for factor in (1.1, 1.25, 1.5):
-            other = SmoothedRuns(slower(entry, factor), arguments.jitter)
-            for n_runs in (20, 50, 100):
-                for rule in RULES:
-                    model = SmoothedRuns(entry, arguments.jitter)
-                    rates = power(model, other, n_runs, n_runs, grid, rule, max(1, arguments.pairs // 5))
-                    print(
-                        f"| {entry.name} | {factor - 1:.0%} | {n_runs} | {rule.name} | {rates.first_wins:.0%} |",
-                        flush=True,
-                    )
+    for n_runs in (20, 50, 100):
+        jobs = calibration.plan(entries, grid, RULES, draws // 5, ["power"], [(n_runs, n_runs)])
+        print_tables(jobs, grid.size, 0)
 
 
 if __name__ == "__main__":

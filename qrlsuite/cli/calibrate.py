@@ -262,7 +262,8 @@ def _winner(finding: Finding) -> str:
 
 def _cells(finding: Finding) -> tuple[str, str]:
     mean, worst, anywhere = (
-        f"{value or 0:.1%}" for value in (finding.cell_mean, finding.cell_worst, finding.any_cell)
+        f"{value or 0:{digits}%}"
+        for value, digits in ((finding.cell_mean, ".2"), (finding.cell_worst, ".1"), (finding.any_cell, ".1"))
     )
     return f"{mean.removesuffix('%')}, {worst}", anywhere
 
