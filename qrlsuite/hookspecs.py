@@ -1,13 +1,17 @@
 """Every hook of qrlsuite. A plugin implements the ones it needs; this file is the manual.
 
-A plugin is a module (or object) listed as an entry point in the group `qrlsuite` of its distribution::
+A plugin is a module (or object) listed as an entry point in the group `qrlsuite` of its distribution, which also
+says which versions of the suite it works with::
+
+    [project]
+    dependencies = ["qrlsuite>=0.1,<0.2"]
 
     [project.entry-points.qrlsuite]
     my_ansatz = "my_package.plugin"
 
 and marks its implementations with `qrlsuite.hookimpl`. Importing the module must do nothing but define them:
 no torch, no PennyLane, no Qiskit. Specs carry references to code (`"package.module:Name"`) that are resolved
-only when a command needs them.
+only when a command needs them. `qrlsuite check NAME` finds out whether what is registered keeps to the rules.
 """
 
 from __future__ import annotations
@@ -29,46 +33,152 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 @hookspec
 def register_environments(register: Callable[[specs.EnvironmentSpec], None]) -> None:
-    """Register environments: `register(EnvironmentSpec(name=..., summary=..., options=..., gymnasium_id=...))`.
+    """Register environments: a task file then names one under `[environment]`.
 
-    A task file then names it under `[environment]`.
+    `options` is a pydantic dataclass whose fields are the keyword arguments of the `gymnasium.Env` at `entry_point`.
+    Faster lanes (`vector`), reference policies and pictures are optional: see `qrlsuite.specs.EnvironmentSpec`::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import EnvironmentSpec
+
+        @hookimpl
+        def register_environments(register):
+            register(
+                EnvironmentSpec(
+                    name="corridor",
+                    summary="Walk to the end of a corridor",
+                    options="my_package.corridor:Options",
+                    gymnasium_id="my_package/Corridor-v1",
+                    entry_point="my_package.corridor:Corridor",
+                )
+            )
     """
 
 
 @hookspec
 def register_models(register: Callable[[specs.ModelSpec], None]) -> None:
-    """Register function approximators: `register(ModelSpec(name=..., family="quantum", build=..., ...))`.
+    """Register function approximators: they appear as `qrlsuite run --model NAME`.
 
-    They appear as `qrlsuite run --model NAME`.
+    `build(obs_dim, out_dim, options, generator)` returns an ordinary `torch.nn.Module` for one agent,
+    (B, obs_dim) -> (B, out_dim), and draws from `generator` alone: see `qrlsuite.specs.ModelSpec`::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import ModelSpec
+
+        @hookimpl
+        def register_models(register):
+            register(
+                ModelSpec(
+                    name="fourier",
+                    summary="Random Fourier features and a linear layer",
+                    family="classical",
+                    options="my_package.fourier:Options",
+                    build="my_package.fourier:build",
+                )
+            )
     """
 
 
 @hookspec
 def register_algorithms(register: Callable[[specs.AlgorithmSpec], None]) -> None:
-    """Register learning algorithms: they appear as `qrlsuite run --algorithm NAME`."""
+    """Register learning algorithms: they appear as `qrlsuite run --algorithm NAME`.
+
+    `factory(envs, build_model, options, streams, device)` returns an object with the methods of
+    `qrlsuite.algorithm.Algorithm`, which trains one agent for every seed at once::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import AlgorithmSpec
+
+        @hookimpl
+        def register_algorithms(register):
+            register(
+                AlgorithmSpec(
+                    name="sarsa",
+                    summary="On-policy temporal differences",
+                    options="my_package.sarsa:Options",
+                    factory="my_package.sarsa:Sarsa",
+                )
+            )
+    """
 
 
 @hookspec
 def register_tasks(register: Callable[[specs.TaskSpec], None]) -> None:
-    """Register benchmark tasks: `register(TaskSpec(name=..., summary=..., path=".../my-task.toml"))`."""
+    """Register benchmark tasks: they appear as `qrlsuite run --task NAME`.
+
+    `path` names the task's TOML file, and name and summary are those in the file::
+
+        from pathlib import Path
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import TaskSpec
+
+        @hookimpl
+        def register_tasks(register):
+            path = Path(__file__).with_name("corridor.toml")
+            register(TaskSpec(name="corridor", summary="A corridor of ten steps", path=str(path)))
+    """
 
 
 @hookspec
 def register_studies(register: Callable[[specs.StudySpec], None]) -> None:
-    """Register studies: `register(StudySpec(name=..., summary=..., path=".../my-study.toml"))`.
+    """Register studies, a list of entries and their pictures: they appear as `qrlsuite study run NAME`.
 
-    They appear as `qrlsuite study run NAME`.
+    `path` names the study's TOML file::
+
+        from pathlib import Path
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import StudySpec
+
+        @hookimpl
+        def register_studies(register):
+            path = Path(__file__).with_name("widths.toml")
+            register(StudySpec(name="widths", summary="How wide a network must be", path=str(path)))
     """
 
 
 @hookspec
 def register_ansatzes(register: Callable[[specs.AnsatzSpec], None]) -> None:
-    """Register circuit families: they appear as `--set ansatz=NAME` of every `vqc-*` model."""
+    """Register circuit families: they appear as `--set ansatz=NAME` of every `vqc-*` model.
+
+    `build(qubits, layers, options)` returns a `qrlsuite.circuit.Circuit`, a description that every backend runs::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import AnsatzSpec
+
+        @hookimpl
+        def register_ansatzes(register):
+            register(
+                AnsatzSpec(
+                    name="ring",
+                    summary="Re-uploaded RY, and a ring of RZZ",
+                    options="my_package.ring:Options",
+                    build="my_package.ring:build",
+                )
+            )
+    """
 
 
 @hookspec
 def register_circuit_backends(register: Callable[[specs.CircuitBackendSpec], None]) -> None:
-    """Register simulators or hardware that compute expectation values of a `qrlsuite.circuit.Circuit`."""
+    """Register simulators or hardware that compute expectation values of a `qrlsuite.circuit.Circuit`.
+
+    `factory(circuit, options)` returns a callable of inputs and parameters, differentiable by torch: see
+    `qrlsuite.circuit.api.CircuitBackend`. They appear as `qrlsuite.circuit.expectations(..., backend=NAME)`::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import CircuitBackendSpec
+
+        @hookimpl
+        def register_circuit_backends(register):
+            register(
+                CircuitBackendSpec(
+                    name="mps",
+                    summary="Matrix product states",
+                    options="my_package.mps:Options",
+                    factory="my_package.mps:Backend",
+                )
+            )
+    """
 
 
 @hookspec
@@ -100,27 +210,120 @@ def register_significance_tests(register: Callable[[specs.SignificanceTestSpec],
 
 @hookspec
 def register_engines(register: Callable[[specs.EngineSpec], None]) -> None:
-    """Register places where groups of seeds run: they appear as `qrlsuite run --engine NAME`."""
+    """Register places where groups of seeds run: they appear as `qrlsuite run --engine NAME`.
+
+    `factory(options)` returns an object with the methods of `qrlsuite.engine.api.Engine`; it decides only where
+    `python -m qrlsuite.engine.worker` runs, and all results are files::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import EngineSpec
+
+        @hookimpl
+        def register_engines(register):
+            register(
+                EngineSpec(
+                    name="ssh",
+                    summary="Processes on other machines that share a folder",
+                    factory="my_package.ssh:Engine",
+                    options="my_package.ssh:Options",
+                )
+            )
+    """
+
+
+@hookspec
+def register_trackers(register: Callable[[specs.TrackerSpec], None]) -> None:
+    """Register trackers that watch a run when they are asked for: `qrlsuite run --track NAME`.
+
+    `factory(target)` returns an object with any of the methods `run_started`, `epoch_finished` and `run_finished`,
+    as the hooks of these names; `target` is what the user wrote after `--track NAME=`, or None::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import TrackerSpec
+
+        @hookimpl
+        def register_trackers(register):
+            register(
+                TrackerSpec(
+                    name="csv",
+                    summary="A line per epoch in a CSV file",
+                    factory="my_package.csv_tracker:Tracker",
+                )
+            )
+    """
 
 
 @hookspec
 def register_commands(app: typer.Typer) -> None:
-    """Add commands to the `qrlsuite` command line: `@app.command() def hello(): ...`."""
+    """Add commands to the `qrlsuite` command line.
+
+    `app` is a `typer.Typer`. A name that is taken already is refused::
+
+    import typer
+    from qrlsuite import hookimpl
+
+    @hookimpl
+    def register_commands(app):
+        @app.command("hello")
+        def hello(name: str = "you"):
+            'Greet someone.'
+            typer.echo(f"Hello, {name}.")
+    """
 
 
 @hookspec
 def run_started(run: Mapping[str, Any]) -> None:
-    """Observe a seed's run beginning or resuming.
+    """Observe a seed's run beginning or resuming, in the worker that trains it.
 
-    `run` is its `run.json` as a mapping (task, algorithm, model, options, seed, versions, ...).
+    `run` is a mapping: what the seed's `run.json` says (task, entry, label, algorithm, model, their options, seed,
+    ...), `epochs`, the number of epochs that are finished, and `folder`, the seed's folder. What a tracker prints
+    goes to the worker's output, which nobody reads: write to a file.
+
+    A run that was stopped resumes from its last checkpoint, so epochs after `run["epochs"]` may come a second time:
+    they are equal to those of the first. A tracker that raises is reported once and left out; it never stops a run.
+
+    This hook watches every run. A tracker that is only to watch when asked for is registered with
+    `register_trackers`::
+
+        from pathlib import Path
+        from qrlsuite import hookimpl
+
+        @hookimpl
+        def run_started(run):
+            with Path(run["folder"], "notes.txt").open("a") as file:
+                print(f"{run['label']} begins after epoch {run['epochs']}", file=file)
     """
 
 
 @hookspec
 def epoch_finished(run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
-    """Observe a finished epoch of one seed: `record` is its line of `epochs.jsonl` as a mapping."""
+    """Observe a finished epoch of one seed: `record` is its line of `epochs.jsonl` as a mapping.
+
+    It has `epoch`, the validation `scores` (a list of numbers), and the algorithm's metrics (`loss`, ...),
+    `train_return` and `train_score`: numbers, or None where there is no value. `run` is as in `run_started`,
+    without `epochs`::
+
+        from pathlib import Path
+        from qrlsuite import hookimpl
+
+        @hookimpl
+        def epoch_finished(run, record):
+            mean = sum(record["scores"]) / len(record["scores"])
+            with Path(run["folder"], "notes.txt").open("a") as file:
+                print(f"epoch {record['epoch']}: {mean:.3f}", file=file)
+    """
 
 
 @hookspec
 def run_finished(run: Mapping[str, Any]) -> None:
-    """Observe a seed's run reaching its last epoch."""
+    """Observe a seed's run reaching its last epoch; its results are complete on disk.
+
+    `run` is as in `run_started`::
+
+    import sys
+    from qrlsuite import hookimpl
+
+    @hookimpl
+    def run_finished(run):
+        print(f"seed {run['seed']} is done: {run['folder']}", file=sys.stderr)
+    """

@@ -1,13 +1,16 @@
 """Discovery and look-up of everything that plugins register.
 
-`load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that
-cannot be imported, or whose hook raises, is reported by the name of its distribution and skipped; a name
-registered twice is an error that names both distributions when it is looked up.
+`load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not
+fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
+reported by the name of its distribution and skipped as a whole; everything else works. A name registered twice is
+an error that names both distributions when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
+first of these problems ends the command.
 """
 
 from __future__ import annotations
 
 import functools
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,8 +19,11 @@ from typing import Any, cast
 
 import pluggy
 
-from qrlsuite import hookspecs, specs
+from qrlsuite import compatibility, hookspecs, specs
 from qrlsuite.errors import PluginError, UnknownNameError, nearest
+
+STRICT = "QRLSUITE_STRICT"
+"""Environment variable: problems of plugins are fatal, in workers too."""
 
 KINDS: dict[str, type[specs.Spec]] = {
     "environments": specs.EnvironmentSpec,
@@ -29,6 +35,7 @@ KINDS: dict[str, type[specs.Spec]] = {
     "significance_tests": specs.SignificanceTestSpec,
     "engines": specs.EngineSpec,
     "studies": specs.StudySpec,
+    "trackers": specs.TrackerSpec,
 }
 """Kinds of registered things, in the plural: hook `register_<kind>`, and the spec that it takes."""
 
@@ -48,13 +55,44 @@ class Registered:
 
 
 @dataclass
+class Plugin:
+    """An entry point, and what became of it.
+
+    Attributes
+    ----------
+    name:
+        Its name among the distribution's entry points.
+    module:
+        What it points at.
+    version:
+        The distribution's version; `""` where there is none.
+    requires:
+        The versions of the suite that the distribution requires; `""` for any.
+    registered:
+        Names by kind in the plural.
+    problem:
+        Why it was skipped; `""` where it works.
+    """
+
+    name: str
+    module: str
+    distribution: str
+    version: str = ""
+    requires: str = ""
+    registered: dict[str, list[str]] = field(default_factory=dict)
+    problem: str = ""
+
+
+@dataclass
 class Registry:
-    """All registered specs by kind and name, and what went wrong on the way."""
+    """All registered specs by kind and name, every plugin, and what went wrong on the way."""
 
     manager: pluggy.PluginManager
     entries: dict[str, dict[str, Registered]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
     duplicates: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+    plugins: list[Plugin] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    strict: bool = False
 
     def names(self, kind: str) -> list[str]:
         """Return the sorted names of a kind."""
@@ -77,10 +115,7 @@ class Registry:
         """
         owners = self.duplicates.get((kind, name))
         if owners:
-            raise PluginError(
-                f"{SINGULAR[kind]} '{name}' is registered by both {' and '.join(owners)}: "
-                f"uninstall one of them (pip uninstall {owners[-1]})"
-            )
+            raise PluginError(_duplicate(kind, name, owners))
         try:
             return self.entries[kind][name]
         except KeyError:
@@ -89,39 +124,97 @@ class Registry:
                 f"unknown {singular} '{name}'{nearest(name, self.entries[kind])}"
             ) from None
 
-    def add_plugin(self, plugin: Any, distribution: str) -> None:
-        """Register a plugin object with the manager and collect its specs.
+    def add_plugin(self, plugin: Any, distribution: str) -> dict[str, list[str]]:
+        """Register a plugin object with the manager, and all that it registers, or nothing of it.
+
+        Returns
+        -------
+        dict
+            Names that it registered, by kind.
 
         Raises
         ------
         PluginError
-            If one of its hooks has a wrong signature, raises, or hands over something that is not a spec.
+            If it implements a hook that does not exist, one of its hooks has a wrong signature, raises, or hands
+            over something that is not a spec.
         """
+        name = f"{distribution}:{getattr(plugin, '__name__', plugin)}"
+        handed: list[tuple[str, specs.Spec]] = []
         try:
-            self.manager.register(plugin, name=f"{distribution}:{getattr(plugin, '__name__', plugin)}")
-        except (pluggy.PluginValidationError, ValueError) as error:
-            raise PluginError(f"plugin of distribution '{distribution}': {error}") from error
-        for kind, expected in KINDS.items():
-            caller = getattr(self.manager.hook, f"register_{kind}")
+            self.manager.register(plugin, name=name)
+            self._know_hooks(plugin)
             others = [p for p in self.manager.get_plugins() if p is not plugin]
-            subset = self.manager.subset_hook_caller(caller.name, others)
-            try:
-                subset(register=functools.partial(self._add, kind, expected, distribution))
-            except Exception as error:
-                raise PluginError(f"distribution '{distribution}', hook '{caller.name}': {error}") from error
+            for kind, expected in KINDS.items():
+                hook = f"register_{kind}"
+                try:
+                    self.manager.subset_hook_caller(hook, others)(
+                        register=functools.partial(_collect, handed, kind, expected)
+                    )
+                except Exception as error:
+                    reason = str(error) if isinstance(error, PluginError) else words(error)
+                    raise PluginError(f"hook '{hook}': {reason}") from error
+        except (pluggy.PluginValidationError, PluginError, ValueError) as error:
+            if self.manager.get_plugin(name) is plugin:
+                self.manager.unregister(plugin)
+            raise PluginError(
+                f"plugin '{name.partition(':')[2]}' of distribution '{distribution}': {error}"
+            ) from error
+        registered: dict[str, list[str]] = {}
+        for kind, spec in handed:
+            registered.setdefault(kind, []).append(spec.name)
+            self._add(kind, spec, distribution)
+        return registered
 
-    def _add(self, kind: str, expected: type[specs.Spec], distribution: str, spec: specs.Spec) -> None:
-        if type(spec) is not expected:
-            raise PluginError(f"register() needs a {expected.__name__}, got {type(spec).__name__}")
+    def _know_hooks(self, plugin: Any) -> None:
+        """Refuse implementations of hooks that do not exist (pluggy's `check_pending`, for one plugin)."""
+        known = [
+            name for name in vars(hookspecs) if hasattr(vars(hookspecs)[name], f"{hookspecs.PROJECT}_spec")
+        ]
+        for caller in self.manager.get_hookcallers(plugin) or []:
+            optional = all(i.optionalhook for i in caller.get_hookimpls() if i.plugin is plugin)
+            if not caller.has_spec() and not optional:
+                raise PluginError(f"there is no hook '{caller.name}'{nearest(caller.name, known)}")
+
+    def _add(self, kind: str, spec: specs.Spec, distribution: str) -> None:
         known = self.entries[kind].get(spec.name)
-        if known is not None:
-            owners = self.duplicates.setdefault((kind, spec.name), [known.distribution])
-            owners.append(distribution)
-            self.problems.append(
-                f"{SINGULAR[kind]} '{spec.name}' is registered by both {' and '.join(owners)}"
-            )
+        if known is None:
+            self.entries[kind][spec.name] = Registered(spec, distribution)
             return
-        self.entries[kind][spec.name] = Registered(spec, distribution)
+        owners = self.duplicates.setdefault((kind, spec.name), [known.distribution])
+        owners.append(distribution)
+        self.report(_duplicate(kind, spec.name, owners))
+
+    def report(self, problem: str) -> None:
+        """Note a problem and warn of it.
+
+        Raises
+        ------
+        PluginError
+            If problems are fatal.
+        """
+        if self.strict:
+            raise PluginError(problem)
+        self.problems.append(problem)
+        warnings.warn(problem, PluginWarning, stacklevel=3)
+
+
+def _collect(handed: list[tuple[str, specs.Spec]], kind: str, expected: type[specs.Spec], spec: Any) -> None:
+    """Be the `register` of a hook."""
+    if type(spec) is not expected:
+        raise PluginError(f"register() needs a {expected.__name__}, got {type(spec).__name__}")
+    handed.append((kind, spec))
+
+
+def _duplicate(kind: str, name: str, owners: list[str]) -> str:
+    what = f"{SINGULAR[kind].replace('_', ' ')} '{name}' is registered"
+    if len(set(owners)) == 1:
+        return f"{what} twice by {owners[0]}: give one of them another name"
+    return f"{what} by both {' and '.join(owners)}: uninstall one of them (pip uninstall {owners[-1]})"
+
+
+def words(error: BaseException) -> str:
+    """Return an error's type and message."""
+    return f"{type(error).__name__}: {error}"
 
 
 def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
@@ -146,39 +239,49 @@ def create(
         Raise at the first broken plugin instead of skipping it with a `PluginWarning`.
     points:
         Where entry points come from; tests hand in their own.
+
+    Raises
+    ------
+    PluginError
+        If strict, and a plugin is broken.
     """
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     manager.add_hookspecs(hookspecs)
-    registry = Registry(manager)
+    registry = Registry(manager, strict=strict)
     for distribution, point in points():
+        version = point.dist.version if point.dist is not None else ""
+        found = Plugin(point.name, point.value, distribution, version)
+        registry.plugins.append(found)
         try:
-            try:
-                plugin = point.load()
-            except Exception as error:
-                raise PluginError(
-                    f"plugin '{point.name}' of distribution '{distribution}' cannot be imported: "
-                    f"{type(error).__name__}: {error}"
-                ) from error
-            registry.add_plugin(plugin, distribution)
+            found.requires = compatibility.required(point.dist)
+            compatibility.check(point.dist)
+            found.registered = registry.add_plugin(_import(point, distribution), distribution)
         except PluginError as error:
             if strict:
                 raise
-            registry.problems.append(str(error))
-    try:
-        manager.check_pending()
-    except pluggy.PluginValidationError as error:
-        if strict:
-            raise PluginError(str(error)) from error
-        registry.problems.append(str(error))
-    for problem in registry.problems:
-        warnings.warn(f"{problem}; skipped", PluginWarning, stacklevel=2)
+            found.problem = str(error)
+            registry.report(f"{error}; skipped")
     return registry
+
+
+def _import(point: metadata.EntryPoint, distribution: str) -> Any:
+    try:
+        return point.load()
+    except (Exception, SystemExit) as error:
+        raise PluginError(
+            f"plugin '{point.name}' of distribution '{distribution}' cannot be imported: {words(error)}"
+        ) from error
+
+
+def is_strict() -> bool:
+    """Return whether the environment asks for strictness: `QRLSUITE_STRICT` is set, and not to 0, false, no or off."""
+    return os.environ.get(STRICT, "").strip().lower() not in ("", "0", "false", "no", "off")
 
 
 @functools.cache
 def load() -> Registry:
     """Return the registry of this process, discovered once."""
-    return create()
+    return create(is_strict())
 
 
 def environment(name: str) -> specs.EnvironmentSpec:
@@ -204,6 +307,11 @@ def task(name: str) -> specs.TaskSpec:
 def study(name: str) -> specs.StudySpec:
     """Look up a study by name."""
     return cast(specs.StudySpec, load().get("studies", name).spec)
+
+
+def tracker(name: str) -> specs.TrackerSpec:
+    """Look up a tracker by name."""
+    return cast(specs.TrackerSpec, load().get("trackers", name).spec)
 
 
 def ansatz(name: str) -> specs.AnsatzSpec:

@@ -25,7 +25,7 @@ from qrlsuite import checkpoint, options, population, provenance, registry, spec
 from qrlsuite.entry import Entry
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, StoreError
-from qrlsuite.events import EventSink
+from qrlsuite.events import EventSink, asked
 from qrlsuite.interrupts import Interruptible
 from qrlsuite.metering import MeteredEnv
 from qrlsuite.seeding import Streams, pack, unpack
@@ -48,6 +48,8 @@ class Progress:
     """Rounds of the current phase, 0 where unknown."""
     median_score: float | None = None
     epoch_seconds: float | None = None
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    """What the user should know although nothing failed: a tracker that was left out."""
 
 
 Report = Callable[[Progress], None]
@@ -150,7 +152,8 @@ class GroupRun:
             self.envs, self.models, entry.algorithm_options, self.streams, torch.device(device)
         )
         self.epoch = 0
-        self.events = EventSink(registry.load().manager)
+        self.events = EventSink(registry.load(), asked())
+        self.progress.warnings = self.events.problems
         self._saved_epoch = -1
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
 
@@ -226,7 +229,7 @@ class GroupRun:
                 "provenance": made_with,
             }
             folder.write_record(record)
-            self.events.send("run_started", run=record)
+            self.events.send("run_started", run={**record, "folder": str(folder.path)})
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
         classical, quantum = self.models.parameters[0]
@@ -329,7 +332,8 @@ class GroupRun:
                     }
                 ),
             )
-            self.events.send("epoch_finished", run=self._seed_record(seed), record=line)
+            run = {**self._seed_record(seed), "folder": str(folder.path)}
+            self.events.send("epoch_finished", run=run, record=line)
         self.progress.epoch = self.epoch
         self.progress.median_score = float(np.median(scores.mean(axis=1)))
         self.report(self.progress)
@@ -401,6 +405,6 @@ class GroupRun:
             }
             del record["format_version"]
             folder.write_record(record)
-            self.events.send("run_finished", run=record)
+            self.events.send("run_finished", run={**record, "folder": str(folder.path)})
         self.progress.phase = "finished"
         self.report(self.progress)

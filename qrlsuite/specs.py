@@ -222,3 +222,21 @@ class EngineSpec(Spec):
     factory: str
     options: str | None = None
     extras: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSpec(Spec):
+    """A tracker that watches a run when it is asked for: `qrlsuite run --track NAME`, or `--track NAME=TARGET`.
+
+    Attributes
+    ----------
+    factory:
+        Reference to `factory(target) -> tracker`, called once in every worker. `target` is the text after the
+        equals sign, or None. A tracker has any of the methods `run_started(run)`, `epoch_finished(run, record)`
+        and `run_finished(run)`, which are given what the hooks of these names are given.
+    extras:
+        Packages that it needs: the pip command by the name of the module.
+    """
+
+    factory: str
+    extras: dict[str, str] = field(default_factory=dict)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import sys
 import warnings
 from typing import Any
@@ -12,8 +14,11 @@ from qrlsuite.errors import QrlSuiteError
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
     from qrlsuite.cli.app import build
-    from qrlsuite.registry import PluginWarning
+    from qrlsuite.registry import STRICT, PluginWarning
 
+    options = itertools.takewhile(lambda word: word.startswith("-"), sys.argv[1:])
+    if "--strict" in options:
+        os.environ[STRICT] = "1"  # workers inherit it
     with warnings.catch_warnings():
         original = warnings.showwarning
 

@@ -37,6 +37,7 @@ def build() -> typer.Typer:
         show,
         status,
         study,
+        tune,
     )
 
     app = typer.Typer(
@@ -57,9 +58,10 @@ def build() -> typer.Typer:
     app.command("runs")(runs.runs)
     app.command("leaderboard")(leaderboard.leaderboard)
     app.command("compare")(compare.compare)
-    app.command("plot", cls=plot.Command)(plot.plot)
     app.command("calibrate")(calibrate.calibrate)
+    app.command("plot", cls=plot.Command)(plot.plot)
     app.command("evaluate")(evaluate.evaluate)
+    app.command("tune")(tune.tune)
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
@@ -71,12 +73,19 @@ def build() -> typer.Typer:
         version: Annotated[
             bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
         ] = False,
+        strict: Annotated[
+            bool,
+            typer.Option(
+                "--strict", help="Stop at a broken plugin instead of skipping it (or QRLSUITE_STRICT=1)."
+            ),
+        ] = False,
     ) -> None:
-        pass
+        pass  # `cli.main` sees to --strict, for plugins are loaded before options are read
 
     from qrlsuite import registry
+    from qrlsuite.cli.extensions import add_commands
 
-    registry.load().manager.hook.register_commands(app=app)
+    add_commands(app, registry.load())
     return app
 
 

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from qrlsuite.cli.app import JsonOption
+
+if TYPE_CHECKING:
+    from qrlsuite.registry import Registry
+
+SHOWN = 8
+"""Names of a kind that `list plugins` shows."""
 
 
 def list_things(
     kind: Annotated[
         str | None,
         typer.Argument(
-            help="tasks, models, algorithms, environments, ansatzes, circuit_backends, hooks, ... or all"
+            help="tasks, models, algorithms, environments, ansatzes, circuit-backends, ..., plugins, hooks; "
+            "default: all that is registered"
         ),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """List what is registered, by the suite or by plugins, and from which distribution.
 
-    Example: qrlsuite list models
+    `plugins` shows each plugin with its version, what it registers and its problems; `hooks` what a plugin can do.
+
+    Examples: qrlsuite list models; qrlsuite list plugins; qrlsuite list hooks
     """
     import json
 
@@ -31,11 +40,14 @@ def list_things(
     accepted = {name.replace("_", "-"): name for name in registry.KINDS} | {
         name: name for name in registry.KINDS
     }
+    if kind == "plugins":
+        _list_plugins(known, json_output)
+        return
     if kind == "hooks":
-        rows = _hooks()
+        rows = [{"kind": "hooks", "distribution": "qrlsuite", **row} for row in hooks()]
     else:
         if kind is not None and kind not in accepted:
-            raise UnknownNameError(f"unknown kind '{kind}'{nearest(kind, [*registry.KINDS, 'hooks'])}")
+            raise UnknownNameError(f"unknown kind '{kind}'{nearest(kind, [*accepted, 'hooks', 'plugins'])}")
         rows = [
             {"kind": k, "name": r.spec.name, "summary": r.spec.summary, "distribution": r.distribution}
             for k, r in known
@@ -47,22 +59,53 @@ def list_things(
     _print(rows)
 
 
-def _hooks() -> list[dict[str, str]]:
-    """Return every hook with the first line of its manual."""
+def hooks() -> list[dict[str, str]]:
+    """Return every hook: its name, its signature, the first line of its manual and the manual."""
     import inspect
 
     from qrlsuite import hookspecs
 
-    return [
-        {
-            "kind": "hooks",
-            "name": name,
-            "summary": (inspect.getdoc(function) or "").partition("\n")[0],
-            "distribution": "qrlsuite",
-        }
-        for name, function in vars(hookspecs).items()
-        if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec")
-    ]
+    found = []
+    for name, function in vars(hookspecs).items():
+        if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec"):
+            manual = inspect.getdoc(function) or ""
+            arguments = ", ".join(inspect.signature(function).parameters)
+            summary = manual.partition("\n")[0]
+            row = {"name": name, "summary": summary, "signature": f"{name}({arguments})", "manual": manual}
+            found.append(row)
+    return found
+
+
+def _list_plugins(known: Registry, json_output: bool) -> None:
+    import dataclasses
+    import json
+
+    if json_output:
+        rows = [dataclasses.asdict(plugin) for plugin in known.plugins]
+        typer.echo(json.dumps({"plugins": rows, "problems": known.problems}))
+        return
+    last = ""
+    for plugin in known.plugins:
+        if plugin.distribution != last:
+            needs = f", for qrlsuite{plugin.requires}" if plugin.requires else ""
+            if not needs and plugin.distribution != "qrlsuite":
+                needs = ", for any qrlsuite (its pyproject.toml should say dependencies = ['qrlsuite>=...'])"
+            typer.echo(("\n" if last else "") + f"{plugin.distribution} {plugin.version}{needs}")
+            last = plugin.distribution
+        typer.echo(f"  {plugin.module}")
+        for kind, names in plugin.registered.items():
+            shown = ", ".join(names[:SHOWN]) + (
+                f", and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+            )
+            typer.echo(f"    {kind.replace('_', ' ')}: {shown}")
+        if plugin.problem:
+            typer.echo(f"    SKIPPED: {plugin.problem}")
+        elif not plugin.registered:
+            typer.echo("    registers nothing by name")
+    skipped = tuple(plugin.problem for plugin in known.plugins if plugin.problem)
+    others = [text for text in known.problems if not text.startswith(skipped)]
+    if others:
+        typer.echo("\n" + "\n".join(f"problem: {text}" for text in others))
 
 
 def _print(rows: list[dict[str, str]]) -> None:

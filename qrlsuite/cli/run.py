@@ -14,6 +14,7 @@ from qrlsuite.cli.training import (
     EngineOptionsOption,
     PartitionOption,
     TimeOption,
+    TrackOption,
     WorkersOption,
 )
 
@@ -66,6 +67,7 @@ def run(
     time: TimeOption = None,
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
+    track: TrackOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -79,7 +81,7 @@ def run(
     import json
 
     from qrlsuite import entry as entries
-    from qrlsuite import options
+    from qrlsuite import events, options
     from qrlsuite.cli.display import RunDisplay
     from qrlsuite.cli.training import place, plan, train
     from qrlsuite.engine import groups
@@ -88,6 +90,8 @@ def run(
     if quick:
         words = _quick_settings(model, words)
     entry = entries.resolve(task, model, algorithm, words, preset)
+    if track:
+        events.ask(track)
     protocol = entry.task.file.protocol
     wanted = groups.parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
     last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))

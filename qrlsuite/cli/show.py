@@ -39,6 +39,10 @@ def show(
     from qrlsuite import registry
     from qrlsuite.errors import UnknownNameError, nearest
 
+    manual = _hook(name, second)
+    if manual is not None:
+        typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
+        return
     kind, wanted = _kind(name, second)
     known = registry.load()
     found = [k for k in registry.KINDS if (kind in (None, k)) and wanted in known.entries[k]]
@@ -58,6 +62,21 @@ def show(
     if found[0] == "ansatzes":
         content["drawing"] = _draw(wanted, qubits, layers, settings or [], figure, content)
     typer.echo(json.dumps(content) if json_output else _text(content))
+
+
+def _hook(first: str, second: str | None) -> dict[str, str] | None:
+    """Return a hook and its manual: `show hook register_models`, or `show register_models`."""
+    from qrlsuite.cli.listing import hooks
+    from qrlsuite.errors import UnknownNameError, nearest
+
+    found = {row["name"]: row for row in hooks()}
+    if second is None:
+        return found.get(first)
+    if first not in ("hook", "hooks"):
+        return None
+    if second not in found:
+        raise UnknownNameError(f"unknown hook '{second}'{nearest(second, found)}")
+    return found[second]
 
 
 def _kind(first: str, second: str | None) -> tuple[str | None, str]:

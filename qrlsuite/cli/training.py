@@ -34,6 +34,14 @@ EngineOptionsOption = Annotated[
     list[str] | None,
     typer.Option("--engine-set", metavar="NAME=VALUE", help="A further option of the engine."),
 ]
+TrackOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--track",
+        metavar="NAME[=TARGET]",
+        help="Watch with a tracker (see `qrlsuite list trackers`): --track tensorboard, --track tensorboard=DIR.",
+    ),
+]
 DeviceOption = Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda.")]
 
 
@@ -143,7 +151,17 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
         raise typer.Exit(130) from None
     finally:
         display.close()
+    for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
+        display.console.print(f"warning: {message}", markup=False, soft_wrap=True)
     api.raise_failures(outcome)
     for message in outcome.taken.values():
         display.console.print(f"left out: {message}", markup=False)
     return outcome
+
+
+def _warnings(store: EntryStore, group: Group) -> list[str]:
+    """Return what a group's worker left for the user to know."""
+    from qrlsuite.engine.groups import ProgressFile
+
+    left = ProgressFile(store, group.id).read().get("warnings")
+    return [str(message) for message in left] if isinstance(left, list) else []

@@ -7,11 +7,12 @@ import sys
 import types
 from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from qrlsuite import registry, specs
+from qrlsuite import compatibility, registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
 
@@ -45,30 +46,124 @@ def test_an_unknown_name_gets_the_nearest_match() -> None:
 def test_a_name_registered_twice_names_both_distributions() -> None:
     for name in ("tp_one", "tp_two"):
         plugin(name, register_models=lambda register: register(specs.ModelSpec(name="twin", **MODEL)))
-    with pytest.warns(registry.PluginWarning, match="'twin' is registered by both one and two"):
-        found = registry.create(points=points(("one", "tp_one"), ("two", "tp_two")))
-    with pytest.raises(PluginError, match="by both one and two: uninstall one of them"):
+    both = points(("one", "tp_one"), ("two", "tp_two"))
+    message = r"'twin' is registered by both one and two: uninstall one of them \(pip uninstall two\)"
+    with pytest.warns(registry.PluginWarning, match=message):
+        found = registry.create(points=both)
+    with pytest.raises(PluginError, match=message):
         found.get("models", "twin")
+    with pytest.raises(PluginError, match=message):
+        registry.create(strict=True, points=both)
+
+
+def test_a_name_registered_twice_by_one_distribution_is_its_own_affair() -> None:
+    def twice(register: Callable[..., None]) -> None:
+        register(specs.ModelSpec(name="twin", **MODEL))
+        register(specs.ModelSpec(name="twin", **MODEL))
+
+    plugin("tp_twice", register_models=twice)
+    with pytest.warns(registry.PluginWarning, match="twice by one: give one of them another name"):
+        registry.create(points=points(("one", "tp_twice")))
+
+
+def one_then_fail(register: Callable[..., None]) -> None:
+    register(specs.ModelSpec(name="half-registered", **MODEL))
+    raise ValueError("no such file")
 
 
 @pytest.mark.parametrize(
     ("functions", "message"),
     [
-        ({"register_models": lambda register: 1 / 0}, "hook 'register_models': division by zero"),
+        (
+            {"register_models": lambda register: 1 / 0},
+            "hook 'register_models': ZeroDivisionError: division by zero",
+        ),
+        ({"register_models": one_then_fail}, "hook 'register_models': ValueError: no such file"),
         ({"register_models": lambda register: register("mlp")}, "needs a ModelSpec, got str"),
         ({"register_models": lambda registre: None}, "registre"),
-        ({"register_modles": lambda register: None}, "register_modles"),
+        (
+            {"register_modles": lambda register: None},
+            "there is no hook 'register_modles'; did you mean 'register_models'",
+        ),
     ],
 )
 def test_a_broken_plugin_is_named_and_skipped(functions: dict[str, Any], message: str) -> None:
     plugin("tp_broken", **functions)
     plugin("tp_fine", register_models=lambda register: register(specs.ModelSpec(name="fine", **MODEL)))
     both = points(("broken-dist", "tp_broken"), ("fine-dist", "tp_fine"))
-    with pytest.warns(registry.PluginWarning, match=message):
+    with pytest.warns(registry.PluginWarning, match=message) as caught:
         found = registry.create(points=both)
+    assert str(caught[0].message).startswith("plugin 'tp_broken' of distribution 'broken-dist': ")
     assert found.names("models") == ["fine"]
+    assert [bool(p.problem) for p in found.plugins] == [True, False]
+    assert "tp_broken" not in str(found.manager.list_name_plugin())
     with pytest.raises(PluginError, match=message):
         registry.create(strict=True, points=both)
+
+
+def test_a_plugin_that_ends_the_interpreter_is_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tp_exits.py").write_text("raise SystemExit('no license')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.warns(registry.PluginWarning, match="cannot be imported: SystemExit: no license"):
+        registry.create(points=points(("rude", "tp_exits")))
+
+
+@pytest.mark.parametrize(
+    ("requires", "version", "fits"),
+    [
+        ([], "9.9", True),
+        (["numpy>=1"], "0.1.0", True),
+        (["qrlsuite"], "0.1.0", True),
+        (["qrlsuite>=0.1,<0.2"], "0.1.0", True),
+        (["qrlsuite>=0.1,<0.2"], "0.1.7.dev3", True),
+        (["qrlsuite>=0.1,<0.2"], "0.2.0", False),
+        (["QRLsuite[tune] >=0.3"], "0.1.0", False),
+        (["qrlsuite>=0.3; extra == 'new'"], "0.1.0", True),
+        (["qrlsuite>=0.3; python_version < '3'"], "0.1.0", True),
+        (["not a requirement!"], "0.1.0", True),
+    ],
+)
+def test_the_versions_that_a_distribution_requires(
+    requires: list[str], version: str, fits: bool, tmp_path: Path
+) -> None:
+    found = distribution(tmp_path, requires)
+    if fits:
+        compatibility.check(found, version)
+    else:
+        with pytest.raises(
+            PluginError, match=r"'acme' 2.5 requires qrlsuite.*, and this is qrlsuite 0\..*pip install"
+        ):
+            compatibility.check(found, version)
+
+
+def test_a_requirement_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(PluginError, match="distribution 'acme' requires 'qrlsuite>>1', which cannot be read"):
+        compatibility.required(distribution(tmp_path, ["qrlsuite>>1"]))
+
+
+def distribution(folder: Path, requires: list[str]) -> metadata.Distribution:
+    info = folder / "acme-2.5.dist-info"
+    info.mkdir()
+    lines = [
+        "Metadata-Version: 2.1",
+        "Name: acme",
+        "Version: 2.5",
+        *(f"Requires-Dist: {r}" for r in requires),
+    ]
+    (info / "METADATA").write_text("\n".join(lines) + "\n")
+    return metadata.Distribution.at(info)
+
+
+@pytest.mark.parametrize(
+    ("value", "strict"), [("1", True), ("yes", True), ("0", False), ("", False), ("No", False)]
+)
+def test_the_variable_that_makes_problems_fatal(
+    value: str, strict: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(registry.STRICT, value)
+    assert registry.is_strict() is strict
 
 
 def test_a_plugin_that_cannot_be_imported_is_named_and_skipped() -> None:

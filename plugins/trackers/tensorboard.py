@@ -1,0 +1,74 @@
+"""Every seed's curves in TensorBoard.
+
+    qrlsuite run --task beam6g --model mlp --track tensorboard
+    tensorboard --logdir runs
+
+Event files lie in `tensorboard/` in each seed's folder; with `--track tensorboard=DIR`, in
+`DIR/<task>/<entry>/seed-0007`. Scalars by epoch: `validation/score` is the mean over the validation episodes,
+`training/return`, `training/score`, `training/loss` and the algorithm's other metrics are those of `epochs.jsonl`.
+
+A resumed run repeats the epochs after its checkpoint. Its new event file says where it goes on, and readers drop
+what earlier files have from there (TensorBoard's session start), so every epoch is shown once. Files are opened for
+each epoch alone: a worker trains a hundred seeds, and TensorBoard's own writer would keep a thread for each.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+
+class TensorBoard:
+    """Writes event files.
+
+    Parameters
+    ----------
+    target:
+        The folder to write below; None for the seeds' own folders.
+    """
+
+    def __init__(self, target: str | None = None) -> None:
+        self.target = None if target is None else Path(target).expanduser().absolute()
+        self._files: dict[str, Path] = {}
+
+    def run_started(self, run: Mapping[str, Any]) -> None:
+        """Open a new event file for a seed, which goes on after `run["epochs"]`."""
+        own = Path(run["folder"])
+        folder = own / "tensorboard"
+        if self.target is not None:
+            folder = self.target / run["task"] / run["entry"] / own.name
+        folder.mkdir(parents=True, exist_ok=True)
+        # readers go through files in the order of their names
+        path = folder / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}"
+        self._files[run["folder"]] = path
+        start = SessionLog(status=SessionLog.START)
+        _append(
+            path,
+            Event(wall_time=time.time(), file_version="brain.Event:2"),
+            Event(wall_time=time.time(), step=int(run["epochs"]) + 1, session_log=start),
+        )
+
+    def epoch_finished(self, run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+        """Append an epoch's scalars."""
+        scores = record["scores"]
+        scalars = {"validation/score": sum(scores) / len(scores)}
+        for name, value in record.items():
+            if name != "epoch" and isinstance(value, int | float):  # None: there is no value in this epoch
+                scalars[f"training/{name.removeprefix('train_')}"] = float(value)
+        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
+        event = Event(wall_time=time.time(), step=record["epoch"], summary=Summary(value=values))
+        _append(self._files[run["folder"]], event)
+
+
+def _append(path: Path, *events: Event) -> None:
+    with path.open("ab") as file:
+        writer = RecordWriter(file)
+        for event in events:
+            writer.write(event.SerializeToString())
