@@ -32,7 +32,7 @@
       const words = matrix.tBodies[0].rows[a].cells[b + 1].title;
       const [one, other] = [a, b].map((place) => section.evidence[`${place}/${runs}`]);
       const interval = (numbers, k) => `${short(numbers.s[k])} (${short(numbers.l[k])} to ${short(numbers.h[k])})`;
-      const head = element("tr", {}, element("th", { scope: "col" }, section.levelName));
+      const head = element("tr", {}, element("th", { scope: "col" }, `${section.levelName} \\ δ`));
       for (const delta of section.deltas) head.append(element("th", { scope: "col" }, delta));
       const body = element("tbody");
       section.levels.forEach((level, e) => {
@@ -47,8 +47,7 @@
         });
         body.append(row);
       });
-      const top = element("tr", {}, element("td"), element("th", { scope: "colgroup", colspan: section.deltas.length }, "δ"));
-      const table = element("table", { class: "cells" }, element("thead", {}, top, head), body);
+      const table = element("table", { class: "cells" }, element("thead", {}, head), body);
       const unit = section.horizon >= 20000 ? "in thousands of steps" : "in steps";
       return result.replaceChildren(
         element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Cells of the pair" }, table),

@@ -6,20 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from qrlsuite.leaderboard.absent import absent
 from qrlsuite.leaderboard.board import Row, Section, undecided_reason
 from qrlsuite.leaderboard.report import ladder
+from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.report.judge import Judgement, judge
-from qrlsuite.leaderboard.report.words import counted, in_unit, listed, short
-from qrlsuite.statistics import Evidence, Grid, Outcome, at_cap, unsettled, unsettled_at
+from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
+from qrlsuite.leaderboard.report.words import counted, listed, short
+from qrlsuite.statistics import Evidence, Grid, Outcome, SignificanceRule
 from qrlsuite.task import RankingSection
 
-LEVELS = 10
-"""Shades of a surface."""
-BARS = ((0.2, 0.15, 0.1), (0.5, 0.75))
-"""The paper's cells for bars: epsilons and deltas (its figure 6)."""
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
 
@@ -41,18 +38,6 @@ class RowView:
 
 
 @dataclass(frozen=True)
-class CellView:
-    """A cell of a surface: its text, its shade and what a pointer shows."""
-
-    text: str
-    level: int
-    capped: bool
-    unsettled: bool
-    reference: bool
-    title: str
-
-
-@dataclass(frozen=True)
 class SectionView:
     """Everything that the template needs; see the template for the meaning of each."""
 
@@ -64,6 +49,7 @@ class SectionView:
     lead: str
     rows: tuple[RowView, ...]
     wanted: int
+    missing: str
     ladder: ladder.Ladder
     matrix: tuple[tuple[tuple[str, str, str], ...], ...]
     surfaces: tuple[tuple[tuple[CellView, ...], ...], ...]
@@ -88,26 +74,29 @@ class SectionView:
         return any(row.entry.quantum for row in self.rows)
 
 
-def view(section: Section, number: int, entries: dict[int, EntryView]) -> SectionView:
+def view(section: Section, number: int, entries: dict[int, EntryView], rule: SignificanceRule) -> SectionView:
     """Return a section of the page.
 
     Parameters
     ----------
     entries:
         The page's entries by the identity of their curves.
+    rule:
+        The one that judged the board.
     """
-    judgement = judge([row.entry for row in section.rows], section.horizon)
+    judgement = judge([row.entry for row in section.rows], section.horizon, rule)
     ranking = section.rows[0].entry.task_file.ranking
     rows = tuple(
         _row(place, row, entries[id(row.entry)], judgement) for place, row in enumerate(section.rows)
     )
     unit = 1000 if section.horizon >= 20_000 else 1
     grid = judgement.grid
-    bars = _bar_grid(ranking)
+    bars = bar_grid(ranking)
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
     names = [f"{float(value):g}" for value in grid.epsilons or grid.thresholds]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
-    surfaces = tuple(_surface(judgement.own(place), ranking, unit) for place in range(len(rows)))
+    missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
+    surfaces = tuple(surface(judgement.own(place), ranking, unit) for place in range(len(rows)))
     return SectionView(
         id=f"board-{number}",
         number=number,
@@ -117,23 +106,24 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         lead=_lead(rows),
         rows=rows,
         wanted=section.rows[0].entry.task_file.protocol.seeds,
+        missing=listed(missing) if missing else "",
         ladder=ladder.draw(judgement.beats(), [row.tier for row in section.rows]),
         matrix=tuple(
             tuple(_matrix_cell(judgement, i, j) for j in range(len(rows))) for i in range(len(rows))
         ),
         surfaces=surfaces,
         bars=tuple(
-            tuple(cell for line in _surface(evidence, ranking, unit) for cell in line)
+            tuple(cell for line in surface(evidence, ranking, unit) for cell in line)
             for evidence in bar_evidence
         ),
         bar_names=tuple(
-            f"{_symbol(bars)} {float(value):g}, δ {float(delta):g}"
+            f"{symbol(bars)} {float(value):g}, δ {float(delta):g}"
             for value in bars.epsilons or bars.thresholds
             for delta in bars.deltas
         ),
         thresholds=tuple(names),
         threshold_name="epsilon" if grid.epsilons else "return",
-        threshold_symbol=_symbol(grid),
+        threshold_symbol=symbol(grid),
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
         unit="thousands of environment steps" if unit == 1000 else "environment steps",
@@ -194,56 +184,6 @@ def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str,
     return texts.get(outcome, "·"), SIGNS.get(outcome, "tie"), pair.words(row)
 
 
-def _surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tuple[CellView, ...], ...]:
-    """Return E lines of D cells: S_hat of an entry at all its runs."""
-    grid, horizon = evidence.grid, evidence.entry.horizon
-    point, interval = evidence.point, evidence.interval()
-    capped = at_cap(interval, horizon)
-    open_end = _unsettled(evidence)
-    wanted = ranking.reference.epsilon if grid.epsilons else ranking.reference.threshold
-    lines = []
-    for i, value in enumerate(grid.epsilons or grid.thresholds):
-        cells = []
-        for j, delta in enumerate(grid.deltas):
-            sign = "≥ " if open_end[i, j] else ""
-            low, high = (short(float(v)) for v in interval[i, j])
-            mark = ", at cap" if capped[i, j] else ""
-            share = float(point[i, j]) / horizon
-            cells.append(
-                CellView(
-                    text=in_unit(float(point[i, j]), unit),
-                    level=min(LEVELS - 1, int(LEVELS * share)),
-                    capped=bool(capped[i, j]),
-                    unsettled=bool(open_end[i, j]),
-                    reference=value == wanted and float(delta) == ranking.reference.delta,
-                    title=f"{sign}{short(float(point[i, j]))} ({low} to {high}{mark})",
-                )
-            )
-        lines.append(tuple(cells))
-    return tuple(lines)
-
-
-def _unsettled(evidence: Evidence) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    grid, values = evidence.grid, evidence.entry.values
-    if grid.epsilons is not None:
-        return unsettled(values, grid.epsilons, [float(d) for d in grid.deltas])
-    return unsettled_at(values, grid.thresholds, [float(d) for d in grid.deltas])
-
-
-def _bar_grid(ranking: RankingSection) -> Grid:
-    """Return the cells of the bars: the paper's where the task's grid has its epsilons, else like them."""
-    levels = ranking.epsilons or ranking.thresholds or []
-    if ranking.epsilons and set(BARS[0]) <= set(ranking.epsilons):
-        return Grid.relative(BARS[0], BARS[1])
-    chosen = sorted({levels[i] for i in (0, len(levels) // 2, -1)}, reverse=ranking.epsilons is not None)
-    make = Grid.relative if ranking.epsilons else Grid.absolute
-    return make(chosen, BARS[1])
-
-
-def _symbol(grid: Grid) -> str:
-    return "ε" if grid.epsilons else "V*"
-
-
 def _data(
     section: Section,
     judgement: Judgement,
@@ -261,7 +201,7 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "level": level,
         "score": "validation score (received / optimal)" if relative else "validation score",
-        "levelName": _symbol(judgement.grid),
+        "levelName": symbol(judgement.grid),
         "levels": [f"{float(value):g}" for value in judgement.grid.epsilons or judgement.grid.thresholds],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],
         "pairs": [[pair.first, pair.second, pair.n_runs, pair.cells] for pair in judgement.pairs],
@@ -270,7 +210,7 @@ def _data(
             for (place, n_runs), evidence in judgement.evidence.items()
         },
         "bars": {
-            "levels": [f"{_symbol(bars)} = {float(value):g}" for value in bars.epsilons or bars.thresholds],
+            "levels": [f"{symbol(bars)} = {float(value):g}" for value in bars.epsilons or bars.thresholds],
             "deltas": [f"δ = {float(delta):g}" for delta in bars.deltas],
             "entries": [_numbers(evidence) for evidence in bar_evidence],
         },

@@ -1,0 +1,80 @@
+"""Sample complexity over a grid of cells: the surface of an entry, and the few cells drawn as bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.leaderboard.report.words import in_unit, short
+from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled, unsettled_at
+from qrlsuite.task import RankingSection
+
+LEVELS = 10
+"""Shades of a surface."""
+BARS = ((0.2, 0.15, 0.1), (0.5, 0.75))
+"""The paper's cells for bars: epsilons and deltas (its figure 6)."""
+
+
+@dataclass(frozen=True)
+class CellView:
+    """A cell of a surface: its text, its shade and what a pointer shows."""
+
+    text: str
+    level: int
+    capped: bool
+    unsettled: bool
+    reference: bool
+    title: str
+
+
+def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tuple[CellView, ...], ...]:
+    """Return E lines of D cells: S_hat of an entry at all its runs."""
+    grid, horizon = evidence.grid, evidence.entry.horizon
+    point, interval = evidence.point, evidence.interval()
+    capped = at_cap(interval, horizon)
+    open_end = _unsettled(evidence)
+    wanted = ranking.reference.epsilon if grid.epsilons else ranking.reference.threshold
+    lines = []
+    for i, value in enumerate(grid.epsilons or grid.thresholds):
+        cells = []
+        for j, delta in enumerate(grid.deltas):
+            sign = "≥ " if open_end[i, j] else ""
+            low, high = (short(float(v)) for v in interval[i, j])
+            mark = ", at cap" if capped[i, j] else ""
+            share = float(point[i, j]) / horizon
+            cells.append(
+                CellView(
+                    text=in_unit(float(point[i, j]), unit),
+                    level=min(LEVELS - 1, int(LEVELS * share)),
+                    capped=bool(capped[i, j]),
+                    unsettled=bool(open_end[i, j]),
+                    reference=value == wanted and float(delta) == ranking.reference.delta,
+                    title=f"{sign}{short(float(point[i, j]))} ({low} to {high}{mark})",
+                )
+            )
+        lines.append(tuple(cells))
+    return tuple(lines)
+
+
+def _unsettled(evidence: Evidence) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    grid, values = evidence.grid, evidence.entry.values
+    if grid.epsilons is not None:
+        return unsettled(values, grid.epsilons, [float(d) for d in grid.deltas])
+    return unsettled_at(values, grid.thresholds, [float(d) for d in grid.deltas])
+
+
+def bar_grid(ranking: RankingSection) -> Grid:
+    """Return the cells of the bars: the paper's where the task's grid has its epsilons, else like them."""
+    levels = ranking.epsilons or ranking.thresholds or []
+    if ranking.epsilons and set(BARS[0]) <= set(ranking.epsilons):
+        return Grid.relative(BARS[0], BARS[1])
+    chosen = sorted({levels[i] for i in (0, len(levels) // 2, -1)}, reverse=ranking.epsilons is not None)
+    make = Grid.relative if ranking.epsilons else Grid.absolute
+    return make(chosen, BARS[1])
+
+
+def symbol(grid: Grid) -> str:
+    """Return the sign of a grid's thresholds."""
+    return "ε" if grid.epsilons else "V*"
