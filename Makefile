@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test install install-dev
+.PHONY: quickstart test docs install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite run --task beam6g --model mlp --quick --runs $(RUNS)
@@ -20,11 +20,16 @@ test: install-dev
 	cd $(VENV) && MYPYPATH=wheel bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
+# Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
+docs: install-dev
+	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
+	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 install: $(BIN)/python
 	$(BIN)/pip install --quiet .
 
 install-dev: $(BIN)/python
-	$(BIN)/pip install --quiet --editable '.[dev]'
+	$(BIN)/pip install --quiet --editable '.[dev,docs]'
 
 # The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,
 # install the torch of your choice into $(VENV) before anything else; it is kept.

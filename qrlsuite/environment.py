@@ -27,7 +27,7 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     step; then infos hold, as Gymnasium's same-step mode does, `final_obs` (num_envs, ...) with mask
     `_final_obs`, and `final_info`, a dict that may hold `score` (num_envs,) with mask `_score`.
 
-    All randomness comes from `self.streams`: stream g serves the lanes g*m .. (g+1)*m - 1, m =
+    All randomness comes from `self.streams`: stream g serves the lanes `g*m .. (g+1)*m - 1`, m =
     num_envs / len(streams), in lane order, so that an episode never depends on lanes of another stream.
     """
 

@@ -1,0 +1,77 @@
+"""The documentation is built with warnings as errors, needs no network, and holds the API that others use."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import statistics, testing
+from qrlsuite.specs import Spec
+from tests.docs.test_plugins import HOOKS
+
+ROOT = Path(__file__).parents[2]
+pytest.importorskip("mkdocs", reason="needs the extra 'docs'")
+pytest.importorskip("mkdocstrings_handlers.python", reason="needs the extra 'docs'")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built pages."""
+    folder = tmp_path_factory.mktemp("site")
+    package = folder / "package" / "qrlsuite"  # as in a wheel: the mapped folders inside
+    package.mkdir(parents=True)
+    for source in (ROOT / "qrlsuite").iterdir():
+        (package / source.name).symlink_to(source)
+    for name in ("plugins", "tasks", "leaderboard"):
+        (package / name).symlink_to(ROOT / name)
+    env = {**os.environ, "QRLSUITE_DOCS_PACKAGE": str(package.parent), "NO_MKDOCS_2_WARNING": "1"}
+    words = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        str(folder / "html"),
+    ]
+    done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:
+        loaded = re.findall(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?([^\"' >]+)", page.read_text())
+        loaded += re.findall(r"<link\b(?![^>]*canonical)[^>]*\bhref=[\"']?([^\"' >]+)", page.read_text())
+        assert not [address for address in loaded if re.match(r"(?:https?:)?//", address)], page
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("hooks", [f"qrlsuite.hookspecs.{name}" for name in HOOKS]),
+        ("specs", [f"qrlsuite.specs.{cls.__name__}" for cls in Spec.__subclasses__()]),
+        ("testing", [f"qrlsuite.testing.{name}" for name in testing.__all__]),
+        ("statistics", [f"qrlsuite.statistics.{name}" for name in statistics.__all__]),
+        ("circuit", ["qrlsuite.circuit.description.Circuit", "qrlsuite.circuit.api.expectations"]),
+        (
+            "core",
+            ["qrlsuite.algorithm.Algorithm", "qrlsuite.environment.LaneEnv", "qrlsuite.population.stack"],
+        ),
+        ("algorithms", ["qrlsuite.plugins.algorithms.ddqn.DDQN"]),
+        ("models", ["qrlsuite.plugins.models.mlp.Options"]),
+        ("environments", ["qrlsuite.plugins.environments.beam6g.env.BeamManagement6G"]),
+    ],
+)
+def test_what_others_use_is_in_the_reference(site: Path, page: str, names: list[str]) -> None:
+    text = (site / "api" / f"{page}.html").read_text()
+    missing = [name for name in names if f'id="{name}"' not in text]
+    assert not missing
