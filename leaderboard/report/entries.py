@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,8 +67,25 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
         ("Core-hours", f"{entry.hours:.2f}"),
+        ("Circuit executions", _told(getattr(entry, "executions", None))),
+        ("Preset", _told(getattr(entry, "preset", None))),
+        ("Versions", _told(getattr(entry, "versions", None))),
+        ("Code revision", _told(getattr(entry, "commits", None))),
+        ("Processor", _told(getattr(entry, "processors", None))),
+        ("Source", _told(getattr(entry, "source", None))),
         ("Task definition", clean(entry.task_hash)),
     ]
+
+
+def _told(value: Any) -> str:
+    """Write a piece of provenance on one line; nothing where it is not known."""
+    if not value:
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{clean(name)} {_told(part)}".strip() for name, part in value.items())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return ", ".join(_told(part) for part in value)
+    return f"{value:,}" if isinstance(value, int) else clean(value)
 
 
 def _options(entry: EntryCurves) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
