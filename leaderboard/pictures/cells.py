@@ -124,5 +124,5 @@ def cut_note(entries: Sequence[EntryCurves], horizon: int) -> str:
     if horizon in entries[0].task_file.ranking.horizons:
         return ""
     short = min(entries, key=lambda entry: int(entry.curves.shape[1]) * entry.steps_per_epoch)
-    why = f", the length of {short.label}" if len(entries) > 1 else ""
+    why = f", the length of {style.plain(short.label)}" if len(entries) > 1 else ""
     return f"all cut to {style.thousands(horizon)} steps{why}"

@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.leaderboard.collect import EntryCurves
-from qrlsuite.leaderboard.pictures import style
+from qrlsuite.leaderboard.pictures import cells, style
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,15 @@ class Options:
 
 
 def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
-    """Draw the validation score of each entry against environment steps."""
+    """Draw the validation score of each entry against environment steps.
+
+    Raises
+    ------
+    OptionError
+        If the entries belong to different tasks.
+    """
     chosen: Options = options.build(Options, settings, "picture 'curves'")
+    cells.one_task(entries, "curves")
     figure = Figure(figsize=(7.2, 4.3), layout="constrained")
     axes = figure.subplots()
     few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other

@@ -82,7 +82,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     few = _sample(entries, grid, horizon, chosen.few, chosen.draws, generator)
     most = min(len(entry.seeds) for entry in entries) // (2 if len(entries) == 1 else 1)
     many = _sample(entries, grid, horizon, most, chosen.draws, generator, resample=len(entries) == 2)
-    names = style.labels(entries) if len(entries) == 2 else ["set A", "set B"]
+    names = style.labels(entries, 26) if len(entries) == 2 else ["set A", "set B"]
     return _figure(entries, names, grid, horizon, few, many, chosen.few, most)
 
 

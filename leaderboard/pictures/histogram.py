@@ -85,8 +85,8 @@ def draw(episodes: Mapping[str, ArrayLike], **settings: Any) -> Figure:
     panels[-1].set_xlabel(style.plain(chosen.quantity))
     panels[-1].set_xlim(low, high)
     if chosen.title:
-        figure.suptitle(style.plain(chosen.title), x=0.01, ha="left", fontsize="medium")
-    style.footnotes(figure, "dashed: mean", style.plain(chosen.note))
+        figure.suptitle(style.plain(chosen.title, 200), x=0.01, ha="left", fontsize="medium")
+    style.footnotes(figure, "dashed: mean", style.plain(chosen.note, 1000))
     return figure
 
 

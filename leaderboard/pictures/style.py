@@ -58,9 +58,11 @@ def label(entry: EntryCurves) -> str:
     return f"{plain(entry.label)}  ({seeds_text(entry)})"
 
 
-def plain(text: str) -> str:
-    """Return text that matplotlib draws as it is: without mathematics between dollar signs."""
-    return text.replace("\\", "\\\\").replace("$", r"\$")
+def plain(text: str, longest: int = 60) -> str:
+    """Return text that matplotlib draws as it is: no mathematics, no control characters, and not too long."""
+    visible = "".join(c if c.isprintable() else "?" for c in text)
+    short = visible if len(visible) <= longest else f"{visible[: longest - 3]}..."
+    return short.replace("$", r"\$")
 
 
 def note(entries: Sequence[EntryCurves]) -> str:
@@ -90,7 +92,7 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def labels(entries: Sequence[EntryCurves]) -> list[str]:
+def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
     """Return what legends call entries: without the algorithm where all share it, never twice the same."""
     algorithms = {entry.algorithm for entry in entries}
     short = [
@@ -98,7 +100,7 @@ def labels(entries: Sequence[EntryCurves]) -> list[str]:
         for entry in entries
     ]
     return [
-        plain(text if short.count(text) == 1 else f"{text} {entry.name.rpartition('-')[2]}")
+        plain(text if short.count(text) == 1 else f"{entry.name.rpartition('-')[2]} {text}", longest)
         for text, entry in zip(short, entries)
     ]
 

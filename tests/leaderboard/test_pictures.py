@@ -1,0 +1,273 @@
+"""Pictures: they show the numbers that they should, say on how many seeds these rest, and survive any name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from qrlsuite import options, specs
+from qrlsuite import task as tasks
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.collect import EntryCurves
+
+FILE = tasks.load("beam6g").file
+
+
+def learner(
+    label: str = "ddqn mlp width=16",
+    first_good: int = 10,
+    seeds: int = 30,
+    epochs: int = 100,
+    quantum: int = 0,
+    task: str = "beam6g",
+    model_options: dict[str, Any] | None = None,
+    environment_options: dict[str, Any] | None = None,
+) -> EntryCurves:
+    """All runs reach .95 after the same epoch and stay: S_hat is that epoch in every cell, without spread."""
+    curves = np.zeros((seeds, epochs))
+    curves[:, first_good:] = 0.95
+    return EntryCurves(
+        name=label,
+        label=label,
+        task=task,
+        task_hash=task,
+        task_file=FILE,
+        algorithm="ddqn",
+        model=label.split()[1],
+        parameters=(387, quantum),
+        curves=curves,
+        seeds=tuple(range(seeds)),
+        left_out=(),
+        hours=0.1,
+        folder=Path(label),
+        identity={
+            "model_options": model_options or {},
+            "task": {"environment_options": environment_options or {}},
+        },
+    )
+
+
+def noisy(label: str, seeds: int = 30, level: float = 0.9) -> EntryCurves:
+    entry = learner(label, seeds=seeds)
+    generator = np.random.default_rng(len(label))
+    pace = generator.lognormal(2.5, 0.4, (seeds, 1))
+    entry.curves[:] = np.clip(
+        level - level * np.exp(-np.arange(1, 101) / pace) + 0.03 * generator.standard_normal((seeds, 100)),
+        0,
+        1,
+    )
+    return entry
+
+
+def texts(figure: Figure) -> str:
+    """Everything that is written in a picture."""
+    found: list[str] = [text.get_text() for text in figure.findobj(lambda a: hasattr(a, "get_text"))]  # type: ignore[attr-defined]
+    return "\n".join(found)
+
+
+def bars(axes: Axes) -> list[Rectangle]:
+    return [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height() > 0]
+
+
+ENTRIES: Sequence[EntryCurves] = (
+    learner("ddqn mlp width=16", 40, model_options={"width": 16}),
+    learner("ddqn mlp width=64", 10, model_options={"width": 64}),
+)
+
+
+def test_kinds_have_a_line_settings_and_a_drawing_function() -> None:
+    for picture in pictures.KINDS.values():
+        assert len(picture.summary) <= 63, "a line of 80 characters in `qrlsuite plot --help`"
+        assert callable(specs.resolve(f"{picture.module}:draw"))
+        assert all(row["description"] for row in options.describe(specs.resolve(picture.options)))
+
+
+@pytest.mark.parametrize(
+    "kind", [name for name, picture in pictures.KINDS.items() if picture.of == "entries"]
+)
+@pytest.mark.parametrize("format_", ["png", "svg"])
+def test_any_name_can_be_drawn_and_seeds_are_stated(kind: str, format_: str) -> None:
+    names = ["ddqn <b>$x^$ 50\\% & \ud800\x00\u202e", "ddqn mlp " + "long " * 40]
+    entries = [noisy(name) for name in names]
+    for k, entry in enumerate(entries):
+        object.__setattr__(entry, "model", "mlp")
+        object.__setattr__(entry, "identity", {"model_options": {"width": k + 1}})
+    figure = pictures.draw(kind, entries)
+    written = texts(figure)
+    assert "30 seeds*" in written or "30 of 100 seeds" in written
+    assert "provisional" in written
+    encoded = pictures.encode(figure, format_)
+    assert encoded.startswith(b"\x89PNG" if format_ == "png" else b"<?xml")
+    assert b"<b>" not in encoded
+
+
+def test_a_complete_entry_is_not_called_provisional() -> None:
+    written = texts(pictures.draw("bars", [learner(seeds=100)]))
+    assert "100 seeds" in written
+    assert "provisional" not in written
+
+
+def test_bars_have_the_height_of_s_hat_and_fade_at_the_cap() -> None:
+    never = learner("ddqn mlp width=8", 100)
+    figure = pictures.draw("bars", [*ENTRIES, never], epsilons=[0.2], deltas=[0.5])
+    first, second, third = bars(figure.axes[0])
+    assert [patch.get_height() for patch in (first, second, third)] == [80_000, 20_000, 200_000]
+    assert [patch.get_alpha() for patch in (first, second, third)] == [1, 1, 0.3]
+    assert "≥" in texts(figure)
+    assert "faded" in texts(figure)
+
+
+def test_surface_writes_s_hat_in_thousands() -> None:
+    figure = pictures.draw("surface", ENTRIES, epsilons=[0.2, 0.3], deltas=[0.5])
+    written = texts(figure).split("\n")
+    assert written.count("80") == 2
+    assert written.count("20") == 2
+    assert "387 parameters, 30 seeds*" in texts(figure)
+
+
+def test_a_picture_is_cut_to_the_shortest_entry_and_says_so() -> None:
+    figure = pictures.draw("surface", [ENTRIES[0], learner("ddqn mlp width=8", 5, epochs=20)])
+    assert "all cut to 40k steps, the length of ddqn mlp width=8" in " ".join(texts(figure).split())
+    with pytest.raises(OptionError, match="'ddqn mlp width=8' ends at 40000 steps"):
+        pictures.draw("surface", [ENTRIES[0], learner("ddqn mlp width=8", 5, epochs=20)], horizon=100_000)
+
+
+def test_scaling_orders_by_size_with_a_panel_per_model() -> None:
+    quantum = [
+        learner(f"ddqn vqc qubits={n}", first, quantum=n, model_options={"qubits": n, "layers": 4})
+        for n, first in ((10, 20), (6, 30), (8, 25))
+    ]
+    figure = pictures.draw("scaling", [*ENTRIES, *quantum])
+    classical, circuits = figure.axes
+    assert (classical.get_xlabel(), circuits.get_xlabel()) == ("width", "qubits")
+    line = circuits.get_lines()[0]
+    assert list(line.get_xdata()) == [6, 8, 10]
+    assert list(line.get_ydata()) == [60_000, 50_000, 40_000]
+    assert "387 + 8" in texts(figure)
+
+
+def test_scaling_draws_depth_for_each_width_but_no_line_of_chance_pairs() -> None:
+    entries = [
+        learner(f"ddqn mlp width={w} depth={d}", w // 4, model_options={"width": w, "depth": d})
+        for w, d in [(16, 2), (32, 2), (64, 2), (32, 1), (32, 3), (64, 1), (64, 3)]
+    ]
+    width, depth = pictures.draw("scaling", entries).axes
+    assert [line.get_label() for line in width.get_lines() if not str(line.get_label()).startswith("_")] == [
+        "mlp"
+    ]
+    labels = {line.get_label() for line in depth.get_lines() if not str(line.get_label()).startswith("_")}
+    assert labels == {"mlp width=32", "mlp width=64"}
+
+
+def test_scaling_over_tasks_averages_instances() -> None:
+    entries = [
+        learner(f"ddqn mlp {n}-{k}", first, task=f"a{n}-{k}", environment_options={"antennas": [[0]] * n})
+        for n, k, first in ((2, 0, 10), (2, 1, 20), (3, 0, 30), (3, 1, 50))
+    ]
+    figure = pictures.draw("scaling", entries, by="environment.antennas")
+    line = figure.axes[0].get_lines()[0]
+    assert (list(line.get_xdata()), list(line.get_ydata())) == ([2, 3], [30_000, 80_000])
+    assert "mean over instances" in texts(figure)
+    with pytest.raises(
+        OptionError, match=r"by = 'environment\.antenas'.*did you mean 'environment\.antennas'"
+    ):
+        pictures.draw("scaling", entries, by="environment.antenas")
+
+
+def test_tiers_say_in_how_many_cells() -> None:
+    few = learner("ddqn mlp width=8", 10, seeds=10)
+    figure = pictures.draw("tiers", [*ENTRIES, few])
+    written = texts(figure)
+    assert "49" in written.split("\n"), "width=64 needs fewer samples in all cells"
+    assert "tier 1" in written
+    assert "undecided: fewer than 20 seeds" in written
+
+
+def test_few_runs_of_one_entry_are_disjoint_sets_and_equally_often_ahead() -> None:
+    from qrlsuite.leaderboard.pictures import few_runs
+    from qrlsuite.statistics import Grid
+
+    entry = noisy("ddqn mlp width=64", 40, 0.95)
+    drawn = few_runs._sample([entry], Grid.relative([0.2], [0.75]), 200_000, 5, 400, np.random.default_rng(0))
+    assert all(not set(a) & set(b) for a, b in zip(*(runs.tolist() for runs in drawn.runs)))
+    ahead, behind = (drawn.steps[0] < drawn.steps[1]).mean(), (drawn.steps[0] > drawn.steps[1]).mean()
+    assert abs(ahead - behind) < 0.1
+    with pytest.raises(OptionError, match="has 9 seeds; this picture needs 10"):
+        pictures.draw("few-runs", [learner(seeds=9)])
+    with pytest.raises(OptionError, match="one or two entries, not 3"):
+        pictures.draw("few-runs", [*ENTRIES, learner("ddqn mlp width=8")])
+
+
+def test_estimator_draws_the_exact_binomial() -> None:
+    from math import comb
+
+    axes = pictures.draw("estimator", runs=5, deltas=[0.9]).axes[0]
+    curve = next(line for line in axes.get_lines() if line.get_label() == "δ = 0.9")
+    at = int(np.argmin(np.abs(np.asarray(curve.get_xdata()) - 0.8)))
+    # of 5 runs 5 must be there: the chance that one is not
+    assert np.asarray(curve.get_ydata())[at] == pytest.approx(1 - comb(5, 5) * 0.8**5)
+
+
+def test_histogram_says_means_and_numbers_of_episodes() -> None:
+    from qrlsuite.leaderboard.pictures import histogram
+
+    figure = histogram.draw({"optimal": np.full(4, 2.0), "mlp": np.array([[1.0, 2.0], [3.0, 2.0]])})
+    assert "optimal   mean 2   (4 episodes)" in texts(figure)
+    assert "mlp   mean 2   (2 x 2 episodes)" in texts(figure)
+    with pytest.raises(OptionError, match="policy 'mlp' has a value that is not finite"):
+        histogram.draw({"mlp": [1.0, float("nan")]})
+    with pytest.raises(OptionError, match="at least one policy"):
+        histogram.draw({})
+
+
+def test_curves_show_single_runs_of_few() -> None:
+    few = pictures.draw("curves", [learner(seeds=3)])
+    assert len(few.axes[0].get_lines()) == 4
+    many = pictures.draw("curves", [learner(seeds=50)])
+    assert len(many.axes[0].get_lines()) == 1
+    assert not [c for c in many.axes[0].collections if isinstance(c, PathCollection)]
+
+
+@pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers", "few-runs"])
+def test_entries_of_two_tasks_are_not_mixed(kind: str) -> None:
+    with pytest.raises(OptionError, match="shows one task"):
+        pictures.draw(kind, [learner(), learner("ddqn mlp width=8", task="other")])
+    with pytest.raises(OptionError, match="at least one entry"):
+        pictures.draw(kind, [])
+
+
+def test_unknown_kinds_and_settings_get_the_nearest_match() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'surface'"):
+        pictures.draw("surfce", ENTRIES)
+    with pytest.raises(OptionError, match="no option 'styl'; did you mean 'style'"):
+        pictures.draw("surface", ENTRIES, styl="3d")
+
+
+def test_naming_the_kinds_imports_no_matplotlib() -> None:
+    program = (
+        "import sys; from qrlsuite.leaderboard import pictures; assert pictures.KINDS; "
+        "assert 'matplotlib' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_no_global_state_of_matplotlib_is_touched() -> None:
+    program = (
+        "import sys, matplotlib; now = lambda: {k: matplotlib.rcParams[k] for k in matplotlib.rcParams "
+        "if k != 'backend'}; before = now(); "  # asking for the backend imports pyplot
+        "from tests.leaderboard.test_pictures import ENTRIES, pictures; "
+        "[pictures.draw(k, ENTRIES) for k in ('curves', 'bars', 'surface')]; "
+        "assert 'matplotlib.pyplot' not in sys.modules; assert before == now()"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
