@@ -130,6 +130,7 @@
         window.Plotly.react(node, ...make({ width }, section, shown, singles.checked), CONFIG);
       }
     };
+    legend.classList.toggle("many", places.length > 6);
     places.forEach((place) => {
       const box = element("input", { type: "checkbox", "data-place": place });
       box.checked = shown.has(place);
