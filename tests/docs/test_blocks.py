@@ -1,0 +1,92 @@
+"""Python on the pages runs, and the README's plugin is a package that installs and conforms."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+ELSEWHERE = {"plugins.md": "test_plugins.py", "statistics.md": "tests/statistics/test_docs.py"}
+"""Pages whose blocks other tests run."""
+OWN_FILE = "# my_ansatz.py\n"
+
+
+def blocks() -> list[Any]:
+    found = []
+    for page in PAGES:
+        texts = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+        found += [
+            pytest.param(text, id=f"{page.name}-{number}")
+            for number, text in enumerate(texts)
+            if page.name not in ELSEWHERE and not text.startswith(OWN_FILE)
+        ]
+    return found
+
+
+@pytest.fixture
+def results(train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder of a user who has trained an entry of beam6g."""
+    entry = train("runs", [0, 1])
+    shutil.copytree(entry, tmp_path / "user" / "runs" / "beam6g" / "ENTRY")
+    monkeypatch.chdir(tmp_path / "user")
+    return tmp_path / "user"
+
+
+@pytest.mark.parametrize("text", blocks())
+def test_a_block_runs(text: str, results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec(text, names)
+    if "curves" in names:
+        table = names["curves"].to_pydict()
+        assert table["epoch"] == [1, 2, 3] * 2
+        assert len(set(table["__filename"])) == 2
+    if "env" in names:
+        names["env"].close()
+
+
+def test_there_are_blocks_to_run() -> None:
+    assert len(blocks()) >= 6
+
+
+def test_the_readmes_plugin_is_a_package(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text()
+    (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
+    (project,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", text, re.DOTALL)
+    assert len([line for line in code.splitlines() if line.strip()]) <= 22, "twenty lines, give or take"
+    (tmp_path / "my_ansatz.py").write_text(code)
+    (tmp_path / "pyproject.toml").write_text(project)
+    site = str(tmp_path / "site")
+    install = [
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--target",
+        site,
+        ".",
+    ]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([site, os.environ.get("PYTHONPATH", "")])}
+    check = "from qrlsuite.testing import assert_conforms; assert_conforms('ansatz', 'ry-ring')"
+    for words in (install, ["-W", "error", "-P", "-c", check]):
+        done = subprocess.run(
+            [sys.executable, *words],
+            cwd=tmp_path,
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=600,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
