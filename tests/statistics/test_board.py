@@ -93,3 +93,25 @@ def test_a_rule_may_be_cyclic_and_the_board_still_ranks() -> None:
     board = outperformance([LearningCurves(entry(0).values, 2000, name) for name in "abc"], grid, Rotating())
     assert [len(tier) for tier in board.ranking.tiers] == [3]
     assert board.ranking.entries[0].cycle == ("a", "b", "c")
+
+
+def test_three_entries_in_a_circle_collapse_into_one_tier_under_the_papers_rule() -> None:
+    # At each of three thresholds one is fast, the next slow, and of the third half the runs are fast, half slow:
+    # its interval overlaps both. So a beats b, b beats c, c beats a, each at one threshold only.
+    pace = {"fast": np.full(30, 2), "slow": np.full(30, 18), "either": np.repeat([2, 18], 15)}
+
+    def runs(name: str, *paces: str) -> LearningCurves:
+        curves = np.zeros((30, 60))
+        for part, (score, word) in enumerate(zip((0.1, 0.5, 0.9), paces)):
+            for run, delay in enumerate(pace[word]):
+                curves[run, 20 * part + delay :] = score
+        return LearningCurves(curves, 100, name)
+
+    a = runs("a", "fast", "either", "slow")
+    b = runs("b", "slow", "fast", "either")
+    c = runs("c", "either", "slow", "fast")
+    behind = LearningCurves(np.zeros((30, 60)), 100, "behind")
+    board = outperformance([a, b, c, behind], Grid.relative([0.9, 0.5, 0.1], [0.5]))
+    assert board.outperforms[:3, :3].tolist() == [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    assert [[entry.name for entry in tier] for tier in board.ranking.tiers] == [["a", "b", "c"], ["behind"]]
+    assert board.ranking.entries[0].cycle == ("a", "b", "c")

@@ -1,0 +1,160 @@
+"""`plot`, `compare --rule` and `calibrate` as a user meets them, on learning curves that are simply written down."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite import registry
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, UnknownNameError
+from qrlsuite.leaderboard import collect, pictures
+from qrlsuite.leaderboard.collect import EntryCurves
+from tests.leaderboard.test_pictures import learner, noisy
+
+RUNNER = CliRunner()
+
+
+@pytest.fixture
+def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
+    """Three entries in place of a results folder."""
+    found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
+
+    def find(runs: Path, name: str) -> EntryCurves:
+        return next(entry for entry in found if name in entry.label)
+
+    monkeypatch.setattr(collect, "collect", lambda runs, task=None: (found, []))
+    monkeypatch.setattr(collect, "find", find)
+    return found
+
+
+def call(*words: str) -> str:
+    result = RUNNER.invoke(build(), list(words))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_help_lists_every_kind_of_the_suite_and_of_environments() -> None:
+    output = call("plot", "--help")
+    for name in (*pictures.KINDS, "trajectories", "field"):
+        assert f"  {name} " in output
+
+
+@pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers"])
+def test_pictures_of_entries(kind: str, entries: list[EntryCurves], tmp_path: Path) -> None:
+    out = tmp_path / "p.svg"
+    content = json.loads(call("plot", kind, "--out", str(out), "--json"))
+    assert content["seeds"] == {entry.name: 30 for entry in entries}
+    assert out.read_text().startswith("<?xml")
+
+
+def test_entries_are_drawn_in_the_order_named(entries: list[EntryCurves], tmp_path: Path) -> None:
+    words = ("--entry", "width=64", "--entry", "qubits=6", "--out", str(tmp_path / "p.png"), "--json")
+    assert list(json.loads(call("plot", "curves", *words))["seeds"]) == [
+        "ddqn mlp width=64",
+        "ddqn vqc qubits=6",
+    ]
+
+
+def test_pictures_of_an_environment(tmp_path: Path) -> None:
+    for kind, setting in (
+        ("trajectories", "environment.degree=5"),
+        ("field", "show=beam"),
+        ("field", "resolution=40"),
+    ):
+        out = tmp_path / f"{kind}.png"
+        call("plot", kind, "--task", "beam6g", "--set", setting, "--out", str(out))
+        assert out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_third_partys_environment_may_draw_and_is_checked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from dataclasses import replace
+
+    from qrlsuite.specs import EnvironmentSpec, PictureSpec
+
+    known = registry.load().entries["environments"]
+    spec = known["beam6g"].spec
+    assert isinstance(spec, EnvironmentSpec)
+    options = "qrlsuite.plugins.environments.beam6g.pictures:FieldOptions"
+    theirs = PictureSpec("map", "their map", "tests.cli.test_plot:not_a_figure", options)
+    monkeypatch.setitem(known, "beam6g", replace(known["beam6g"], spec=replace(spec, pictures=(theirs,))))
+    assert "their map (tasks of beam6g)" in call("plot", "--help")
+    with pytest.raises(PluginError, match="returned str, not a matplotlib"):
+        call("plot", "map", "--task", "beam6g", "--out", str(tmp_path / "m.png"))
+
+
+def not_a_figure(worlds: object, options: object) -> str:
+    return "no figure"
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "message"),
+    [
+        (("surfce",), UnknownNameError, "did you mean 'surface'"),
+        (("trajectory",), UnknownNameError, "did you mean 'trajectories'"),
+        (("trajectories",), OptionError, "add --task TASK"),
+        (
+            ("field", "--task", "cartpole"),
+            OptionError,
+            "shows tasks of beam6g; 'cartpole' is a task of cartpole",
+        ),
+        (("histogram",), OptionError, "drawn by: qrlsuite evaluate ENTRY"),
+        (("bars", "--set", "epsilon=[0.1]"), OptionError, "did you mean 'epsilons'"),
+        (("bars", "--set", "environment.degree=4"), OptionError, "shows what was trained"),
+        (("bars", "--set", "model.width=4"), OptionError, "write width=... for the picture"),
+        (("bars", "--out", "x.gif"), OptionError, r"must be \.png, \.pdf or \.svg"),
+    ],
+)
+def test_bad_input_says_what_to_type(
+    words: tuple[str, ...], kind: type[QrlSuiteError], message: str, entries: list[EntryCurves]
+) -> None:
+    with pytest.raises(kind, match=message):
+        call("plot", *words)
+
+
+def test_settings_are_listed() -> None:
+    assert "elevation = 22" in call("plot", "surface", "--settings")
+    assert "degrees" in call("plot", "trajectories", "--settings")
+
+
+def test_compare_fits_eighty_columns_and_names_the_rule(entries: list[EntryCurves]) -> None:
+    output = call("compare", "width=64", "width=16", "--rule", "difference")
+    head, _, sentence = output.strip().rpartition("\n")
+    assert all(len(line) <= 80 for line in head.splitlines()[:-1])
+    assert "rule 'difference'" in output
+    assert (
+        sentence == "outperforms: significantly fewer samples in 49 of 49 cells, significantly more in none"
+    )
+    assert "+ significantly fewer samples" in output
+    assert "rule" not in call("compare", "width=64", "width=16")
+
+
+def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryCurves]) -> None:
+    assert "difference-paired" in call("list", "significance-tests")
+    assert "promises: the whole grid of one pair" in call("show", "difference")
+    assert "rule 'difference': the whole grid" in call("leaderboard", "--rule", "difference")
+    assert json.loads(call("leaderboard", "--format", "json"))["rule"] == "intervals"
+
+
+def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryCurves]) -> None:
+    words = ("calibrate", "qubits=6", "--draws", "4", "--seeds", "20", "--board", "2", "--part", "pairs")
+    output = call(*words, "--rule", "intervals")
+    assert "'intervals' promises each cell by itself" in output
+    assert "a false winner between two equal entries of 20 seeds in" in output
+    content = json.loads(call(*words, "--rule", "intervals", "--json"))
+    assert [rate["seeds"] for rate in content["rates"]] == [[20, 20]]
+    assert 0 <= content["rates"][0]["winner"] <= 1
+    with pytest.raises(OptionError, match="--seeds 20;30: write two numbers"):
+        call("calibrate", "--seeds", "20;30")
+    object.__setattr__(entries[2], "curves", np.zeros((1, 100)))
+    object.__setattr__(entries[2], "seeds", (0,))
+    with pytest.raises(UnknownNameError, match="no entry with two seeds or more"):
+        call("calibrate", "qubits=6")

@@ -1,0 +1,91 @@
+"""Calibration of rules: what is planned, computed, and said in words."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrlsuite.cli.calibrate import summary, tables
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import calibration
+from qrlsuite.statistics import (
+    DifferenceRule,
+    Evidence,
+    Grid,
+    IntervalRule,
+    LearningCurves,
+    SmoothedRuns,
+    false_winners,
+    slower,
+)
+from tests.statistics.conftest import entry
+
+GRID = Grid.relative([0.3, 0.2], [0.5])
+
+
+class Always:
+    """Declares the first the winner everywhere: wrong by design."""
+
+    name, promise = "always", "nothing"
+
+    def __call__(self, first: Evidence, second: Evidence) -> Any:
+        return np.ones(first.grid.shape, dtype=int)
+
+
+def test_every_part_is_planned_for_every_entry_and_rule() -> None:
+    jobs = calibration.plan([entry(0), entry(1)], GRID, [IntervalRule(), DifferenceRule()], draws=40)
+    counts = {part: sum(job.part == part for job in jobs) for part in calibration.PARTS}
+    assert counts == {"halves": 4, "pairs": 12, "boards": 4, "power": 12}
+    assert {job.draws for job in jobs if job.part == "boards"} == {10}
+
+
+def test_a_paired_rule_is_not_asked_at_unequal_numbers() -> None:
+    jobs = calibration.plan([entry(0)], GRID, [DifferenceRule(paired=True)], 4, ["pairs"])
+    assert len(jobs) == 2
+
+
+def test_a_rule_that_always_errs_is_found_out() -> None:
+    jobs = calibration.plan([entry(0)], GRID, [Always()], 4, numbers=[(20, 20)], board=3)
+    found = [job.run() for job in jobs]
+    assert {each.part for each in found} == set(calibration.PARTS)
+    assert all(each.winner == 1 for each in found)
+    words = summary(found, "always", 3)
+    assert "false winner between two equal entries of 20 seeds in 100.0% of cases" in words
+    assert "somewhere on 100.0% of boards of 3 equals" in words
+
+
+def test_rates_are_those_of_the_statistics_and_ticks_count_draws() -> None:
+    ticks: list[int] = []
+    (job,) = calibration.plan([entry(1)], GRID, [IntervalRule()], 6, ["pairs"], [(20, 20)])
+    found = job.run(lambda: ticks.append(1))
+    rates = false_winners(SmoothedRuns(entry(1)), 20, 20, GRID, IntervalRule(), 6)
+    assert (found.winner, found.any_cell, found.draws) == (rates.winner, rates.any_cell, 6)
+    assert len(ticks) == 6
+    assert json.loads(json.dumps(found.as_dict()))["seeds"] == [20, 20]
+
+
+def test_tables_state_the_spread_over_entries_and_no_error_of_splits() -> None:
+    jobs = calibration.plan([entry(0), entry(1)], GRID, [Always()], 4, ["halves"])
+    ((sentence, rows),) = tables([job.run() for job in jobs], GRID.size, 5)
+    assert "only the spread over entries" in sentence
+    assert rows[-1][0] == "over 2 entries"
+    assert all("±" not in cell for row in rows for cell in row)
+
+
+def test_an_estimate_is_measured() -> None:
+    jobs = calibration.plan([entry(0)], GRID, [IntervalRule()], 100, ["pairs"])
+    assert calibration.estimate(jobs) > 0
+    assert calibration.estimate([]) == 0
+
+
+def test_slower_runs_get_as_far_later() -> None:
+    rising = LearningCurves(np.linspace(0.1, 1, 10)[None], 100, "a")
+    late = slower(rising, 2)
+    assert late.values[0, 9] == pytest.approx(rising.values[0, 4])
+    assert late.values[0, 3] == pytest.approx(rising.values[0, 1])
+    assert (slower(rising, 1).values == rising.values).all()
+    with pytest.raises(OptionError, match=r"factor = 0\.5"):
+        slower(rising, 0.5)
