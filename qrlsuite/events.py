@@ -7,6 +7,7 @@ are asked through the environment variable `QRLSUITE_TRACK`, which `qrlsuite run
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import logging
 import os
@@ -81,7 +82,7 @@ class EventSink:
         self._failed: set[str] = set()
         self._asked: dict[str, Any] = {}
         for word in words:
-            self._guarded(word, "its factory", lambda word=word: self._build(word))
+            self._guarded(word, "its factory", functools.partial(self._build, word))
 
     def _build(self, word: str) -> None:
         [(name, target)] = parse([word]).items()
@@ -99,11 +100,11 @@ class EventSink:
     def _listeners(self, event: str, content: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
         for hook in getattr(self.known.manager.hook, event).get_hookimpls():
             arguments = [content[name] for name in hook.argnames]
-            yield str(hook.plugin_name), lambda hook=hook, arguments=arguments: hook.function(*arguments)
+            yield str(hook.plugin_name), functools.partial(hook.function, *arguments)
         for name, tracker in self._asked.items():
             method = getattr(tracker, event, None)
             if method is not None:
-                yield name, lambda method=method: method(*content.values())
+                yield name, functools.partial(method, *content.values())
 
     def _guarded(self, name: str, what: str, call: Callable[[], Any]) -> None:
         try:

@@ -25,6 +25,7 @@ def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
     from qrlsuite.cli import (
         calibrate,
+        check,
         compare,
         evaluate,
         import_,
@@ -65,6 +66,7 @@ def build() -> typer.Typer:
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
+    app.command("check")(check.check)
     app.add_typer(study.app, name="study")
     app.add_typer(new.app, name="new")
 

@@ -29,14 +29,26 @@ __all__ = [
     "check_algorithm",
     "check_ansatz",
     "check_circuit_backend",
+    "check_engine",
     "check_environment",
     "check_model",
+    "check_significance_test",
     "check_task",
     "check_tracker",
 ]
 
-CHECKED = ("ansatzes", "circuit_backends", "models", "environments", "algorithms", "tasks")
-"""Kinds with checks of their own; of other kinds, what all have in common is checked."""
+_FILES = {
+    "ansatzes": "ansatz",
+    "circuit_backends": "backend",
+    "models": "model",
+    "environments": "environment",
+    "algorithms": "algorithm",
+    "tasks": "task",
+    "engines": "engine",
+    "significance_tests": "significance",
+    "trackers": "tracker",
+}
+"""Where the checks of each kind are; of other kinds, what all have in common is checked."""
 
 Settings = Mapping[str, Any] | None
 
@@ -49,7 +61,8 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     kind:
         `"ansatz"`, `"circuit-backend"`, `"model"`, `"environment"`, `"algorithm"`, `"task"`, `"tracker"`, ...
     name_or_spec:
-        A registered name, or a spec that need not be registered. For a tracker: a module, or its name.
+        A registered name, or a spec that need not be registered. For a plugin that implements the hooks of run
+        events: the module, or its name.
     settings:
         Values of options; others take their defaults (and circuit models two qubits and one layer).
 
@@ -63,21 +76,28 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     from qrlsuite.testing import common
 
     wanted = plural(kind)
-    if wanted == "trackers":
+    if wanted == "trackers" and not _is_named_tracker(name_or_spec):
         from qrlsuite.testing import tracker
 
-        return tracker.check(name_or_spec)
+        return tracker.check_plugin(name_or_spec)
     subject = common.subject(wanted, name_or_spec, settings)
     findings, usable = common.check_common(subject)
-    if not usable or wanted not in CHECKED:
+    if not usable or wanted not in _FILES:
         return findings
-    file = {"ansatzes": "ansatz", "circuit_backends": "backend"}.get(wanted, wanted[:-1])
-    own: list[Finding] = importlib.import_module(f"qrlsuite.testing.{file}").check(subject, **more)
+    file = importlib.import_module(f"qrlsuite.testing.{_FILES[wanted]}")
+    own: list[Finding] = file.check(subject, **more)
     return findings + own
 
 
+def _is_named_tracker(given: Any) -> bool:
+    """Tell a tracker that is registered by name from a plugin that implements the hooks of run events."""
+    from qrlsuite import registry, specs
+
+    return isinstance(given, specs.TrackerSpec) or given in registry.load().entries["trackers"]
+
+
 def plural(kind: str) -> str:
-    """Return a kind's name in the plural, as the registry has it; `"trackers"` for trackers.
+    """Return a kind's name in the plural, as the registry has it.
 
     Raises
     ------
@@ -91,7 +111,6 @@ def plural(kind: str) -> str:
     known = {single: many for many, single in registry.SINGULAR.items()} | {
         many: many for many in registry.KINDS
     }
-    known |= {"tracker": "trackers", "trackers": "trackers"}
     if word not in known:
         raise UnknownNameError(f"unknown kind '{kind}'{nearest(kind, known)}")
     return known[word]
@@ -135,9 +154,26 @@ def check_task(name_or_spec: Any) -> list[Finding]:
     return check("task", name_or_spec)
 
 
-def check_tracker(plugin: Any) -> list[Finding]:
-    """Check a tracker, given as a module, an object or a module's name: its hooks, and what they are sent."""
-    return check("tracker", plugin)
+def check_engine(name_or_spec: Any, settings: Settings = None) -> list[Finding]:
+    """Check an engine: its methods, numbers of workers, and that a new entry waits for nothing. It starts nothing."""
+    return check("engine", name_or_spec, settings)
+
+
+def check_significance_test(name_or_spec: Any) -> list[Finding]:
+    """Check a significance rule: signs, antisymmetry, direction, equal entries, one against many."""
+    return check("significance_test", name_or_spec)
+
+
+def check_tracker(name_or_plugin: Any) -> list[Finding]:
+    """Check a tracker: what a run sends it, two runs at once.
+
+    Parameters
+    ----------
+    name_or_plugin:
+        A registered name or a spec; or a plugin that implements the hooks of run events, as a module, an object
+        or a module's name.
+    """
+    return check("tracker", name_or_plugin)
 
 
 def assert_conforms(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.util
 import json
 import os
 import subprocess
@@ -80,8 +81,17 @@ class Subject:
 
     def options(self) -> Any:
         """Build the options object with the settings."""
-        cls = specs.resolve(self.references()["options"])
-        return option_values.build(cls, self.settings, self.title)
+        reference = self.references().get("options")
+        return (
+            None
+            if reference is None
+            else option_values.build(specs.resolve(reference), self.settings, self.title)
+        )
+
+    def missing(self) -> str:
+        """Return what to type for packages that it needs and that are not installed; `""` where all are there."""
+        extras: dict[str, str] = getattr(self.spec, "extras", {})
+        return " and ".join(sorted({c for m, c in extras.items() if importlib.util.find_spec(m) is None}))
 
 
 def subject(kind: str, given: str | specs.Spec, settings: Mapping[str, Any] | None = None) -> Subject:
@@ -197,7 +207,8 @@ def _references(subject: Subject) -> None:
         except Exception as error:
             require(
                 False,
-                f"{field} = {reference!r}: {error}; is the name spelled as in the file, and the package installed?",
+                f"{field} = {reference!r}: {error}; "
+                + (subject.missing() or "is the name spelled as in the file, and the package installed?"),
             )
         require(
             callable(found), f"{field} = {reference!r} is {type(found).__name__}, and it must be callable"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 SIZES: tuple[tuple[int, ...], ...] = ((0,), (3,), (1, 2), (4, 1, 3), (3, 0, 4, 2, 1))
@@ -39,6 +40,19 @@ def require(holds: bool, message: str) -> None:
         raise BrokenRuleError(message)
 
 
+_watcher: ContextVar[Callable[[str], None]] = ContextVar("_watcher", default=lambda rule: None)
+
+
+@contextlib.contextmanager
+def watching(call: Callable[[str], None]) -> Iterator[None]:
+    """Have `call(rule)` called before every rule that is checked: what a progress display needs."""
+    token = _watcher.set(call)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
 class Checklist:
     """Goes through rules; a rule that raises is a finding, never an end.
 
@@ -65,6 +79,7 @@ class Checklist:
         cause:
             The likely cause of another exception.
         """
+        _watcher.get()(rule)
         try:
             check()
         except BrokenRuleError as error:

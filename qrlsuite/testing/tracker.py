@@ -1,21 +1,24 @@
-"""What a tracker keeps to: hooks of the right names and arguments that take what a run sends."""
+"""What a tracker keeps to: methods or hooks of the right names and arguments, that take what a run sends."""
 
 from __future__ import annotations
 
 import copy
 import importlib
 import inspect
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pluggy
 
-from qrlsuite import hookspecs
-from qrlsuite.events import EventSink
-from qrlsuite.testing.common import HEAVY, fresh_process
-from qrlsuite.testing.findings import Checklist, Finding, require
+from qrlsuite import hookspecs, specs
+from qrlsuite.events import EVENTS
+from qrlsuite.testing.common import HEAVY, Subject, fresh_process
+from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 
-EVENTS = ("run_started", "epoch_finished", "run_finished")
+RUNS = "two runs at once, resumed, and a metric without a value"
 
 RUN: dict[str, Any] = {
     "task": "example",
@@ -44,14 +47,60 @@ RECORD: dict[str, Any] = {
 """An epoch's line as `epoch_finished` sees it; a metric without a value is None."""
 
 
-def check(plugin: Any) -> list[Finding]:
-    """Check a tracker, given as a module, an object or a module's name."""
+def check(subject: Subject) -> list[Finding]:
+    """Check a tracker that is asked for by name, which writes into a temporary folder meanwhile."""
+    spec = subject.spec
+    assert isinstance(spec, specs.TrackerSpec)
+    rules = Checklist()
+    made: list[Any] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for target in (None, str(Path(folder) / "target")):
+            if not rules.run(
+                "builds" if target is None else "target",
+                f"factory({'None' if target is None else 'target'}), with a method for an event",
+                lambda target=target: made.append(_build(spec, target)),  # type: ignore[misc]
+                "the factory takes one argument: what the user writes after --track NAME=, or None",
+            ):
+                return rules.findings
+        rules.run(
+            "events",
+            RUNS,
+            lambda: _sent(made, Path(folder)),
+        )
+    return rules.findings
+
+
+def _build(spec: specs.TrackerSpec, target: str | None) -> Any:
+    tracker = specs.resolve(spec.factory)(target)
+    require(
+        any(callable(getattr(tracker, event, None)) for event in EVENTS),
+        f"{type(tracker).__name__} has none of the methods {', '.join(EVENTS)}",
+    )
+    return tracker
+
+
+def _sent(trackers: list[Any], folder: Path) -> None:
+    for tracker in trackers:
+
+        def send(event: str, tracker: Any = tracker, **content: Any) -> None:
+            method = getattr(tracker, event, None)
+            if method is not None:
+                method(*content.values())
+
+        _a_run(send, folder)
+
+
+def check_plugin(plugin: Any) -> list[Finding]:
+    """Check a plugin that watches every run, given as a module, an object or a module's name."""
     rules = Checklist()
     found: list[Any] = [plugin]
     if isinstance(plugin, str):
         found.clear()
         if not rules.run(
-            "imports", "the module can be imported", lambda: found.append(importlib.import_module(plugin))
+            "imports",
+            "the module can be imported",
+            lambda: found.append(importlib.import_module(plugin)),
+            "no tracker of that name is registered, nor is there a module of that name",
         ):
             return rules.findings
     made = found[0]
@@ -61,7 +110,12 @@ def check(plugin: Any) -> list[Finding]:
         rules.run(
             "lazy imports", f"importing it imports none of {', '.join(HEAVY)}", lambda: _lazy(made.__name__)
         )
-    rules.run("events", "two runs at once, and a metric without a value", lambda: _events(made))
+    with tempfile.TemporaryDirectory() as folder:
+        rules.run(
+            "events",
+            RUNS,
+            lambda: _a_run(_caller(made), Path(folder)),
+        )
     return rules.findings
 
 
@@ -99,26 +153,43 @@ def _lazy(module: str) -> None:
     )
 
 
-class _Sink(EventSink):
-    """Lets a tracker's error through, instead of leaving the tracker out."""
+def _caller(plugin: Any) -> Callable[..., None]:
+    """Return `send(event, **content)`, which lets a tracker's error through."""
+    manager = _manager(plugin)
 
-    def send(self, event: str, **content: Any) -> None:
-        for implementation in getattr(self.manager.hook, event).get_hookimpls():
+    def send(event: str, **content: Any) -> None:
+        for implementation in getattr(manager.hook, event).get_hookimpls():
             implementation.function(*[content[argument] for argument in implementation.argnames])
 
+    return send
 
-def _events(plugin: Any) -> None:
-    sink = _Sink(_manager(plugin))
-    runs = [{**RUN, "seed": seed} for seed in (7, 8)]
-    kept = copy.deepcopy((runs, RECORD))
-    for run in runs:
-        sink.send("run_started", run=run)
-    for epoch in (1, 2):
+
+def _a_run(send: Callable[..., None], folder: Path) -> None:
+    """Send what two seeds' runs send: two epochs, the second of them again after resuming."""
+    runs = []
+    for seed in (7, 8):
+        own = folder / f"seed-{seed:04d}"
+        own.mkdir(exist_ok=True)
+        runs.append({**RUN, "seed": seed, "folder": str(own)})
+    for first, last in ((1, 2), (2, 2)):
         for run in runs:
-            sink.send("epoch_finished", run=run, record={**RECORD, "epoch": epoch})
+            _unchanged(send, "run_started", run={**run, "epochs": first - 1})
+        for epoch in range(first, last + 1):
+            for run in runs:
+                _unchanged(send, "epoch_finished", run=run, record=copy.deepcopy({**RECORD, "epoch": epoch}))
     for run in runs:
-        sink.send("run_finished", run=run)
-    require(
-        (runs, RECORD) == kept,
-        "a hook changes the mapping that it is given: copy it, for the next tracker and the run's files use it too",
-    )
+        _unchanged(send, "run_finished", run={**run, "epochs": 2})
+
+
+_CHANGES = "changes the mapping that it is given: copy it, for the next tracker is given the same"
+
+
+def _unchanged(send: Callable[..., None], event: str, **content: Any) -> None:
+    kept = copy.deepcopy(content)
+    try:
+        send(event, **content)
+    except Exception as error:
+        raise BrokenRuleError(
+            f"{event} raises {type(error).__name__}: {error}; `qrlsuite show hook {event}` says what it is given"
+        ) from error
+    require(content == kept, f"{event} {_CHANGES}")

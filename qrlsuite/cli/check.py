@@ -1,0 +1,139 @@
+"""`qrlsuite check`: does a plugin keep to the rules?"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from qrlsuite.cli.app import JsonOption
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from qrlsuite.testing import Finding
+    from qrlsuite.testing.selection import Item
+
+
+def check(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME|KIND:NAME|DISTRIBUTION",
+            help="What is registered, or a whole distribution. For a tracker without a name: its module.",
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="An option with which a single thing is checked."),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Check plugins against the rules that the suite keeps to itself, one by one, with the likely cause.
+
+    Exit codes: 0 every rule holds, 1 a rule is broken, 2 there is nothing of that name.
+
+    Examples: qrlsuite check my-model; qrlsuite check ansatz:ring --set depth=2; qrlsuite check my-distribution
+    """
+    import json
+
+    from qrlsuite.options import parse_setting
+    from qrlsuite.testing import selection
+
+    if name is None:
+        _teach(json_output)
+        return
+    items = selection.select(name)
+    chosen = {setting.name: setting.value for setting in map(parse_setting, settings or [])}
+    if chosen and len(items) > 1:
+        raise typer.BadParameter("--set is for one thing: name it, qrlsuite check KIND:NAME --set NAME=VALUE")
+    if json_output:
+        found = [(item, _findings(item, chosen)) for item in items]
+        typer.echo(json.dumps([_plain(item, finding) for item, findings in found for finding in findings]))
+    else:
+        found = _show(items, chosen)
+    if not all(finding.ok for _, findings in found for finding in findings):
+        raise typer.Exit(1)
+
+
+def _findings(item: Item, settings: dict[str, Any]) -> list[Finding]:
+    from qrlsuite import testing
+    from qrlsuite.testing.findings import Finding as Found
+
+    try:
+        return testing.check(item.kind, item.name, settings)
+    except Exception as error:  # a plugin whose code fails outside of any rule: the rest is still checked
+        return [Found("check", False, f"{type(error).__name__}: {error}")]
+
+
+def _plain(item: Item, finding: Finding) -> dict[str, Any]:
+    from qrlsuite import registry
+
+    return {
+        "kind": registry.SINGULAR[item.kind],
+        "name": item.name,
+        "rule": finding.rule,
+        "ok": finding.ok,
+        "message": finding.message,
+    }
+
+
+def _show(items: list[Item], settings: dict[str, Any]) -> list[tuple[Item, list[Finding]]]:
+    """Check things one after another, with what is going on in the last line of a terminal."""
+    from rich.console import Console
+
+    from qrlsuite.testing.findings import watching
+
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    found = []
+    with console.status("") as status:
+
+        def announce(item: Item) -> Callable[[str], None]:
+            return lambda rule: status.update(f"{_clean(item.title)}: {rule}".replace("[", r"\["))
+
+        for item in items:
+            with watching(announce(item)):
+                findings = _findings(item, settings)
+            found.append((item, findings))
+            console.print(_clean(item.title), style="bold")
+            for finding in findings:
+                _print(console, finding)
+    broken = sum(not finding.ok for _, findings in found for finding in findings)
+    total = sum(len(findings) for _, findings in found)
+    if broken:
+        console.print(f"{broken} of {total} rules broken", style="bold red")
+    else:
+        console.print(f"all {total} rules hold", style="bold green")
+    return found
+
+
+def _print(console: Any, finding: Finding) -> None:
+    mark, style = ("\u2713", "green") if finding.ok else ("\u2717", "red")
+    console.print(f"  {mark} ", style=style, end="")
+    console.print(_clean(f"{finding.rule}: {finding.message}"), style="dim" if finding.ok else "")
+
+
+def _clean(text: str) -> str:
+    """Keep control characters of a stranger's messages away from the terminal."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _teach(json_output: bool) -> None:
+    """Say what can be checked here."""
+    import json
+
+    from qrlsuite import registry
+
+    known = registry.load()
+    others = sorted({plugin.distribution for plugin in known.plugins} - {"qrlsuite"})
+    if json_output:
+        typer.echo(json.dumps({"distributions": others}))
+        return
+    typer.echo("qrlsuite check NAME            something registered: qrlsuite check mlp")
+    typer.echo("qrlsuite check KIND:NAME       where several kinds have the name: qrlsuite check model:mlp")
+    typer.echo("qrlsuite check DISTRIBUTION    everything that a package registers")
+    typer.echo("\nIn a package's own tests: from qrlsuite.testing import assert_conforms")
+    if others:
+        typer.echo(f"\nInstalled plugins of others: {', '.join(_clean(name) for name in others)}")
+    else:
+        typer.echo("\nNo plugin of others is installed. Begin one: qrlsuite new plugin --help")
