@@ -66,6 +66,13 @@ GATES: dict[str, GateSignature] = {
 `U3(t, p, d) = [[cos t/2, -e^{id} sin t/2], [e^{ip} sin t/2, e^{i(p+d)} cos t/2]]`.
 """
 
+COMPOSED = {
+    "RZZ": "CNOT (a, b), RZ b, CNOT (a, b)",
+    "RXX": "H a, H b, CNOT (a, b), RZ b, CNOT (a, b), H a, H b",
+    **{f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"},
+}
+"""Gates that others have, and how to append them here."""
+
 
 @dataclass(frozen=True, slots=True)
 class Element:
@@ -229,7 +236,9 @@ class Circuit:
             Apply the gate only where this qubit is 1 (rotations only).
         """
         if gate not in GATES:
-            raise OptionError(f"unknown gate '{gate}'{nearest(gate, GATES)}")
+            hint = COMPOSED.get(gate.upper())
+            known = f"; write it as {hint}" if hint else nearest(gate, GATES)
+            raise OptionError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]
         targets = (wires,) if isinstance(wires, int) else tuple(wires)
         if control is not None and not signature.controllable:

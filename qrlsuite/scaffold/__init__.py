@@ -130,9 +130,11 @@ def package(name: str, kind: Kind) -> Package:
 
     module, thing = _names(name, kind)
     words = _WORDS[kind]
+    # with the kind: the distribution has the same name
+    kinds = (Kind.environment, Kind.task) if kind is Kind.environment else (kind,)
+    checks = [f"qrlsuite check {one}:{thing}" for one in kinds]
     commands = tuple(
-        line.format(thing=thing, upper=module.upper())
-        for line in ("pytest", f"qrlsuite check {name}", *words.commands)
+        line.format(thing=thing, upper=module.upper()) for line in ("pytest", *checks, *words.commands)
     )
     source = f"src/{module}"
     registered = "the tracker: edit this" if kind is Kind.tracker else f"registers the {kind} with qrlsuite"
@@ -149,6 +151,7 @@ def package(name: str, kind: Kind) -> Package:
         "kind": str(kind),
         "article": "an" if kind[0] in "ae" else "a",
         "summary": words.summary,
+        "check": checks[0],
         "commands": commands,
         "contents": list(contents.items()),
         "files": any(file.endswith(".toml") for file in words.files),

@@ -127,7 +127,9 @@ def test_the_command_writes_a_package_and_says_what_to_type_next(
         "tests/test_acme_ring.py",
     }
     assert all(path in out for path in written)
-    assert out.index("pip install -e") < out.index("\n  pytest\n") < out.index("qrlsuite check acme-ring")
+    assert (
+        out.index("pip install -e") < out.index("\n  pytest\n") < out.index("qrlsuite check ansatz:acme-ring")
+    )
     assert f"cd '{folder}'" in out
     readme = (folder / "README.md").read_text()
     assert "qrlsuite run --task beam6g --model vqc-native --set ansatz=acme-ring --quick" in readme
