@@ -94,16 +94,14 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     for each in axes[::columns]:
         each.set_ylabel("Ŝ (environment steps)")
     figure.suptitle(
-        f"{_heading(entries)}: sample complexity against size", x=0.01, ha="left", fontsize="medium"
+        f"{_heading(entries)}: sample complexity against {_sizes(panels)}",
+        x=0.01,
+        ha="left",
+        fontsize="medium",
     )
     repeated = any(len(line.members) > len(line.sizes) for panel in panels for line in panel.lines)
-    counts = sorted({len(entry.seeds) for entry in entries})
-    seeds = (
-        f"{counts[0]} seeds" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds, beside each marker"
-    )
     style.footnotes(
         figure,
-        f"each point: {seeds}{'*' if style.note(entries) else ''}",
         "bars: 5th to 95th percentile",
         "faded: the 95th percentile is at the cap" if any(m.at_cap.any() for m in measured.values()) else "",
         "lines: mean over instances" if repeated else "",
@@ -183,8 +181,22 @@ def _draw_panel(
     axes.set_ylim(0, horizon * 1.08)
     axes.yaxis.set_major_formatter(style.thousands)
     style.tidy(axes)
-    axes.set_title(words, fontsize=9, loc="left")
-    axes.legend(frameon=False, fontsize=7.5)
+    axes.set_title(f"{words}: {_seeds(panel)}", fontsize=9, loc="left")
+    if cell == (0, 0):
+        axes.legend(frameon=False, fontsize=7.5)
+
+
+def _seeds(panel: _Panel) -> str:
+    """Write on how many seeds the points of a panel rest."""
+    entries = [entry for line in panel.lines for _, entry in line.members]
+    counts = sorted({len(entry.seeds) for entry in entries})
+    star = "*" * any(style.provisional(entry) for entry in entries)
+    return f"{counts[0]} to {counts[-1]} seeds{star}" if len(counts) > 1 else style.seeds_text(entries[0])
+
+
+def _sizes(panels: Sequence[_Panel]) -> str:
+    names = list(dict.fromkeys(panel.by.removeprefix("environment.") for panel in panels))
+    return names[0] if len(names) == 1 else "size"
 
 
 def _heading(entries: Sequence[EntryCurves]) -> str:
