@@ -40,6 +40,7 @@ def opened(chromium: Any, tmp_path: Path) -> Iterator[Callable[..., Any]]:
         path = tmp_path / f"report-{len(contexts)}.html"
         path.write_text(page if isinstance(page, str) else render(page), encoding="utf-8")
         context = chromium.new_context(viewport={"width": width, "height": 900}, offline=True, **settings)
+        context.set_default_timeout(300_000)  # of a busy machine nothing is demanded
         contexts.append(context)
         tab = context.new_page()
         tab.on("console", lambda message: trouble.append(f"console: {message.text}"))

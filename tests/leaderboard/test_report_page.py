@@ -147,10 +147,13 @@ def test_no_page_scrolls_sideways(opened: Open) -> None:
     entries = [boards.entry("w" * 150), *(boards.entry(f"entry {i}", speed=1 + i / 2) for i in range(13))]
     tab = opened(boards.of(entries, ["x" * 400]))
     tab.evaluate("document.querySelectorAll('details').forEach((details) => { details.open = true; })")
+    fits = """[...document.querySelectorAll('.plot')].every((plot) =>
+      plot.querySelector('.main-svg').getAttribute('width') === String(plot.clientWidth))"""
     overflow = {}
     for width in (1400, 1000, 800, 390, 320):
         tab.set_viewport_size({"width": width, "height": 900})
-        tab.wait_for_timeout(400)  # figures are drawn again shortly after the last change of size
+        while not tab.evaluate(fits):  # figures are drawn again shortly after the last change of size
+            tab.wait_for_timeout(50)
         overflow[width] = tab.evaluate("document.documentElement.scrollWidth") - width
     assert overflow == dict.fromkeys(overflow, 0)
 
