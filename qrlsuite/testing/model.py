@@ -331,12 +331,12 @@ def _population(made: Subjects) -> None:
         populations.quantum_parameters(together) == populations.quantum_parameters(agent),
         "the population declares other quantum parameters than its agents: hand quantum_parameters() on",
     )
-    if not made.sampled:
-        difference = float((values[2] - agent(x[2])).detach().abs().max())
+    for seed in range(0 if made.sampled else S):
+        difference = float((values[seed] - made.agent(seed)(x[seed])).detach().abs().max())
         require(
             difference < 1e-4,
-            f"slice 2 of the population differs from agent 2 alone by {difference:.2g}: are slices mixed, or initial "
-            "parameters drawn again?",
+            f"slice {seed} of the population differs from agent {seed} alone by {difference:.2g}: are slices mixed, or "
+            "initial parameters drawn again?",
         )
 
 

@@ -1,0 +1,220 @@
+"""Significance rules, engines and trackers that break one rule of their kind each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrlsuite import hookimpl
+from qrlsuite.specs import EngineSpec, SignificanceTestSpec, Spec, TrackerSpec
+from qrlsuite.testing import check
+from tests.testing.broken import Broken, assert_breaks, own_rules
+
+HERE = __name__
+
+
+class GoodRule:
+    name = "good"
+    promise = "none"
+
+    def sign(self, first: Any, second: Any) -> Any:
+        fewer, more = 2 * first.point < second.point, 2 * second.point < first.point
+        return fewer.astype("int8") - more.astype("int8")
+
+    def __call__(self, first: Any, second: Any) -> Any:
+        return self.sign(first, second)
+
+
+class NoPromise(GoodRule):
+    promise = ""
+
+
+class Floats(GoodRule):
+    def __call__(self, first: Any, second: Any) -> Any:
+        return self.sign(first, second) / 2
+
+
+class Moody(GoodRule):
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, first: Any, second: Any) -> Any:
+        self.calls += 1
+        swings = first.entry.name == "fast" and second.entry.name == "slow" and self.calls % 2
+        return self.sign(first, second) * (0 if swings else 1)
+
+
+class Partial(GoodRule):
+    def __call__(self, first: Any, second: Any) -> Any:
+        return np.maximum(self.sign(first, second), 0)
+
+
+class Vain(GoodRule):
+    def __call__(self, first: Any, second: Any) -> Any:
+        order = ("fast", "same", "slow", "never", "mixed")
+        if {first.entry.name, second.entry.name} == {"fast", "same"}:
+            less = order.index(first.entry.name) < order.index(second.entry.name)
+            return np.full(first.grid.shape, 1 if less else -1, dtype=np.int8)
+        return self.sign(first, second)
+
+
+class Backwards(GoodRule):
+    def __call__(self, first: Any, second: Any) -> Any:
+        return -self.sign(first, second)
+
+
+class Hasty(GoodRule):
+    def against(self, first: Any, others: Sequence[Any]) -> Any:
+        return np.zeros((len(others), *first.grid.shape), dtype=np.int8)
+
+
+class GoodEngine:
+    def __init__(self, options: None) -> None:
+        pass
+
+    def workers(self, asked: int | None) -> int:
+        return asked or 4
+
+    def queued(self, store: Any) -> set[int]:
+        return set()
+
+    def run(self, work: Any, show: Any) -> None:
+        raise AssertionError("a check starts nothing")
+
+
+def picky_engine() -> GoodEngine:
+    return GoodEngine(None)
+
+
+class ShortRun(GoodEngine):
+    def run(self, work: Any) -> None:  # type: ignore[override]
+        pass
+
+
+class Many(GoodEngine):
+    def workers(self, asked: int | None) -> int:
+        return 4
+
+
+class Queue(GoodEngine):
+    def queued(self, store: Any) -> Any:
+        return [0, 1]
+
+
+class GoodTracker:
+    def __init__(self, target: str | None) -> None:
+        pass
+
+    def epoch_finished(self, run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+        sum(record["scores"])
+
+
+def deaf_tracker(target: str | None) -> object:
+    return object()
+
+
+def no_target(target: str | None) -> GoodTracker:
+    if target is not None:
+        raise ValueError("a target is not supported")
+    return GoodTracker(target)
+
+
+class Careless(GoodTracker):
+    def epoch_finished(self, run: Any, record: Any) -> None:
+        format(record["train_return"], ".3f")
+
+
+class Rewriting(GoodTracker):
+    def run_started(self, run: Any) -> None:
+        run["seed"] = 0
+
+
+def rule(name: str) -> Spec:
+    return SignificanceTestSpec(name="broken", summary="Breaks a rule", factory=f"{HERE}:{name}")
+
+
+def engine(name: str) -> Spec:
+    return EngineSpec(name="broken", summary="Breaks a rule", factory=f"{HERE}:{name}")
+
+
+def tracker(name: str) -> Spec:
+    return TrackerSpec(name="broken", summary="Breaks a rule", factory=f"{HERE}:{name}")
+
+
+BROKEN = {
+    ("significance_tests", "builds"): Broken(rule("NoPromise"), r"promise is '', and must be text"),
+    ("significance_tests", "signs"): Broken(rule("Floats"), r"as float64, and must hold -1, 0 and 1 as int8"),
+    ("significance_tests", "repeatable"): Broken(
+        rule("Moody"), r"judged differently the second time: draw", frozenset({"antisymmetric"})
+    ),
+    ("significance_tests", "antisymmetric"): Broken(rule("Partial"), r"ranks would depend on the order"),
+    ("significance_tests", "equal entries"): Broken(rule("Vain"), r"same curves differ significantly"),
+    ("significance_tests", "direction"): Broken(rule("Backwards"), r"-1 for an entry that needs about 300"),
+    ("significance_tests", "against"): Broken(rule("Hasty"), r"is not rule\(first, other\) for each"),
+    ("engines", "builds"): Broken(engine("picky_engine"), r"the factory takes the options, or None"),
+    ("engines", "methods"): Broken(engine("ShortRun"), r"run\(work, show\) cannot be called"),
+    ("engines", "workers"): Broken(engine("Many"), r"workers\(1\) returned 4: more than --workers 1 allows"),
+    ("engines", "queued"): Broken(engine("Queue"), r"returned \[0, 1\] .* seeds in it are never trained"),
+    ("trackers", "builds"): Broken(tracker("deaf_tracker"), r"object has none of the methods run_started"),
+    ("trackers", "target"): Broken(tracker("no_target"), r"not supported; the factory takes one argument"),
+    ("trackers", "events"): Broken(tracker("Careless"), r"epoch_finished raises TypeError: .*show hook"),
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), BROKEN)
+def test_one_rule_is_broken(kind: str, name: str) -> None:
+    assert_breaks(kind, name, BROKEN[kind, name])
+
+
+def test_a_tracker_that_changes_what_it_is_given() -> None:
+    assert_breaks("trackers", "events", Broken(tracker("Rewriting"), r"run_started changes the mapping"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "spec"),
+    [
+        ("significance_tests", rule("GoodRule")),
+        ("engines", engine("GoodEngine")),
+        ("trackers", tracker("GoodTracker")),
+    ],
+)
+def test_every_rule_is_broken_by_one(kind: str, spec: Spec) -> None:
+    findings = own_rules(kind, spec)
+    assert all(finding.ok for finding in findings), findings
+    optional = {"against"} if kind == "significance_tests" else set()
+    assert {finding.rule for finding in findings} | optional == {name for k, name in BROKEN if k == kind}
+
+
+class Unmarked:
+    def run_started(self, run: Any) -> None:
+        pass
+
+
+class Misnamed:
+    @hookimpl
+    def epoch_finished(self, run: Any, line: Any) -> None:
+        pass
+
+
+class Failing:
+    @hookimpl
+    def run_finished(self, run: Any) -> None:
+        raise RuntimeError("no network")
+
+
+@pytest.mark.parametrize(
+    ("plugin", "name", "message"),
+    [
+        ("no_such_module_of_mine", "imports", "nor is there a module of that name"),
+        (Unmarked(), "hooks", "run_started: write @hookimpl above it"),
+        (Misnamed(), "hooks", "line"),
+        (Failing(), "events", "run_finished raises RuntimeError: no network"),
+    ],
+)
+def test_plugins_that_watch_runs(plugin: Any, name: str, message: str) -> None:
+    [broken] = [finding for finding in check("tracker", plugin) if not finding.ok]
+    assert broken.rule == name
+    assert message in broken.message
