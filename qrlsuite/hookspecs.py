@@ -259,15 +259,15 @@ def register_commands(app: typer.Typer) -> None:
 
     `app` is a `typer.Typer`. A name that is taken already is refused::
 
-    import typer
-    from qrlsuite import hookimpl
+        import typer
+        from qrlsuite import hookimpl
 
-    @hookimpl
-    def register_commands(app):
-        @app.command("hello")
-        def hello(name: str = "you"):
-            'Greet someone.'
-            typer.echo(f"Hello, {name}.")
+        @hookimpl
+        def register_commands(app):
+            @app.command("hello")
+            def hello(name: str = "you"):
+                'Greet someone.'
+                typer.echo(f"Hello, {name}.")
     """
 
 
@@ -320,10 +320,11 @@ def run_finished(run: Mapping[str, Any]) -> None:
 
     `run` is as in `run_started`::
 
-    import sys
-    from qrlsuite import hookimpl
+        from pathlib import Path
+        from qrlsuite import hookimpl
 
-    @hookimpl
-    def run_finished(run):
-        print(f"seed {run['seed']} is done: {run['folder']}", file=sys.stderr)
+        @hookimpl
+        def run_finished(run):
+            with Path(run["folder"], "notes.txt").open("a") as file:
+                print(f"seed {run['seed']} is done", file=file)
     """
