@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.leaderboard import origin
 from qrlsuite.store import EntryStore, SeedCurve, entries
 from qrlsuite.task import TaskFile
 
@@ -31,6 +32,18 @@ class EntryCurves:
         Core-hours spent on the N runs.
     identity:
         What the entry's hash covers: task, algorithm, model and their resolved options.
+    options:
+        The resolved options under "algorithm", "model" and "environment".
+    preset:
+        The preset that supplied defaults.
+    versions:
+        Every version that occurs among the seeds, by distribution; Python's under "python".
+    commits, processors:
+        Every code revision and processor that occurs among the seeds.
+    executions:
+        Circuit executions of the N runs in all.
+    source:
+        Whether the curves were read from a results folder or from a published entry.
     """
 
     name: str
@@ -47,6 +60,18 @@ class EntryCurves:
     hours: float
     folder: Path
     identity: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    preset: str | None = None
+    versions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    commits: tuple[str, ...] = ()
+    processors: tuple[str, ...] = ()
+    executions: int = 0
+    source: Literal["runs", "published"] = "runs"
+
+    @property
+    def mixed_versions(self) -> tuple[str, ...]:
+        """The distributions of which more than one version made the runs."""
+        return tuple(name for name, found in self.versions.items() if len(found) > 1)
 
     @property
     def steps_per_epoch(self) -> int:
@@ -120,25 +145,44 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         return None
     length = _common_length(curves)
     kept = [curve for curve in curves if len(curve.scores) >= length]
-    first = store.seed(kept[0].seed).record() or {}
+    stores = [store.seed(curve.seed) for curve in kept]
+    records = [seed.record() or {} for seed in stores]
+    provenance = [made for run in records for made in run.get("provenance", [])]
+    first = records[0]
     parameters = first.get("parameters", {})
     identity = record["identity"]
+    task_file = TaskFile.model_validate(record["task_file"])
+    preset = record["preset"]
     return EntryCurves(
         name=record["name"],
         label=record["label"],
         task=record["task_name"],
         task_hash=record["task_hash"],
-        task_file=TaskFile.model_validate(record["task_file"]),
+        task_file=task_file,
         algorithm=identity["algorithm"],
         model=identity["model"],
         parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
         curves=np.stack([curve.curve[:length] for curve in kept]),
         seeds=tuple(curve.seed for curve in kept),
         left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
-        hours=sum(store.seed(curve.seed).seconds() for curve in kept) / 3600,
+        hours=sum(seed.seconds() for seed in stores) / 3600,
         folder=store.path,
         identity=identity,
+        options={
+            "algorithm": _mapping(identity.get("algorithm_options")),
+            "model": _mapping(identity.get("model_options")),
+            "environment": task_file.environment.options,
+        },
+        preset=preset if isinstance(preset, str) else None,
+        versions=origin.versions(provenance),
+        commits=origin.texts(provenance, "commit"),
+        processors=origin.texts(provenance, "processor"),
+        executions=sum(origin.executions(seed) for seed in stores),
     )
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _common_length(curves: Iterable[SeedCurve]) -> int:
