@@ -395,14 +395,24 @@ class EntryStore:
     def create(cls, runs: Path, entry: Entry) -> EntryStore:
         """Return the entry's folder below a results folder, made if it is not there.
 
+        Where the entry's settings are known to come from tuning, its record says so from now on; of two records
+        of tuning the one that took more steps stands.
+
         Raises
         ------
         StoreError
             If a folder of another format version or another entry is in its place, or it cannot be made.
         """
         store = cls.find(runs, entry)
-        if not (store.path / "entry.json").exists():
-            write_json(store.path / "entry.json", entry.record())
+        path = store.path / "entry.json"
+        if not path.exists():
+            write_json(path, entry.record())
+        elif entry.tuning is not None:
+            record = store.record()
+            known = record.pop("tuning") or {}
+            if known.get("steps", -1) < entry.tuning["steps"]:
+                del record["format_version"]
+                write_json(path, {**record, "tuning": entry.tuning})
         return store
 
     def record(self) -> dict[str, Any]:
@@ -426,10 +436,13 @@ class EntryStore:
             for name, value in named.items():
                 if not isinstance(value, str):
                     raise ValueError(f"{name} is not text")
+            tuning = record.get("tuning")
+            if tuning is not None and not (isinstance(tuning, dict) and _is_count(tuning.get("steps"))):
+                raise ValueError("tuning is not a record of it")
             TaskFile.model_validate(record.get("task_file"))
         except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
             raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None
-        return {"preset": None, **record}
+        return {"preset": None, "tuning": None, **record}
 
     def entry(self) -> Entry:
         """Build the entry that the folder belongs to.

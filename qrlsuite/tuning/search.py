@@ -258,7 +258,7 @@ class Search:
         base = self.base
         comment = (
             f"Settings found by `qrlsuite tune` ({cell_text(base.task.file.ranking, self.request.objective)}); to use "
-            f"them:\n  qrlsuite run --task {base.task.name} --model {base.model.name} --preset {path.name}"
+            f"them:\n  qrlsuite run --task {self.request.task} --model {base.model.name} --preset {path.name}"
         )
         write_atomically(path, preset.dumps(found, comment).encode())
 

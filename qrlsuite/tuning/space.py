@@ -20,6 +20,7 @@ beside the task files, the suite's and those of plugins.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -205,6 +206,25 @@ def _forget(found: dict[str, Any], name: str) -> None:
     for known in list(found):
         if set(known.split("+")) & set(name.split("+")):
             del found[known]
+
+
+def parse_varied(word: str) -> Setting:
+    """Parse a word of `--vary`: `lr=[1e-3, 5e-4]`, `lr=1e-3,5e-4`, `activation=relu,tanh`, `lr={low=.1, high=1}`.
+
+    Raises
+    ------
+    OptionError
+        If there is no `=` or no name.
+    """
+    key, equals, given = word.partition("=")
+    if not equals or not key.strip():
+        raise OptionError(f"--vary {word}: write a name and its values, --vary 'lr=[1e-3, 5e-4]'")
+    text = re.sub(r"(?<![\w.])\.(?=\d)", "0.", given.strip())
+    value = options.parse_value(text)
+    if not isinstance(value, list | dict) and not text.startswith(("[", "{")):
+        value = [options.parse_value(part.strip()) for part in text.split(",") if part.strip()]
+    side, dot, name = key.strip().partition(".")
+    return Setting(side, name, value) if dot else Setting(None, side, value)
 
 
 def _values(name: str, value: Any) -> list[Any] | Range:
