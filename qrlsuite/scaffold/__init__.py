@@ -12,7 +12,7 @@ import re
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -44,7 +44,7 @@ class _Words:
 
     summary: str
     commands: tuple[str, ...]
-    files: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str]
 
 
 _WORDS = {
@@ -81,7 +81,8 @@ _WORDS = {
     ),
     Kind.tracker: _Words(
         "every epoch as a line of a CSV file",
-        ("{upper}_FILE=epochs.csv qrlsuite run --task beam6g --model mlp --quick",),
+        ("qrlsuite run --task beam6g --model mlp --quick --track {thing}=epochs.csv",),
+        {"tracker.py": "the tracker: edit this"},
     ),
 }
 
@@ -133,13 +134,10 @@ def package(name: str, kind: Kind) -> Package:
     # with the kind: the distribution has the same name
     kinds = (Kind.environment, Kind.task) if kind is Kind.environment else (kind,)
     checks = [f"qrlsuite check {one}:{thing}" for one in kinds]
-    commands = tuple(
-        line.format(thing=thing, upper=module.upper()) for line in ("pytest", *checks, *words.commands)
-    )
+    commands = tuple(line.format(thing=thing) for line in ("pytest", *checks, *words.commands))
     source = f"src/{module}"
-    registered = "the tracker: edit this" if kind is Kind.tracker else f"registers the {kind} with qrlsuite"
     contents = {
-        f"{source}/__init__.py": registered,
+        f"{source}/__init__.py": f"registers the {kind} with qrlsuite",
         **{f"{source}/{file}": meaning for file, meaning in words.files.items()},
         f"tests/test_{module}.py": "runs qrlsuite's checks",
     }
@@ -147,7 +145,6 @@ def package(name: str, kind: Kind) -> Package:
         "name": name,
         "module": module,
         "thing": thing,
-        "upper": module.upper(),
         "kind": str(kind),
         "article": "an" if kind[0] in "ae" else "a",
         "summary": words.summary,

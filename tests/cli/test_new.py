@@ -79,7 +79,7 @@ def test_new_packages_pass_their_own_tests(packages: Path) -> None:
     ]
     out = run(*words, "acme-ansatz", "acme-model", "acme-environment", "acme-algorithm", "acme-task",
               "acme-tracker", cwd=packages, env={**os.environ, "PYTHONPATH": path})  # fmt: skip
-    assert "8 passed" in out
+    assert "9 passed" in out
 
 
 def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> None:
@@ -94,6 +94,7 @@ def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> 
         ("tasks", "acme-environment"),
         ("algorithms", "acme-algorithm"),
         ("tasks", "acme-task"),
+        ("trackers", "acme-tracker"),
     }
 
 
@@ -143,7 +144,7 @@ def test_json_names_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixtu
     content = json.loads(out)
     assert content["folder"] == str(tmp_path / "qrlsuite-csv")
     assert "src/qrlsuite_csv/__init__.py" in content["files"]
-    assert "QRLSUITE_CSV_FILE=epochs.csv" in content["next"][-1]
+    assert "--track csv=epochs.csv" in content["next"][-1]
 
 
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

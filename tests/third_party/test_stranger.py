@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SUITE = ("pyproject.toml", "README.md", "LICENSE", "qrlsuite", "plugins", "tasks", "leaderboard")
+TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
 PIP = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
 
 
@@ -105,6 +108,7 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
         "models": {"fourier", "vqc-damped"},
         "significance_tests": {"half"},
         "tasks": {"channel-hop"},
+        "trackers": {"acme-log"},
     }
     assert installed.qrlsuite("rzz-cost", "--qubits", "3", "--layers", "2").stdout == "12\n"
     assert "RZZ" in installed.qrlsuite("show", "ansatz", "rzz-ring", "--qubits", "3").stdout
@@ -115,34 +119,47 @@ def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
     assert (installed.folder / "acme-next" / "src" / "acme_next" / "model.py").exists()
 
 
-def test_it_passes_the_checks(installed: Installation) -> None:
-    """Its own test file, as its author runs it: every kind in it."""
-    tests = Path(__file__).parent / "acme-qrl" / "tests"
-    shutil.copytree(tests, installed.folder / "tests")
+def test_it_passes_its_own_test(installed: Installation) -> None:
+    """As its author runs it: every kind in it."""
+    shutil.copytree(Path(__file__).parent / "acme-qrl" / "tests", installed.folder / "tests")
     words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
     assert "8 passed" in run(*words, cwd=installed.folder).stdout
 
 
-TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
+def test_the_commands_of_the_page_run(installed: Installation) -> None:
+    """docs/plugins.md, in its order; `new` and installing have tests of their own."""
+    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)
+    lines = [shlex.split(line) for line in "".join(blocks).splitlines()]
+    outputs = {}
+    for program, *words in lines:
+        if program == "qrlsuite" and words[0] != "new":
+            more = ["--workers", "1"] if words[0] == "run" else []
+            outputs[" ".join(words)] = installed.qrlsuite(*words, *more).stdout
+    assert len(outputs) > 10
+    checked = outputs["check acme-qrl"]
+    for title in ("ansatz rzz-ring", "circuit backend damped", "significance test half", "tracker acme-log"):
+        assert title in checked
+    assert "rules hold" in checked
+    assert len((installed.folder / "scores.txt").read_text().splitlines()) == 4  # 2 seeds of 2 epochs
 
 
-@pytest.mark.parametrize("model", ["vqc-pennylane", "vqc-damped"])
-def test_its_circuit_is_trained_on_its_task(installed: Installation, model: str) -> None:
+def test_its_backend_computes_a_model(installed: Installation) -> None:
     words = (
         "run",
         "--task",
         "channel-hop",
         "--model",
-        model,
+        "vqc-damped",
         "--set",
         "ansatz=rzz-ring",
         "--set",
         "qubits=2",
     )
-    done = installed.qrlsuite(*words, "--set", "layers=1", *TINY, "--runs", "circuits", "--json")
+    done = installed.qrlsuite(*words, "--set", "strength=0.1", *TINY, "--runs", "circuits", "--json")
     summary = json.loads(done.stdout)
     assert summary["seeds"] == 1
     assert "ansatz=rzz-ring" in summary["label"]
+    assert "strength=0.1" in summary["label"]
 
 
 def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> None:
@@ -165,36 +182,38 @@ def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> N
 
 
 def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Installation) -> None:
-    budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "runs")
+    budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "ranked")
     for model in ("fourier", "mlp"):
         installed.qrlsuite("run", "--task", "channel-hop", "--model", model, *budget)
 
     def board() -> dict[str, Any]:
-        out = installed.qrlsuite("leaderboard", "--runs", "runs", "--format", "json").stdout
+        out = installed.qrlsuite("leaderboard", "--runs", "ranked", "--format", "json").stdout
         (section,) = json.loads(out)["sections"]
         return {row["label"]: row for row in section["rows"]}
 
     before = board()
     assert set(before) == {"ddqn fourier features=24", "ddqn mlp width=64"}
     assert {row["tier"] for row in before.values()} <= {1, 2}  # decided: 20 seeds each
-    assert "not installed" not in installed.qrlsuite("leaderboard", "--runs", "runs").stdout
+    assert "not installed" not in installed.qrlsuite("leaderboard", "--runs", "ranked").stdout
 
     installed.pip("uninstall", "--yes", "--quiet", "acme-qrl")
     assert installed.listed() == {}
     assert board() == before
-    table = " ".join(installed.qrlsuite("leaderboard", "--runs", "runs").stdout.split())
+    table = " ".join(installed.qrlsuite("leaderboard", "--runs", "ranked").stdout.split())
     assert (
         "not installed here: environment 'channel-hop', model 'fourier'; ranked from the stored curves"
         in table
     )
     circuits = installed.qrlsuite("leaderboard", "--runs", "circuits", "--format", "markdown").stdout
     assert "ansatz 'rzz-ring'" in circuits
-    assert "fourier" in installed.qrlsuite("runs", "--runs", "runs").stdout
-    compared = installed.qrlsuite("compare", "fourier", "mlp", "--runs", "runs").stdout
+    assert "fourier" in installed.qrlsuite("runs", "--runs", "ranked").stdout
+    compared = installed.qrlsuite("compare", "fourier", "mlp", "--runs", "ranked").stdout
     assert "fourier" in compared
 
-    gone = installed.qrlsuite("run", "--task", "channel-hop", "--model", "fourier", "--runs", "runs", code=2)
+    gone = installed.qrlsuite(
+        "run", "--task", "channel-hop", "--model", "fourier", "--runs", "ranked", code=2
+    )
     assert "unknown task 'channel-hop'" in gone.stderr
-    gone = installed.qrlsuite("run", "--task", "beam6g", "--model", "fourier", "--runs", "runs", code=2)
+    gone = installed.qrlsuite("run", "--task", "beam6g", "--model", "fourier", "--runs", "ranked", code=2)
     assert "unknown model 'fourier'" in gone.stderr
     installed.qrlsuite("run", "--task", "cartpole", "--model", "mlp", *TINY, "--runs", "others")

@@ -83,6 +83,17 @@ def register_significance_tests(register):
 
 
 @hookimpl
+def register_trackers(register):
+    register(
+        specs.TrackerSpec(
+            name="acme-log",
+            summary="every epoch's median score as a line of a text file",
+            factory="acme_qrl.tracker:Log",
+        )
+    )
+
+
+@hookimpl
 def register_commands(app):
     @app.command("rzz-cost")
     def rzz_cost(qubits: int = 6, layers: int = 4) -> None:
