@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Report = Callable[[str, int, int], None]
+NOTHING = "nothing is trained yet"
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,9 @@ class Drawn:
     ----------
     seeds:
         Seeds that each point rests on: (task, label, number) in the study's order, 0 where nothing is there yet.
+    short:
+        Entries that have begun but end before the others do, (task, label, epochs): they would cut the picture
+        to their length, and are left out.
     figure:
         None where the picture cannot be drawn of what is there.
     problem:
@@ -41,6 +45,7 @@ class Drawn:
     name: str
     kind: str
     seeds: tuple[tuple[str, str, int], ...]
+    short: tuple[tuple[str, str, int], ...] = ()
     figure: Figure | None = None
     problem: str = ""
 
@@ -118,28 +123,33 @@ def draw(
     for picture in study.file.pictures:
         shown = [m for m in members if not picture.entries or m.group in picture.entries]
         unique = {member.entry.name: member for member in shown}
-        seeds = tuple(
-            (m.entry.task.name, m.entry.label, len(there[name].seeds) if name in there else 0)
-            for name, m in unique.items()
+        present = [there[name] for name in unique if name in there]
+        longest = max((_steps(entry) for entry in present), default=0)
+        entries = [entry for entry in present if _steps(entry) == longest]
+        counts = {entry.name: len(entry.seeds) for entry in entries}
+        head = Drawn(
+            picture.name,
+            picture.kind,
+            tuple((m.entry.task.name, m.entry.label, counts.get(name, 0)) for name, m in unique.items()),
+            tuple((e.task, e.label, e.curves.shape[1]) for e in present if _steps(e) < longest),
         )
-        entries = [there[name] for name in unique if name in there]
         kind = pictures.KINDS[picture.kind]
         if kind.of == "nothing":
-            drawn.append(
-                Drawn(picture.name, picture.kind, (), pictures.draw(picture.kind, **picture.settings))
-            )
+            figure = pictures.draw(picture.kind, **picture.settings)
+            drawn.append(Drawn(picture.name, picture.kind, (), figure=figure))
         elif not entries:
-            drawn.append(Drawn(picture.name, picture.kind, seeds, None, "nothing is trained yet"))
+            drawn.append(dataclasses.replace(head, problem=NOTHING))
         else:
-            drawn.append(_attempt(picture, entries, seeds, report))
+            drawn.append(_attempt(picture, entries, head, report))
     return drawn
 
 
+def _steps(entry: EntryCurves) -> int:
+    return int(entry.curves.shape[1]) * entry.steps_per_epoch
+
+
 def _attempt(
-    picture: PictureSection,
-    entries: Sequence[EntryCurves],
-    seeds: tuple[tuple[str, str, int], ...],
-    report: Report | None,
+    picture: PictureSection, entries: Sequence[EntryCurves], head: Drawn, report: Report | None
 ) -> Drawn:
     """Draw one picture; what is there may not suffice for it."""
     try:
@@ -148,8 +158,8 @@ def _attempt(
         else:
             figure = pictures.draw(picture.kind, entries, **picture.settings)
     except QrlSuiteError as error:
-        return Drawn(picture.name, picture.kind, seeds, None, str(error))
-    return Drawn(picture.name, picture.kind, seeds, figure)
+        return dataclasses.replace(head, problem=str(error))
+    return dataclasses.replace(head, figure=figure)
 
 
 def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:

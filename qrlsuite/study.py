@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.entry import Entry, resolve
-from qrlsuite.errors import OptionError, TaskError, nearest
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
 from qrlsuite.options import Setting
 from qrlsuite.task import load as load_task
 
@@ -171,7 +171,10 @@ class Study:
             for draft in _drafts(group):
                 targets = [m.entry for m in found[group.match.group]] if group.match is not None else [None]
                 for target in targets:
-                    entry = _entry(group, draft, settings, models, target, used)
+                    try:
+                        entry = _entry(group, draft, settings, models, target, used)
+                    except QrlSuiteError as error:
+                        raise type(error)(f"{self.source}, group '{group.name}': {error}") from None
                     members.setdefault((entry.task.name, entry.name), Member(group.name, entry))
             found[group.name] = list(members.values())
         for setting in settings:

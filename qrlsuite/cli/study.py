@@ -54,7 +54,9 @@ MapOption = Annotated[
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--only", metavar="WORD", help="Only entries whose group, label, name or task has the word."
+        "--only",
+        metavar="WORD",
+        help="Only entries whose group, label, name or task has the word, or one of several.",
     ),
 ]
 OutOption = Annotated[
@@ -256,9 +258,9 @@ def _members(
     _check_pictures(loaded)
     members = loaded.members(given, mapped)
     if only:
-        kept = [m for m in members if all(_mentions(m, word) for word in only)]
+        kept = [m for m in members if any(_mentions(m, word) for word in only)]
         if not kept:
-            raise OptionError(f"--only {' --only '.join(only)}: no entry of study '{loaded.name}' has that")
+            raise OptionError(f"--only {' --only '.join(only)}: study '{loaded.name}' has no such entry")
         return loaded, kept
     return loaded, members
 
@@ -421,6 +423,9 @@ def _draw(
                 "seeds": [
                     {"task": task, "label": label, "seeds": count} for task, label, count in drawn.seeds
                 ],
+                "short": [
+                    {"task": task, "label": label, "epochs": count} for task, label, count in drawn.short
+                ],
             }
         )
         if not quiet:
@@ -429,16 +434,20 @@ def _draw(
 
 
 def _say(drawn: Drawn, path: Path) -> None:
-    counts: dict[int, list[str]] = {}
-    for task, label, count in drawn.seeds:
-        counts.setdefault(count, []).append(
-            f"{task} {label}" if len({t for t, _, _ in drawn.seeds}) > 1 else label
-        )
+    from qrlsuite.leaderboard.studies import NOTHING
+
     if drawn.figure is None:
-        if drawn.problem != "nothing is trained yet":
+        if drawn.problem != NOTHING:
             typer.echo(f"no picture '{drawn.name}': {drawn.problem}")
         return
     typer.echo(f"wrote {path}")
-    for count, labels in sorted(counts.items(), reverse=True):
-        words = f"{count} seeds" if count else "nothing yet"
+    several = len({task for task, _, _ in drawn.seeds}) > 1
+    names = {(task, label): f"{task} {label}" if several else label for task, label, _ in drawn.seeds}
+    epochs = {(task, label): count for task, label, count in drawn.short}
+    lines: dict[str, list[str]] = {}
+    for task, label, count in sorted(drawn.seeds, key=lambda point: -point[2]):
+        begun = epochs.get((task, label))
+        words = f"{count} seeds" if count else f"left out, at epoch {begun}" if begun else "nothing yet"
+        lines.setdefault(words, []).append(names[task, label])
+    for words, labels in lines.items():
         typer.echo(f"  {words}: {', '.join(labels)}")

@@ -1,0 +1,418 @@
+"""Studies at work: every one runs at a small budget and gives its pictures; budgets, sharing, interruptions."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from qrlsuite import registry, speed
+from qrlsuite.cli import main
+from qrlsuite.cli.app import build
+from qrlsuite.cli.studying import Item, cheapest_first, check_budget, fitting, survey
+from qrlsuite.cli.training import Place
+from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.worker import train_group
+from qrlsuite.errors import OptionError
+from qrlsuite.specs import EngineSpec
+from qrlsuite.speed import Speed, Speeds
+from qrlsuite.store import EntryStore
+from qrlsuite.study import parse
+from tests.conftest import TINY, results
+
+STUDY = """
+format_version = 1
+name = "widths"
+summary = "Two small networks and a circuit"
+
+[[entries]]
+name = "mlp"
+task = "TASK"
+model = "mlp"
+grid = { width = [16, 4] }
+
+[[entries]]
+name = "vqc"
+task = "TASK"
+model = "vqc-native"
+options = { qubits = 2, layers = 1 }
+
+[[pictures]]
+name = "curves"
+kind = "curves"
+
+[[pictures]]
+name = "scaling"
+kind = "scaling"
+entries = ["mlp"]
+settings = { by = "width" }
+"""
+
+
+class Here:
+    """An engine that trains in this process: quick, where starting processes would take most of the time."""
+
+    trained: list[tuple[str, tuple[int, ...]]] = []  # noqa: RUF012 - emptied by the fixture
+
+    def __init__(self, options: None = None) -> None:
+        pass
+
+    def workers(self, asked: int | None) -> int:
+        return asked or 1
+
+    def queued(self, store: EntryStore) -> set[int]:
+        return set()
+
+    def run(self, work: Work, show: Show) -> Outcome:
+        for group in work.groups:
+            train_group(work.store.path, group.seeds, work.epochs)
+            self.trained.append((work.store.record()["label"], group.seeds))
+        return Outcome()
+
+
+class Queue(Here):
+    """An engine that hands work over and leaves."""
+
+    waiting: dict[str, set[int]] = {}  # noqa: RUF012 - emptied by the fixture
+
+    def queued(self, store: EntryStore) -> set[int]:
+        return self.waiting.get(store.path.name, set())
+
+    def run(self, work: Work, show: Show) -> Outcome:
+        seeds = {seed for group in work.groups for seed in group.seeds}
+        self.waiting.setdefault(work.store.path.name, set()).update(seeds)
+        return Outcome(submitted=f"{len(seeds)} seeds submitted")
+
+
+@pytest.fixture(autouse=True)
+def engines(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = registry.load().entries["engines"]
+    for name, cls in (("here", Here), ("queue", Queue)):
+        spec = EngineSpec(name, "for tests", f"{__name__}:{cls.__name__}")
+        monkeypatch.setitem(known, name, registry.Registered(spec, "tests"))
+    Here.trained.clear()
+    Queue.waiting.clear()
+
+
+@pytest.fixture
+def widths(tmp_path: Path) -> str:
+    (tmp_path / "tiny.toml").write_text(TINY)
+    path = tmp_path / "widths.toml"
+    path.write_text(STUDY.replace("TASK", str(tmp_path / "tiny.toml")))
+    return str(path)
+
+
+def say(*words: str) -> Result:
+    return CliRunner().invoke(build(), ["study", *words], catch_exceptions=False)
+
+
+def answer(*words: str) -> dict[str, Any]:
+    result = say(*words, "--json")
+    assert result.exit_code == 0, result.output
+    content: dict[str, Any] = json.loads(result.stdout)
+    return content
+
+
+STUDIES = (
+    "fig1",
+    "fig6",
+    "fig7",
+    "fig8",
+    "cartpole",
+    "ppo",
+    "ablation",
+    "degree",
+    "antennas",
+    "ansatz",
+    "estimator",
+    "few-runs",
+    "matched",
+)
+SIZES = {"qubits = [": "qubits = [2, 3]", "layers = [": "layers = [1, 2]", "width = [": "width = [4, 8]"}
+"""Grids of sizes, and what they become."""
+REDUCED = {"interactions": 80, "environments": 4, "validation_episodes": 4, "steps": 20}
+
+
+def reduced(name: str, folder: Path) -> str:
+    """Write a study of the suite with small models, and the same tasks at a protocol of moments; returns its path."""
+    text = Path(registry.study(name).path).read_text()
+    for start, grid in SIZES.items():
+        text = re.sub(rf"{re.escape(start)}[^]]*\]", grid, text)
+    text = re.sub(r"qubits = \d+", "qubits = 2", text)
+
+    def task(match: re.Match[str]) -> str:
+        content = Path(registry.task(match[1]).path).read_text()
+        for key, value in REDUCED.items():
+            content, count = re.subn(rf"^{key} = \d+$", f"{key} = {value}", content, flags=re.MULTILINE)
+            assert count == 1, key
+        (folder / f"{match[1]}.toml").write_text(content)
+        return f'"{folder / match[1]}.toml"'
+
+    tasks = re.compile(r'^task = (?:"[^"]*"|\[[^]]*\])', re.MULTILINE)
+    (folder / f"{name}-study.toml").write_text(tasks.sub(lambda m: re.sub(r'"([^"]*)"', task, m[0]), text))
+    return str(folder / f"{name}-study.toml")
+
+
+def test_no_study_is_left_out() -> None:
+    built_in = {
+        r.spec.name for kind, r in registry.load() if kind == "studies" and r.distribution == "qrlsuite"
+    }
+    assert set(STUDIES) == built_in
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
+    seeds = 6 if name == "few-runs" else 2  # its picture compares 5 with more
+    words = [reduced(name, tmp_path), "--seeds", str(seeds), "--epochs", "2"]
+    words += ["--engine", "here", "--runs", str(tmp_path / "runs")]
+    content = answer("run", *words)
+    assert content["core_hours_left"] == 0
+    assert all(entry["finished"] == seeds and entry["basis"] == "measured" for entry in content["entries"])
+    assert (
+        content["trained"] == seeds * len(content["entries"]) == sum(len(group) for _, group in Here.trained)
+    )
+    assert len(content["pictures"]) >= 1
+    for picture in content["pictures"]:
+        assert picture["problem"] is None, picture
+        assert Path(picture["file"]).read_bytes().startswith(b"\x89PNG")
+        assert all(point["seeds"] == seeds for point in picture["seeds"])
+    assert answer("run", *words, "--dry-run")["steps"] == [], "nothing is trained twice"
+
+
+def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    plain = [
+        "run",
+        "--task",
+        str(tmp_path / "tiny.toml"),
+        "--model",
+        "mlp",
+        "--set",
+        "width=16",
+        "--runs",
+        runs,
+    ]
+    done = CliRunner().invoke(build(), [*plain, "--engine", "here"], catch_exceptions=False)
+    assert done.exit_code == 0
+    (folder,) = (tmp_path / "runs" / "tiny").iterdir()
+    before = results(folder, 3)
+    content = answer("show", widths, "--runs", runs)
+    assert [entry["finished"] for entry in content["entries"]] == [4, 0, 0]
+    assert [entry["basis"] for entry in content["entries"]] == ["measured", "scaled", "reference"]
+    assert content["hours_left"] > 0
+    Here.trained.clear()
+    say("run", widths, "--engine", "here", "--runs", runs)
+    assert sorted(label for label, _ in Here.trained) == [
+        "ddqn mlp width=4",
+        "ddqn vqc-native qubits=2 layers=1",
+    ]
+    assert results(folder, 3) == before
+
+
+def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for words in (
+        ("show", widths),
+        ("run", widths, "--dry-run"),
+        ("run", widths, "--dry-run", "--budget", "1h"),
+    ):
+        result = say(*words, "--engine", "here", "--runs", str(runs))
+        assert result.exit_code == 0
+        assert "vqc-native" in result.stdout
+    assert not runs.exists()
+    steps = answer("run", widths, "--dry-run", "--engine", "here", "--runs", str(runs))["steps"]
+    assert [step["would_train"] for step in steps] == [4, 4, 4]
+    assert not runs.exists()
+
+
+def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    words = ("--engine", "here", "--runs", runs)
+    said = say("run", widths, "--seeds", "3", "--only", "width=16", *words)
+    assert "3 seeds: ddqn mlp width=16" in said.stdout
+    said = say("run", widths, "--seeds", "2", "--only", "width=4", *words)
+    assert "2 seeds: ddqn mlp width=4" in said.stdout
+    drawn = say("draw", widths, "--runs", runs, "--format", "svg")
+    assert "3 seeds: ddqn mlp width=16" in drawn.stdout
+    assert "2 seeds: ddqn mlp width=4" in drawn.stdout
+    assert "nothing yet: ddqn vqc-native qubits=2 layers=1" in drawn.stdout
+    assert (tmp_path / "runs" / "study-widths-scaling.svg").read_text().startswith("<?xml")
+
+
+def test_a_picture_that_cannot_be_drawn_yet_says_why(widths: str, tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    said = say("run", widths, "--seeds", "2", "--only", "width=16", "--engine", "here", "--runs", runs)
+    assert said.exit_code == 0
+    drawn = say("draw", widths, "--runs", runs)
+    assert drawn.exit_code == 0
+    assert "no picture 'scaling': " in drawn.stdout
+
+
+def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[Item]:
+    study = parse(Path(widths).read_text(), "widths.toml")
+    return survey(study.members(), tmp_path / "runs", Place(Here(), 2), speeds, range(4), 10)
+
+
+def speeds(mlp: float | None, vqc: float | None) -> Speeds:
+    rows = [Speed(("beam6g", "ddqn", name), {}, s) for name, s in (("mlp", mlp), ("vqc-native", vqc)) if s]
+    return Speeds(references=rows)
+
+
+def test_the_cheapest_entry_is_first_and_the_unknown_last(widths: str, tmp_path: Path) -> None:
+    order = cheapest_first(items(widths, tmp_path, speeds(2.0, 1.0)))
+    assert [item.plan.entry.model.name for item in order] == ["vqc-native", "mlp", "mlp"]
+    assert [item.seconds for item in order] == [40.0, 80.0, 80.0]
+    order = cheapest_first(items(widths, tmp_path, speeds(2.0, None)))
+    assert [item.plan.entry.model.name for item in order] == ["mlp", "mlp", "vqc-native"]
+
+
+def test_what_fits_into_a_budget(widths: str, tmp_path: Path) -> None:
+    """One seed of 10 epochs takes 10 s; two workers; four seeds are missing."""
+    item = items(widths, tmp_path, speeds(1.0, None))[0]
+    assert item.estimate.basis == "reference"
+    assert fitting(item, 9.9, 2) == []
+    assert fitting(item, 10, 2) == [0, 1], "half of it would hold nothing"
+    assert fitting(item, 30, 2) == [0, 1], "half of it is planned for"
+    assert fitting(item, 40, 2) == [0, 1, 2, 3]
+    measured = Item(item.plan, item.groups, speed.Estimate(1.0, "measured"))
+    assert fitting(measured, 10, 2) == [0, 1]
+    assert fitting(measured, 15, 2) == [0, 1, 2], (
+        "as many core-seconds as two workers have, if no seed is too long"
+    )
+    assert fitting(measured, 20, 2) == [0, 1, 2, 3]
+    unknown = Item(item.plan, item.groups, speed.Estimate(None, "unknown"))
+    assert fitting(unknown, 1, 2) == [0, 1], "one seed per worker, to learn what it costs"
+
+
+def test_a_budget_that_cannot_hold_one_group(widths: str, tmp_path: Path) -> None:
+    found = items(widths, tmp_path, speeds(1.0, 50.0))
+    check_budget(found, 10, 2)
+    with pytest.raises(
+        OptionError, match=r"cannot hold one group: a seed of 'ddqn mlp width=16' .* takes about 10 s"
+    ):
+        check_budget(found, 9, 2)
+
+
+def test_a_budget_is_kept_and_the_same_command_continues(widths: str, tmp_path: Path) -> None:
+    words = (widths, "--engine", "here", "--runs", str(tmp_path / "runs"))
+    refused = CliRunner().invoke(build(), ["study", "run", *words, "--budget", "0.001s"])
+    assert isinstance(refused.exception, OptionError)
+    assert not (tmp_path / "runs").exists()
+    assert answer("run", *words, "--budget", "1h")["core_hours_left"] == 0
+    assert len(Here.trained) >= 3
+
+
+def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -> None:
+    from qrlsuite.cli.studying import Session
+
+    ticks = iter(range(0, 10_000, 60))
+    known = speeds(0.1, 0.2)
+    session = Session(
+        tmp_path / "runs", Place(Here(), 1), known, budget=100, quiet=True, clock=lambda: float(next(ticks))
+    )
+    left = session.run(items(widths, tmp_path, known))
+    assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))], (
+        "the second look at the clock is past the budget"
+    )
+    assert [(item.plan.entry.label, len(item.plan.missing)) for item in left] == [
+        ("ddqn mlp width=4", 4),
+        ("ddqn vqc-native qubits=2 layers=1", 4),
+    ]
+
+
+def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_path: Path) -> None:
+    words = (widths, "--engine", "queue", "--runs", str(tmp_path / "runs"))
+    said = say("run", *words)
+    assert said.stdout.count("4 seeds submitted") == 3
+    again = answer("run", *words)
+    assert again["submitted"] == []
+    assert [entry["busy"] for entry in again["entries"]] == [4, 4, 4]
+
+
+def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    words = [sys.executable, "-m", "qrlsuite", "study", "run", widths, "--only", "width=16"]
+    words += ["--epochs", "60", "--seeds", "2", "--workers", "1", "--runs"]
+    process = subprocess.Popen([*words, str(runs)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not list(runs.glob("tiny/*/seed-0000/epochs.jsonl")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGINT)
+    out, message = process.communicate(timeout=120)
+    assert process.returncode == 130, message
+    assert "every finished epoch is saved. The same command continues" in message
+    assert "study-widths-curves.png" in out
+    (folder,) = (runs / "tiny").iterdir()
+    assert not (folder / "seed-0000" / "epochs.parquet").exists(), "it was too fast to be interrupted"
+    subprocess.run([*words, str(runs)], check=True, capture_output=True)
+    subprocess.run([*words, str(tmp_path / "straight")], check=True, capture_output=True)
+    (straight,) = (tmp_path / "straight" / "tiny").iterdir()
+    assert all(results(folder, seed) == results(straight, seed) for seed in (0, 1))
+
+
+def test_listing() -> None:
+    listed = say("list").stdout
+    assert all(name in listed for name in STUDIES)
+    rows = json.loads(say("list", "--json").stdout)
+    assert next(row for row in rows if row["name"] == "fig6")["core_hours"] == 2503
+    shown = say("show", "fig7", "--runs", "nowhere").stdout
+    assert "ddqn vqc-native qubits=14" in shown
+    assert "0/100" in shown
+    assert "reference speeds of another machine" in shown
+    assert "3,567 core-hours" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "fig66"], "unknown study 'fig66'; did you mean 'fig6'"),
+        (["run", "fig6", "--budget", "soon"], "write a time, for example 90s, 30min, 2h"),
+        (["run", "fig6", "--budget", "1s"], "cannot hold one group"),
+        (["run", "fig6", "--format", "gif"], "--format gif"),
+        (["run", "fig6", "--engine", "lokal"], "did you mean 'local'"),
+        (["run", "fig6", "--model-map", "vqc-native"], "write MODEL=MODEL"),
+        (["run", "fig6", "--model-map", "vqc-native=vqc-nativ"], "did you mean 'vqc-native'"),
+        (["show", "fig6", "--only", "nothing"], "study 'fig6' has no such entry"),
+        (["show", "fig6", "--seeds", "a:b"], "write a number (100)"),
+        (["draw", "fig6"], "nothing is trained yet: qrlsuite study run fig6"),
+        (["show", "bad.toml"], "pictures.0.kind: unknown picture 'bar'; did you mean 'bars'"),
+        (["show", "worse.toml"], "worse.toml: pictures.0.settings"),
+        (["show", "episodes.toml"], "pictures.0.evaluation: picture 'histogram' needs evaluation"),
+    ],
+)
+def test_wrong_input_gives_one_clear_line_and_exit_code_2(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    head = 'format_version = 1\nname = "x"\nsummary = "x"\n[[pictures]]\n'
+    Path("bad.toml").write_text(f'{head}kind = "bar"\n')
+    Path("worse.toml").write_text(f'{head}kind = "estimator"\nsettings = {{ runs = "many" }}\n')
+    Path("episodes.toml").write_text(f'{head}kind = "histogram"\n')
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(sys, "argv", ["qrlsuite", "study", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    printed = capsys.readouterr()
+    assert stopped.value.code == 2
+    assert message in printed.err
+    assert len(printed.err.strip().splitlines()) == 1, printed.err
+    assert printed.out == ""
+    assert sorted(tmp_path.iterdir()) == before, "wrong input leaves nothing behind"
+
+
+def test_every_part_explains_itself() -> None:
+    for command in ("list", "show", "run", "draw"):
+        assert "Example" in say(command, "--help").stdout
