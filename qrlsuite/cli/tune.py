@@ -161,7 +161,7 @@ def tune(
                 sampler_seed=sampler_seed,
                 seeds=search.tuning_seeds(seeds),
                 epochs=epochs,
-                objective=objective.value,  # type: ignore[arg-type]
+                objective=objective.value,
             )
         )
     searches = _searches(requests, runs)

@@ -116,7 +116,7 @@ def _draw(dimension: Dimension, generator: np.random.Generator) -> Any:
     if ends is None:
         return dimension.values[int(generator.integers(len(dimension.values)))]
     if ends.integer and not ends.log:
-        return int(generator.integers(ends.low, ends.high, endpoint=True))
+        return int(generator.integers(int(ends.low), int(ends.high), endpoint=True))
     low, high = (math.log(ends.low), math.log(ends.high)) if ends.log else (ends.low, ends.high)
     value = float(generator.uniform(low, high))
     value = min(max(math.exp(value) if ends.log else value, ends.low), ends.high)

@@ -20,7 +20,8 @@ class Optimal:
         """Return the antennas (L,)."""
         intensity = self.envs.tabulate().intensity
         lanes = np.arange(self.envs.num_envs)
-        return intensity[lanes, :, self.envs.steps + 1].argmax(axis=1).astype(np.int64)
+        best: NDArray[np.int64] = intensity[lanes, :, self.envs.steps + 1].argmax(axis=1).astype(np.int64)
+        return best
 
 
 class NearestAntenna:
@@ -47,7 +48,8 @@ class NearestAntenna:
         """Return the nearest antenna at every step (n, K + 1) of paths (n, degree, 2)."""
         x, y = trajectory.positions(support, self.envs.options.steps)
         squared = [(x - a) ** 2 + (y - b) ** 2 for (a, b), _ in self.envs.options.antennas]
-        return np.argmin(squared, axis=0).astype(np.int64)
+        nearest: NDArray[np.int64] = np.argmin(squared, axis=0).astype(np.int64)
+        return nearest
 
 
 def _lanes(envs: LaneEnv) -> BeamLanes:
