@@ -117,7 +117,7 @@ def _entry(folder: Path) -> dict[str, Any]:
     return {
         **{
             key: record[key]
-            for key in ("label", "name", "hash", "preset", "task_name", "task_hash", "identity")
+            for key in ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
         },
         "seeds": len(seeds),
         "provenance": (first or {}).get("provenance", []),
