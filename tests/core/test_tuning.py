@@ -1,0 +1,314 @@
+"""Tuning: spaces, samplers, what a trial is worth, and searches that end the same however often they were stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrlsuite import preset
+from qrlsuite.entry import Entry, resolve
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, UnknownNameError
+from qrlsuite.options import parse_setting
+from qrlsuite.store import EntryStore
+from qrlsuite.task import RankingSection
+from qrlsuite.tuning import objective, samplers, search, space
+
+SETTINGS = (parse_setting("width=4"), parse_setting("depth=1"))
+RANKING = RankingSection.model_validate(
+    {
+        "epsilons": [0.5, 0.2],
+        "deltas": [0.5, 1.0],
+        "reference": {"epsilon": 0.2, "delta": 0.5},
+        "horizons": [40],
+    }
+)
+
+
+def varied(*words: str) -> tuple[Any, ...]:
+    return tuple(space.parse_varied(word) for word in words)
+
+
+def request(task: str, **changes: Any) -> search.Request:
+    given: dict[str, Any] = {
+        "settings": SETTINGS,
+        "varied": varied("lr=1e-2,1e-3", "gamma=.9,.99"),
+        "seeds": search.tuning_seeds("2"),
+        "epochs": 1,
+    }
+    return search.Request(task, "mlp", **{**given, **changes})
+
+
+class Trainer:
+    """Trains in this process, and can be interrupted before a trial."""
+
+    def __init__(self, folder: Path, stop_before: int | None = None) -> None:
+        self.folder, self.stop_before, self.trained = folder, stop_before, 0
+
+    def __call__(self, entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
+        from qrlsuite.engine.worker import train_group
+
+        store = EntryStore.create(self.folder, entry)
+        missing = sorted(set(seeds) - store.finished(seeds, epochs))
+        if missing:
+            if self.trained == self.stop_before:
+                raise KeyboardInterrupt
+            self.trained += 1
+            train_group(store.path, missing, epochs)
+        return store
+
+
+def finish(what: search.Search, stop_before: int | None = None) -> Trainer:
+    trainer = Trainer(what.runs, stop_before)
+    while not what.over:
+        what.step(trainer)
+    return trainer
+
+
+def without_hours(text: str) -> str:
+    return "\n".join(line for line in text.splitlines() if not line.startswith("core_hours"))
+
+
+@pytest.mark.parametrize("sampler", ["grid", "tpe"])
+def test_a_search_that_was_stopped_ends_with_the_same_preset(
+    sampler: str, tiny_task: str, tmp_path: Path
+) -> None:
+    wanted = request(tiny_task, sampler=sampler, trials=3 if sampler == "tpe" else None)
+    straight = search.Search(wanted, tmp_path / "straight")
+    finish(straight)
+    with pytest.raises(KeyboardInterrupt):
+        finish(search.Search(wanted, tmp_path / "stopped"), stop_before=2)
+    resumed = search.Search(wanted, tmp_path / "stopped")
+    trainer = finish(resumed)
+    distinct = len({trial.entry.hash for trial in straight.trials})
+    assert trainer.trained == distinct - 2, "finished trials are not trained again"
+    straight.write(straight.path)
+    resumed.write(resumed.path)
+    assert straight.path.name == resumed.path.name
+    assert without_hours(straight.path.read_text()) == without_hours(resumed.path.read_text())
+    assert resumed.preset().tuning is not None
+    assert [t.point for t in straight.trials] == [t.point for t in resumed.trials]
+
+
+def test_the_preset_is_the_best_trial_and_the_entry_says_so(tiny_task: str, tmp_path: Path) -> None:
+    found = search.Search(request(tiny_task), tmp_path)
+    finish(found)
+    assert found.best is not None
+    assert found.best.merit.order == min(trial.merit.order for trial in found.trials)
+    path = tmp_path / "mine.toml"
+    found.write(path)
+    entry = resolve(tiny_task, "mlp", preset=str(path))
+    assert entry.hash == found.best.entry.hash, "the options decide what the entry is"
+    assert entry.tuning is not None
+    assert (entry.tuning["trials"], entry.tuning["steps"]) == (4, 4 * 2 * 60)
+    assert entry.tuning["changed"] == []
+    assert not entry.tuning["on_protocol_seeds"]
+    changed = resolve(tiny_task, "mlp", settings=[parse_setting("lr=.5")], preset=str(path))
+    assert changed.tuning is not None
+    assert changed.tuning["changed"] == ["algorithm.lr"]
+
+    untuned = resolve(tiny_task, "mlp", settings=[*SETTINGS, *space.settings(found.best.point)])
+    store = EntryStore.create(tmp_path / "runs", untuned)
+    assert store.record()["tuning"] is None
+    EntryStore.create(tmp_path / "runs", entry)
+    assert store.record()["tuning"]["trials"] == 4, "an entry that was there before learns that it was tuned"
+    assert store.entry().tuning == entry.tuning
+    EntryStore.create(tmp_path / "runs", untuned)
+    assert store.record()["tuning"]["trials"] == 4, "and does not forget it"
+
+
+def test_tuning_seeds_are_not_protocol_seeds() -> None:
+    assert search.tuning_seeds("3") == (1_000_000, 1_000_001, 1_000_002)
+    assert search.tuning_seeds("1000005:1000007") == (1_000_005, 1_000_006)
+    with pytest.raises(OptionError, match="write --seeds 20 for 1000000 to 1000019"):
+        search.tuning_seeds("0:20")
+
+
+def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
+    record = {
+        "task": "t", "objective": "cell", "value": 1, "sampler": "grid", "trials": 1, "planned": 1,
+        "epochs": 1, "steps": 1, "space": {},
+    }  # fmt: skip
+    assert preset.TuningRecord.model_validate({**record, "seeds": "0:20"}).on_protocol_seeds
+    assert not preset.TuningRecord.model_validate({**record, "seeds": "1000000:1000020"}).on_protocol_seeds
+
+
+def test_worth_by_hand() -> None:
+    """Two runs of four epochs of 10 steps, at thresholds 0.5 and 0.8."""
+    curves = np.array([[0.1, 0.6, 0.9, 0.9], [0.1, 0.1, 0.6, 0.7]])
+    worth = objective.merit(curves, RANKING, 10, "cell")
+    # P_hat at 0.8: 0, 0, 1/2, 1/2 -> below 1/2 for 2 epochs, below 1 for 4; at 0.5: 0, 1/2, 1, 1 -> 1 and 2
+    assert (worth.cell, worth.area, worth.unsettled) == (20, (10 + 20 + 20 + 40) / 4, False)
+    assert worth.value == 20
+    assert objective.merit(curves, RANKING, 10, "area").value == 22.5
+    better = objective.merit(np.minimum(curves + 0.01, 1), RANKING, 10, "cell")
+    assert better.order < worth.order, "equal sample complexities are told apart by the scores"
+    assert 0 < worth.signal - better.signal < 5
+    assert objective.merit(np.zeros((2, 4)), RANKING, 10, "cell").unsettled
+
+
+def test_the_papers_grids_have_its_sizes() -> None:
+    grid = space.load("paper")
+    sizes = {
+        (model, algorithm): samplers.size(space.space(resolve("beam6g", model, algorithm), grid))
+        for model in ("mlp", "vqc-native")
+        for algorithm in ("ddqn", "ppo")
+    }
+    assert sizes == {
+        ("mlp", "ddqn"): 3 * 4 * 2 * 5 * 3 * 2 * 3,
+        ("vqc-native", "ddqn"): 3 * 4 * 4 * 3,
+        ("mlp", "ppo"): 4 * 5 * 5 * 3 * 2 * 3,
+        ("vqc-native", "ppo"): 4 * 3 * 3 * 3,
+    }
+
+
+def test_options_that_vary_as_one_get_one_value(tiny_task: str) -> None:
+    entry = resolve(tiny_task, "vqc-native")
+    (dimension,) = space.space(entry, None, varied("activation_in+activation_out=relu,tanh"))
+    settings = space.settings({dimension.name: "tanh"})
+    assert {setting.name for setting in settings} == {"activation_in", "activation_out"}
+    assert {setting.value for setting in settings} == {"tanh"}
+    assert space.text({dimension.name: "tanh"}) == "activation_in+activation_out=tanh"
+
+
+def test_set_takes_an_option_out_of_the_grid(tiny_task: str) -> None:
+    grid = space.load("paper")
+    names = [d.name for d in space.space(resolve(tiny_task, "mlp"), grid, fixed=[parse_setting("lr=1e-3")])]
+    assert "algorithm.gamma" in names
+    assert "algorithm.lr" not in names
+
+
+def test_one_at_a_time_starts_at_what_is_untuned(tiny_task: str) -> None:
+    what = search.Search(request(tiny_task, sampler="one-at-a-time"), Path("nowhere"))
+    points = [tuple(what.sampler.ask().values()) for _ in range(what.planned)]
+    assert points == [(5e-4, 0.95), (1e-2, 0.95), (1e-3, 0.95), (5e-4, 0.9), (5e-4, 0.99)]
+
+
+@pytest.mark.parametrize("sampler", ["random", "tpe"])
+def test_drawn_points_repeat_extend_and_stay_in_range(sampler: str, tiny_task: str) -> None:
+    words = varied("lr={low = 1e-4, high = 1e-2, log = true}", "batch={low = 8, high = 64}", "gamma=.9,.99")
+    dimensions = space.space(resolve(tiny_task, "mlp"), None, words)
+
+    def points(trials: int, seed: int = 0) -> list[space.Point]:
+        made = samplers.create(sampler, dimensions, trials, seed, {})
+        found = []
+        for _ in range(made.total):
+            found.append(made.ask())
+            made.tell(float(found[-1]["algorithm.lr"]))
+        return found
+
+    twelve = points(12)
+    assert points(12) == twelve
+    assert points(5) == twelve[:5]
+    assert points(12, seed=1) != twelve
+    assert all(1e-4 <= p["algorithm.lr"] <= 1e-2 and 8 <= p["algorithm.batch"] <= 64 for p in twelve)
+    assert all(isinstance(p["algorithm.batch"], int) for p in twelve)
+
+
+def test_random_combinations_are_distinct_and_no_more_than_there_are(tiny_task: str) -> None:
+    made = samplers.create(
+        "random", space.space(resolve(tiny_task, "mlp"), None, varied("lr=.1,.2,.3")), 9, 0, {}
+    )
+    assert sorted(made.ask()["algorithm.lr"] for _ in range(made.total)) == [0.1, 0.2, 0.3]
+
+
+def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> None:
+    def elsewhere(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
+        return EntryStore.create(tmp_path, entry)
+
+    for sampler, begun in (("grid", 4), ("tpe", 1)):
+        what = search.Search(
+            request(tiny_task, sampler=sampler, trials=None if sampler == "grid" else 4), tmp_path
+        )
+        while not what.over:
+            assert what.step(elsewhere) is None
+        assert (what.asked, len(what.pending)) == (begun, begun)
+        with pytest.raises(OptionError, match="no trial has finished"):
+            what.preset()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"varied": ()}, "nothing is varied"),
+        ({"varied": varied("widht=1,2")}, "did you mean 'width'"),
+        ({"varied": varied("lr=-1,2")}, "a trial with algorithm.lr = -1"),
+        ({"varied": varied("lr=[]")}, "the list of values to try is empty"),
+        ({"varied": varied("lr={low = 2, high = 1}")}, "low < high is needed"),
+        ({"varied": varied("lr={low = 1, high = 2}")}, "is a range, which sampler 'grid' cannot go through"),
+        ({"trials": 2}, "--sampler random --trials 2"),
+        ({"sampler": "tpe"}, "needs --trials"),
+        ({"sampler": "gird"}, "did you mean 'grid'"),
+    ],
+)
+def test_bad_requests(changes: dict[str, Any], message: str, tiny_task: str) -> None:
+    with pytest.raises(QrlSuiteError) as refused:
+        search.Search(request(tiny_task, **changes), Path("nowhere"))
+    assert message in str(refused.value)
+
+
+def test_a_missing_optuna_is_named_with_the_command(tiny_task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samplers.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(QrlSuiteError, match=r"pip install 'qrlsuite\[tune\]'"):
+        search.Search(request(tiny_task, sampler="tpe", trials=2), Path("nowhere"))
+
+
+GOOD = 'format_version = 1\nalgorithm = "ddqn"\nmodel = "mlp"\n'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (GOOD + "algoritm_options = {}", "unknown key 'algoritm_options'; did you mean 'algorithm_options'"),
+        (GOOD + "[tuning]\ntaks = 'x'", "unknown key 'taks' in [tuning]; did you mean 'task'"),
+        (GOOD + "[algorithm_options]\nlrr = 1", "algorithm 'ddqn' has no option 'lrr'; did you mean 'lr'"),
+        (GOOD + "[model_options]\nwidth = 0", "model 'mlp': width = 0"),
+        (GOOD.replace('"mlp"', '"vqc-native"'), "holds settings for model 'vqc-native', not for 'mlp'"),
+        ('format_version = 1\nmodel = "mlp"', "missing key 'algorithm'"),
+        ("= 1", "not valid TOML"),
+        (None, "cannot be read"),
+    ],
+)
+def test_bad_preset_files(content: str | None, message: str, tiny_task: str, tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(QrlSuiteError) as refused:
+        resolve(tiny_task, "mlp", preset=str(path))
+    assert message in str(refused.value)
+    assert "p.toml" in str(refused.value)
+
+
+def test_values_of_every_type_survive_a_preset_file() -> None:
+    values = {"a": True, "b": 1e-05, "c": 'q"\\\n', "d": [1, 2.5, "x"], "e f": {"g": [{"h": 1}]}}
+    file = preset.PresetFile(
+        format_version=1, algorithm="x", model="y", algorithm_options={**values, "none": None}
+    )
+    import tomllib
+
+    assert tomllib.loads(preset.dumps(file, "a comment\nof two lines"))["algorithm_options"] == values
+
+
+def test_bad_grid_files(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="unknown grid 'papre'; did you mean 'paper'"):
+        space.load("papre")
+    path = tmp_path / "g.toml"
+    for content in ("format_version = 1", "format_version = 1\n[search.all.al]\nlr = [1]", "x ="):
+        path.write_text(content)
+        with pytest.raises(TaskError, match=r"g\.toml"):
+            space.load(str(path))
+
+
+def test_pace_is_measured_on_runs_that_are_alike(
+    tiny_task: str, tmp_path: Path, train: Callable[..., Path]
+) -> None:
+    entry = resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+    assert search.pace([tmp_path / "nothing"], entry) is None
+    train("runs", [0], 1)
+    seconds = search.pace([tmp_path / "nothing", tmp_path / "runs"], entry)
+    assert seconds is not None
+    assert seconds > 0
+    assert search.pace([tmp_path / "runs"], resolve(tiny_task, "vqc-native")) is None
