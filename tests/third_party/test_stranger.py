@@ -120,7 +120,7 @@ def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
 
 
 def test_it_passes_its_own_test(installed: Installation) -> None:
-    """As its author runs it; the slow kinds are left to `qrlsuite check acme-qrl`, which goes through the same rules."""
+    """As its author runs it; the slow kinds are left to `qrlsuite check acme-qrl`, with the same rules."""
     shutil.copytree(Path(__file__).parent / "acme-qrl" / "tests", installed.folder / "tests")
     words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
     words += ("-k", "fourier or half or log")
