@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError, nearest
 from qrlsuite.leaderboard import origin
 from qrlsuite.store import EntryStore, SeedCurve, entries
 from qrlsuite.task import TaskFile
@@ -79,27 +79,47 @@ class EntryCurves:
         return self.task_file.protocol.interactions
 
 
-def collect(runs: Path, task: str | None = None) -> tuple[list[EntryCurves], list[str]]:
-    """Read every entry below a results folder.
+def collect(
+    runs: Path, task: str | None = None, shipped: bool = False
+) -> tuple[list[EntryCurves], list[str]]:
+    """Read every entry below a folder of results or of published entries.
+
+    Parameters
+    ----------
+    shipped:
+        Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
+        both is shown once, the one with more seeds: equal seeds are the same runs, not further evidence.
 
     Returns
     -------
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    good, refused = [], []
-    for store in entries(runs, task):
+    from qrlsuite.leaderboard import published
+
+    stores = [] if shipped and not runs.is_dir() else entries(runs, task)
+    stores += entries(published.SHIPPED, task) if shipped else []
+    good: dict[tuple[str, str, str], EntryCurves] = {}
+    refused = []
+    for store in stores:
         try:
-            entry = read_entry(store)
+            entry = read(store)
         except QrlSuiteError as error:
             refused.append(str(error))
             continue
-        if entry is not None:
-            good.append(entry)
-    return good, refused
+        if entry is None:
+            continue
+        key = (entry.task, entry.task_hash, entry.name)
+        if shipped and key in good:
+            one, other = sorted((good[key], entry), key=lambda e: len(e.seeds), reverse=True)
+            refused.append(f"{other.folder}: {len(other.seeds)} seeds; shown once, from {one.folder}")
+            good[key] = one
+        else:
+            good[key] = entry
+    return list(good.values()), refused
 
 
-def find(runs: Path, name: str) -> EntryCurves:
+def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
     """Read the one entry whose name, label or hash begins with `name`, or whose folder it is.
 
     Raises
@@ -108,9 +128,9 @@ def find(runs: Path, name: str) -> EntryCurves:
         If none or several match; the message lists them.
     """
     if (Path(name) / "entry.json").exists():
-        found = [read_entry(EntryStore(Path(name)))]
+        found = [read(EntryStore(Path(name)))]
     else:
-        everything, _ = collect(runs)
+        everything, _ = collect(runs, shipped=shipped)
         exact = [e for e in everything if name in (e.name, e.label)]
         found = list(exact or [e for e in everything if _matches(e, name)])
         if not found:
@@ -129,13 +149,28 @@ def _matches(entry: EntryCurves, name: str) -> bool:
     return any(part.startswith(name) for part in parts)
 
 
-def read_entry(store: EntryStore) -> EntryCurves | None:
-    """Read one entry; None where no run has finished an epoch.
+def read(store: EntryStore) -> EntryCurves | None:
+    """Read one entry, from runs or published; None where no run has finished an epoch.
 
     Raises
     ------
     StoreError
-        If a file is damaged.
+        If a file is damaged, or a published entry is not what it says.
+    """
+    from qrlsuite.leaderboard import published
+
+    if published.is_published(store.path):
+        return published.read(store.path).entry_curves()
+    return read_entry(store)
+
+
+def read_entry(store: EntryStore) -> EntryCurves | None:
+    """Read one entry from its runs; None where no run has finished an epoch.
+
+    Raises
+    ------
+    StoreError
+        If a file is damaged, or a score is outside [0, 1].
     """
     record = store.record()
     runs = [store.seed(seed) for seed in store.seeds()]
@@ -153,6 +188,8 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
     identity = record["identity"]
     task_file = TaskFile.model_validate(record["task_file"])
     preset = record["preset"]
+    values = np.stack([curve.curve[:length] for curve in kept])
+    require_scores(values, task_file, store.path)
     return EntryCurves(
         name=record["name"],
         label=record["label"],
@@ -162,7 +199,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         algorithm=identity["algorithm"],
         model=identity["model"],
         parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
-        curves=np.stack([curve.curve[:length] for curve in kept]),
+        curves=values,
         seeds=tuple(curve.seed for curve in kept),
         left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
         hours=sum(seed.seconds() for seed in stores) / 3600,
@@ -179,6 +216,24 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         processors=origin.texts(provenance, "processor"),
         executions=sum(origin.executions(seed) for seed in stores),
     )
+
+
+def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:
+    """Refuse scores that a task cannot give.
+
+    Raises
+    ------
+    StoreError
+        If one is not finite, or outside [0, 1] where the task's scores are relative to the best possible.
+    """
+    if not np.isfinite(scores).all():
+        raise StoreError(f"{folder}: scores must be finite")
+    outside = (scores < -_TOLERANCE) | (scores > 1 + _TOLERANCE)
+    if task_file.ranking.thresholds is None and outside.any():
+        raise StoreError(f"{folder}: a score is {scores[outside][0]:g}, outside [0, 1]")
+
+
+_TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

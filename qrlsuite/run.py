@@ -210,9 +210,7 @@ class GroupRun:
         if epoch:
             self._restore(epoch, arrays)
         else:
-            self.envs.seed_lanes(
-                [s.numpy("environment", lane) for s in self.streams for lane in range(self.E)]
-            )
+            self.begin_episodes()
             self.algorithm.start()
         self.progress.epoch = self.epoch
         origin = provenance.collect([registry.load().get("models", self.entry.model.name).distribution])
@@ -230,6 +228,10 @@ class GroupRun:
             }
             folder.write_record(record)
             self.events.send("run_started", run={**record, "folder": str(folder.path)})
+
+    def begin_episodes(self) -> None:
+        """Give every training environment the stream that its seed and place determine."""
+        self.envs.seed_lanes([s.numpy("environment", lane) for s in self.streams for lane in range(self.E)])
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
         classical, quantum = self.models.parameters[0]
@@ -258,7 +260,7 @@ class GroupRun:
         metrics = dict(self.algorithm.train_epoch(self.entry.task.file.protocol.rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained = time.perf_counter()
-        scores = self._validate(self.epoch + 1)
+        scores = self.validate(self.epoch + 1)
         finished = time.perf_counter()
         executions = {name: count - before.get(name, 0) for name, count in self.models.executions().items()}
         self.progress.epoch_seconds = finished - started
@@ -275,7 +277,7 @@ class GroupRun:
             ]
         return means[0], means[1]
 
-    def _validate(self, epoch: int) -> NDArray[np.float64]:
+    def validate(self, epoch: int) -> NDArray[np.float64]:
         """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V)."""
         envs = self.validation
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)

@@ -18,6 +18,10 @@ RuleOption = Annotated[
         help="What counts as significant: qrlsuite list significance-tests; qrlsuite show NAME.",
     ),
 ]
+PublishedOption = Annotated[
+    bool,
+    typer.Option("--published", help="With the published entries that come with the suite."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 
@@ -28,6 +32,7 @@ def build() -> typer.Typer:
         check,
         compare,
         evaluate,
+        export,
         import_,
         leaderboard,
         listing,
@@ -57,12 +62,13 @@ def build() -> typer.Typer:
     app.command("run")(run.run)
     app.command("status")(status.status)
     app.command("runs")(runs.runs)
-    app.command("leaderboard")(leaderboard.leaderboard)
+    app.add_typer(leaderboard.app, name="leaderboard")
     app.command("compare")(compare.compare)
     app.command("calibrate")(calibrate.calibrate)
     app.command("plot", cls=plot.Command)(plot.plot)
     app.command("evaluate")(evaluate.evaluate)
     app.command("tune")(tune.tune)
+    app.command("export")(export.export)
     app.command("import")(import_.import_results)
     app.command("list")(listing.list_things)
     app.command("show")(show.show)

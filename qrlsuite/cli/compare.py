@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qrlsuite import rules
-from qrlsuite.cli.app import JsonOption, RuleOption, RunsOption
+from qrlsuite.cli.app import JsonOption, PublishedOption, RuleOption, RunsOption
 
 if TYPE_CHECKING:
     from qrlsuite.statistics import Comparison
@@ -27,6 +27,7 @@ def compare(
     first: Annotated[str, typer.Argument(metavar="ENTRY", help="An entry's name, or the beginning of it.")],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
     rule: RuleOption = rules.DEFAULT,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -40,7 +41,7 @@ def compare(
 
     from qrlsuite.leaderboard import board, collect
 
-    one, other = collect.find(runs, first), collect.find(runs, second)
+    one, other = (collect.find(runs, name, published) for name in (first, second))
     comparison = board.compare_entries(one, other, rules.load(rule))
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))

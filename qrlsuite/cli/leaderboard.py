@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qrlsuite import rules
-from qrlsuite.cli.app import RuleOption, RunsOption
+from qrlsuite.cli import verify
+from qrlsuite.cli.app import PublishedOption, RuleOption, RunsOption
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
@@ -21,10 +22,17 @@ class Format(StrEnum):
     table = "table"
     markdown = "markdown"
     json = "json"
+    csv = "csv"
     html = "html"
 
 
+app = typer.Typer(invoke_without_command=True)
+app.command("verify")(verify.verify)
+
+
+@app.callback()
 def leaderboard(
+    context: typer.Context,
     task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
     output: Annotated[
@@ -34,6 +42,7 @@ def leaderboard(
         ),
     ] = None,
     rule: RuleOption = rules.DEFAULT,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Rank the entries of each task by significant outperformance.
@@ -44,6 +53,8 @@ def leaderboard(
 
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """
+    if context.invoked_subcommand is not None:
+        return
     import json
 
     from qrlsuite.errors import OptionError, UnknownNameError
@@ -52,7 +63,7 @@ def leaderboard(
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
-    found, refused = collect.collect(runs, task)
+    found, refused = collect.collect(runs, task, published)
     board = boards.build(found, refused, rules.load(rule))
     if format_ is Format.json:
         typer.echo(json.dumps(boards.as_dict(board)))
@@ -61,16 +72,19 @@ def leaderboard(
         typer.echo(f"left out: {line}", err=True)
     if not board.sections:
         raise UnknownNameError(
-            f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run"
+            f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run; "
+            "--published shows those that come with the suite"
         )
     if format_ is Format.html:
         _page(board, output or runs / "leaderboard.html")
     elif format_ is Format.markdown:
         typer.echo(_markdown(board))
+    elif format_ is Format.csv:
+        typer.echo(_csv(board), nl=False)
     else:
         for section in board.sections:
             _table(section)
-    if board.rule != rules.DEFAULT and format_ is not Format.html:
+    if board.rule != rules.DEFAULT and format_ not in (Format.html, Format.csv):
         typer.echo(f"rule '{board.rule}': {board.promise}")
 
 
@@ -163,3 +177,37 @@ def _markdown(board: Leaderboard) -> str:
             lines.append(f"| {' | '.join(cells)} |")
         lines += ["", *(f"{note.replace('*', chr(92) + '*')}  " for note in _notes(section)), ""]
     return "\n".join(lines)
+
+
+def _csv(board: Leaderboard) -> str:
+    """Write one line per entry and section; lists are separated by semicolons."""
+    import csv
+    import io
+
+    from qrlsuite.leaderboard import board as boards
+
+    rows = []
+    for section in boards.as_dict(board)["sections"]:
+        for row in section["rows"]:
+            low, high = row.pop("interval")
+            count = row.pop("parameters")
+            flat = {
+                **{name: section[name] for name in ("task", "horizon", "cell")},
+                **row,
+                "parameters_classical": count["classical"],
+                "parameters_quantum": count["quantum"],
+                "interval_low": low,
+                "interval_high": high,
+                "rule": board.rule,
+            }
+            rows.append({k: "; ".join(v) if isinstance(v, list) else v for k, v in flat.items()})
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _harmless(value) for name, value in row.items()} for row in rows)
+    return buffer.getvalue()
+
+
+def _harmless(value: object) -> object:
+    """Keep spreadsheets from reading a name as a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value

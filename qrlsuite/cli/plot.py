@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.app import JsonOption, PublishedOption, RunsOption
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +53,7 @@ def plot(
     list_settings: Annotated[
         bool, typer.Option("--settings", help="List the settings of this kind, and draw nothing.")
     ] = False,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -93,7 +94,7 @@ def plot(
         if of == "episodes":
             raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
         if of == "entries":
-            found = _entries(runs, task or [], entry or [], kind)
+            found = _entries(runs, published, task or [], entry or [])
         figure = pictures.draw(kind, found, **own)
         name, folder = ("-".join(dict.fromkeys(e.task for e in found)), runs) if found else ("", Path())
     path = output or folder / f"{name}-{kind}.png".removeprefix("-")
@@ -196,16 +197,16 @@ def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     return own, world
 
 
-def _entries(runs: Path, tasks: list[str], names: list[str], kind: str) -> list[EntryCurves]:
+def _entries(runs: Path, shipped: bool, tasks: list[str], names: list[str]) -> list[EntryCurves]:
     """Return the entries to draw: those named, in that order, else all of the task, the smallest model first."""
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
     if names:
-        found = [collect.find(runs, name) for name in dict.fromkeys(names)]
+        found = [collect.find(runs, name, shipped) for name in dict.fromkeys(names)]
         found = [e for e in found if not tasks or e.task in tasks]
     else:
-        found, refused = collect.collect(runs)
+        found, refused = collect.collect(runs, shipped=shipped)
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
         found = [e for e in found if not tasks or e.task in tasks]

@@ -1,0 +1,91 @@
+"""Writing published entries from runs."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.fingerprint import fingerprint
+from qrlsuite.leaderboard import origin, published
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.store import EntryStore
+
+
+def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
+    """Write an entry's published form; returns its folder `out/<task>/<entry>`.
+
+    Only complete runs are written. What the seeds looked like before training is computed anew, so that a file
+    that was changed since does not agree with it.
+
+    Parameters
+    ----------
+    entry:
+        Read from a results folder.
+    force:
+        Replace a published entry that has more seeds or more epochs.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the entry was imported or is published already, a larger one is in its place, or it does not fit this
+        version of the suite.
+    """
+    if entry.source != "runs":
+        raise QrlSuiteError(f"{entry.folder} is a published entry already")
+    store = EntryStore(entry.folder)
+    built = store.entry()
+    folder = out / entry.task / entry.name
+    _refuse_smaller(folder, entry, force)
+    records = [store.seed(seed).record() or {} for seed in entry.seeds]
+    unfinished = [seed for seed, record in zip(entry.seeds, records) if record.get("status") != "finished"]
+    if unfinished:
+        raise QrlSuiteError(
+            f"'{entry.label}' is not complete: {len(unfinished)} of {len(records)} seeds are still training; "
+            "repeat the `qrlsuite run` that made it"
+        )
+    content = published.files(
+        {name: value for name, value in store.record().items() if name != "published"},
+        entry.seeds,
+        entry.curves,
+        [store.seed(seed).seconds() / 3600 for seed in entry.seeds],
+        [origin.executions(store.seed(seed)) for seed in entry.seeds],
+        [record["provenance"][-1] if record.get("provenance") else {} for record in records],
+        entry.parameters,
+        fingerprint(built, entry.seeds),
+    )
+    _replace(folder, content)
+    published.read(folder)
+    return folder
+
+
+def _refuse_smaller(folder: Path, entry: EntryCurves, force: bool) -> None:
+    if force or not folder.exists():
+        return
+    try:
+        before = published.read(folder)
+    except StoreError as error:
+        raise QrlSuiteError(f"{error}; --force replaces it") from None
+    if len(before.seeds) > len(entry.seeds) or before.curves.shape[1] > entry.curves.shape[1]:
+        raise QrlSuiteError(
+            f"{folder} has {len(before.seeds)} seeds of {before.curves.shape[1]} epochs, "
+            f"and '{entry.label}' {len(entry.seeds)} of {entry.curves.shape[1]}; --force replaces it"
+        )
+
+
+def _replace(folder: Path, content: dict[str, bytes]) -> None:
+    """Put whole files in place of a folder: a reader sees the old ones or the new ones."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+            fresh, old = Path(temporary) / "new", Path(temporary) / "old"
+            fresh.mkdir()
+            for name, data in content.items():
+                (fresh / name).write_bytes(data)
+            if folder.exists():
+                folder.rename(old)
+            fresh.rename(folder)
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {error.strerror or error}") from None

@@ -1,0 +1,380 @@
+"""Published entries: an entry's validation curves and how they were made, in three small files.
+
+    <task>/<entry>/entry.json       what was run, with every option, versions and processors
+                   curves.parquet   seed, epoch, score: the mean of each validation
+                   seeds.parquet    per seed: hours, circuit executions, and what it looked like before training
+
+Nothing in them is believed: hashes are computed again, the folder's place, the label and every number are
+checked, and every figure of a leaderboard is computed from the curves.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.entry import from_record
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.fingerprint import Fingerprint
+from qrlsuite.leaderboard import origin
+from qrlsuite.leaderboard.collect import EntryCurves, require_scores
+from qrlsuite.registry import load as registered
+from qrlsuite.specs import NAME
+from qrlsuite.store import EntryStore
+from qrlsuite.task import TaskFile, digest
+
+SHIPPED = Path(__file__).parent / "entries"
+"""The entries that come with the suite."""
+
+CURVES = "curves.parquet"
+SEEDS = "seeds.parquet"
+MAX_BYTES = 20_000_000
+"""A file larger than this, packed or unpacked, is no entry."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published entry, checked.
+
+    Attributes
+    ----------
+    record:
+        `entry.json`.
+    curves:
+        (N, T) float64.
+    hours, executions:
+        (N,): core-hours and circuit executions per seed.
+    origins:
+        (N,): for each seed the index of its provenance in the record.
+    fingerprint:
+        What the seeds looked like before training.
+    """
+
+    folder: Path
+    record: Mapping[str, Any]
+    task_file: TaskFile
+    seeds: tuple[int, ...]
+    curves: NDArray[np.float64]
+    hours: NDArray[np.float64]
+    executions: NDArray[np.int64]
+    origins: NDArray[np.int64]
+    fingerprint: Fingerprint
+
+    @property
+    def provenance(self) -> list[Mapping[str, Any]]:
+        """What each seed was made with, in the seeds' order."""
+        made = self.record["published"]["provenance"]
+        return [made[index] for index in self.origins]
+
+    def entry_curves(self) -> EntryCurves:
+        """Return what a leaderboard ranks."""
+        record, identity = self.record, self.record["identity"]
+        count = record["published"]["parameters"]
+        provenance = self.provenance
+        return EntryCurves(
+            name=record["name"],
+            label=record["label"],
+            task=record["task_name"],
+            task_hash=record["task_hash"],
+            task_file=self.task_file,
+            algorithm=identity["algorithm"],
+            model=identity["model"],
+            parameters=(count["classical"], count["quantum"]),
+            curves=self.curves,
+            seeds=self.seeds,
+            left_out=(),
+            hours=float(self.hours.sum()),
+            folder=self.folder,
+            identity=identity,
+            options={
+                "algorithm": identity["algorithm_options"],
+                "model": identity["model_options"],
+                "environment": self.task_file.environment.options,
+            },
+            preset=record["preset"] if isinstance(record["preset"], str) else None,
+            versions=origin.versions(provenance),
+            commits=origin.texts(provenance, "commit"),
+            processors=origin.texts(provenance, "processor"),
+            executions=int(self.executions.sum()),
+            source="published",
+        )
+
+
+def is_published(folder: Path) -> bool:
+    """Return whether a folder holds a published entry rather than runs."""
+    return (folder / CURVES).exists()
+
+
+def read(folder: Path) -> Published:
+    """Read a published entry and check all that can be checked without training.
+
+    Raises
+    ------
+    StoreError
+        With the first thing that is wrong.
+    """
+    try:
+        return _read(folder)
+    except StoreError:
+        raise
+    except (
+        QrlSuiteError,
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        text = " ".join(str(error).split())[:200]
+        raise StoreError(f"{folder}: not a published entry: {type(error).__name__}: {text}") from None
+
+
+def _read(folder: Path) -> Published:
+    for name in ("entry.json", CURVES, SEEDS):
+        if not (folder / name).is_file():
+            raise StoreError(f"{folder}: {name} is missing; write the entry again with `qrlsuite export`")
+        if (folder / name).stat().st_size > MAX_BYTES:
+            raise StoreError(f"{folder / name}: larger than {MAX_BYTES // 1_000_000} MB")
+    record = EntryStore(folder).record()
+    task_file = TaskFile.model_validate(record["task_file"])
+    published = record["published"]
+    _check_identity(folder, record, task_file)
+    provenance = published["provenance"]
+    _require(
+        isinstance(provenance, list)
+        and len(provenance) > 0
+        and all(isinstance(made, dict) for made in provenance),
+        folder,
+        "provenance is not a list of records",
+    )
+    for family in ("classical", "quantum"):
+        count = published["parameters"][family]
+        _require(type(count) is int and 0 <= count < 10**12, folder, f"{family} parameters: {count!r}")
+    seeds, curves = _curves(folder, task_file)
+    facts = _table(folder / SEEDS, _SEED_COLUMNS)
+    _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
+    hours = np.array(facts["hours"], np.float64)
+    executions = np.array(facts["executions"], np.int64)
+    origins = np.array(facts["origin"], np.int64)
+    beginning = Fingerprint(
+        np.array(facts["parameters"], np.float64),
+        np.array(facts["episodes"], np.float64),
+        np.array(facts["before"], np.float64),
+    )
+    _require(
+        bool(np.isfinite(hours).all() and (hours >= 0).all()), folder, "hours must be numbers, not negative"
+    )
+    _require(bool((executions >= 0).all()), folder, "circuit executions must not be negative")
+    _require(
+        bool((origins >= 0).all() and (origins < len(provenance)).all()),
+        folder,
+        "a seed names a provenance that is not there",
+    )
+    for values in (beginning.parameters, beginning.episodes, beginning.before):
+        _require(bool(np.isfinite(values).all()), folder, f"{SEEDS} holds values that are not finite")
+    _require(
+        beginning.parameters.ndim == 2 and beginning.episodes.shape == (len(seeds), 2),
+        folder,
+        f"{SEEDS} has rows of different lengths",
+    )
+    return Published(folder, record, task_file, seeds, curves, hours, executions, origins, beginning)
+
+
+def _require(holds: bool, folder: Path, problem: str) -> None:
+    if not holds:
+        raise StoreError(f"{folder}: {problem}")
+
+
+def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
+    """Compute hashes, name and label again from what they stand for."""
+    identity, task = record["identity"], record["identity"]["task"]
+    expected = f"{identity['algorithm']}-{identity['model']}-{record['hash'][:8]}"
+    _require(digest(task) == record["task_hash"], folder, "the task's definition does not have its hash")
+    _require(digest(identity) == record["hash"], folder, "the options do not have the entry's hash")
+    for part in ("algorithm_options", "model_options"):
+        _require(isinstance(identity[part], dict), folder, f"{part} is not a table")
+    for name in (identity["algorithm"], identity["model"]):
+        _require(bool(NAME.fullmatch(name)), folder, f"{name!r} is not a name")
+    _require(
+        record["name"] == expected, folder, f"it is named {record['name']!r}, and should be {expected!r}"
+    )
+    _require(
+        (folder.parent.name, folder.name) == (record["task_name"], expected),
+        folder,
+        f"its place is {record['task_name']}/{expected}",
+    )
+    protocol = task_file.protocol
+    stated = {
+        "environment": task_file.environment.name,
+        "environments": protocol.environments,
+        "interactions": protocol.interactions,
+        "validation_episodes": protocol.validation_episodes,
+        "score": task_file.score.model_dump(mode="json"),
+    }
+    for name, value in stated.items():
+        _require(
+            task.get(name) == value,
+            folder,
+            f"its task file has {name} = {value!r}, its task {task.get(name)!r}",
+        )
+    known = registered().entries
+    if not (
+        identity["algorithm"] in known["algorithms"]
+        and identity["model"] in known["models"]
+        and task_file.environment.name in known["environments"]
+    ):
+        usual = f"{identity['algorithm']} {identity['model']}"
+        _require(record["label"].startswith(usual), folder, f"its label does not begin with {usual!r}")
+        return
+    entry = from_record(record, str(folder / "entry.json"))  # builds the options anew, and compares the hash
+    _require(
+        record["label"] == entry.label,
+        folder,
+        f"its label is {record['label']!r}, and should be {entry.label!r}",
+    )
+
+
+_CURVE_COLUMNS = {"seed": "int64", "epoch": "int64", "score": "double"}
+_SEED_COLUMNS = {
+    "seed": "int64",
+    "origin": "int64",
+    "hours": "double",
+    "executions": "int64",
+    "before": "double",
+    "episodes": "list<double>",
+    "parameters": "list<double>",
+}
+
+
+def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray[np.float64]]:
+    """Read (N,) seeds and (N, T) curves."""
+    table = _table(folder / CURVES, _CURVE_COLUMNS)
+    numbers = np.array(table["seed"], np.int64)
+    epochs, scores = np.array(table["epoch"], np.int64), np.array(table["score"], np.float64)
+    seeds, counts = np.unique(numbers, return_counts=True)
+    _require(len(seeds) > 0, folder, "it holds no run")
+    _require(int(seeds[0]) >= 0, folder, f"seed {seeds[0]} is negative")
+    length = int(epochs.max())
+    order = np.lexsort((epochs, numbers))
+    for seed, count in zip(seeds, counts):
+        own = np.sort(epochs[numbers == seed])
+        twice = own[1:][own[1:] == own[:-1]]
+        _require(
+            not len(twice), folder, f"seed {seed} is there twice (epoch {twice[0] if len(twice) else 0})"
+        )
+        _require(
+            int(count) == length and int(own[0]) == 1,
+            folder,
+            f"seed {seed} has {count} of {length} epochs: some are missing",
+        )
+    require_scores(scores, task_file, folder)
+    return tuple(int(seed) for seed in seeds), scores[order].reshape(len(seeds), length)
+
+
+def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:
+    """Read a parquet file that must hold exactly these columns, without empty cells."""
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        file = pyarrow.parquet.ParquetFile(path)
+        found = {
+            field.name: "list<double>"
+            if pyarrow.types.is_list(field.type) and pyarrow.types.is_float64(field.type.value_type)
+            else str(field.type)
+            for field in file.schema_arrow
+        }
+        if found != dict(columns):
+            raise StoreError(f"{path}: columns are {found}, and should be {dict(columns)}")
+        meta = file.metadata
+        size = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
+        if size > MAX_BYTES or meta.num_rows * 8 > MAX_BYTES:
+            raise StoreError(f"{path}: unpacks to more than {MAX_BYTES // 1_000_000} MB")
+        table = file.read()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise StoreError(
+            f"{path} is not a readable parquet file: {' '.join(str(error).split())[:200]}"
+        ) from None
+    if any(column.null_count for column in table.columns):
+        raise StoreError(f"{path} has empty cells")
+    result: dict[str, list[Any]] = table.to_pydict()
+    return result
+
+
+def files(
+    record: Mapping[str, Any],
+    seeds: tuple[int, ...],
+    curves: NDArray[np.float64],
+    hours: list[float],
+    executions: list[int],
+    provenance: list[Mapping[str, Any]],
+    parameters: tuple[int, int],
+    beginning: Fingerprint,
+) -> dict[str, bytes]:
+    """Encode an entry's three files, by name; equal entries give equal bytes.
+
+    Parameters
+    ----------
+    record:
+        `entry.json` of its runs.
+    curves:
+        (N, T).
+    hours, executions, provenance, beginning:
+        Per seed, N of each.
+    """
+    distinct: list[Mapping[str, Any]] = []
+    for made in provenance:
+        if made not in distinct:
+            distinct.append(made)
+    count, length = curves.shape
+    content = {
+        **record,
+        "published": {
+            "seeds": count,
+            "epochs": length,
+            "parameters": {"classical": parameters[0], "quantum": parameters[1]},
+            "core_hours": round(math.fsum(hours), 6),
+            "circuit_executions": sum(executions),
+            "provenance": distinct,
+        },
+    }
+    return {
+        "entry.json": json.dumps(content, indent=1, allow_nan=False).encode() + b"\n",
+        CURVES: _encode(
+            {
+                "seed": np.repeat(np.array(seeds, np.int64), length),
+                "epoch": np.tile(np.arange(1, length + 1, dtype=np.int64), count),
+                "score": np.asarray(curves, np.float64).ravel(),
+            }
+        ),
+        SEEDS: _encode(
+            {
+                "seed": np.array(seeds, np.int64),
+                "origin": np.array([distinct.index(made) for made in provenance], np.int64),
+                "hours": np.array(hours, np.float64),
+                "executions": np.array(executions, np.int64),
+                "before": beginning.before,
+                "episodes": beginning.episodes.tolist(),
+                "parameters": beginning.parameters.tolist(),
+            }
+        ),
+    }
+
+
+def _encode(columns: Mapping[str, Any]) -> bytes:
+    import pyarrow
+    import pyarrow.parquet
+
+    sink = pyarrow.BufferOutputStream()
+    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+    pyarrow.parquet.write_table(table, sink, compression="zstd", compression_level=19)
+    result: bytes = sink.getvalue().to_pybytes()
+    return result

@@ -1,0 +1,214 @@
+"""Checking published entries: their files, and some of their seeds by training them again."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from qrlsuite import provenance, registry
+from qrlsuite.entry import Entry, from_record
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.fingerprint import fingerprint
+from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard.published import Published
+from qrlsuite.run import GroupRun, Progress
+from qrlsuite.store import EntryStore
+
+AGREEMENT = 1e-5
+"""How closely the beginnings of runs agree between machines, relative to 1 or the value."""
+P_VALUE = 0.01
+"""Below it, final scores of a re-run are not plausible members of the entry."""
+
+Check = Literal["files", "equal", "plausible"]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of checking one entry.
+
+    Attributes
+    ----------
+    check:
+        The strongest check that was made: of the files alone, of equal curves, or of plausible ones.
+    seeds:
+        The seeds that were trained again.
+    message:
+        What was checked and what came out, in words.
+    """
+
+    folder: Path
+    name: str
+    ok: bool
+    check: Check
+    seeds: tuple[int, ...]
+    message: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            "entry": self.name,
+            "folder": str(self.folder),
+            "ok": self.ok,
+            "check": self.check,
+            "seeds": list(self.seeds),
+            "message": self.message,
+        }
+
+
+def find(path: Path) -> list[Path]:
+    """Return the published entries at or below a folder, sorted.
+
+    Raises
+    ------
+    QrlSuiteError
+        If there is none.
+    """
+    if (path / "entry.json").exists():
+        return [path]
+    found = sorted(
+        {p.parent for p in path.glob("*/*/entry.json")} | {p.parent for p in path.glob("*/entry.json")}
+    )
+    if not found:
+        raise QrlSuiteError(f"{path} holds no published entry: qrlsuite export ENTRY --out {path}")
+    return found
+
+
+def verify(
+    folder: Path,
+    rerun: int = 0,
+    generator: np.random.Generator | None = None,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Verdict:
+    """Check one published entry.
+
+    With `rerun`, that many seeds are chosen at random and trained again from nothing. On the type of machine and
+    the versions that made them, their curves must be equal. Elsewhere floating point differs in the last bits and
+    training amplifies that, so that initial parameters, the first epoch's episodes and the score before training
+    must agree to 1e-5, and the final scores must be plausible members of the entry (two-sided Mann-Whitney rank
+    test, p > .01).
+
+    Parameters
+    ----------
+    generator:
+        Chooses the seeds; fresh entropy by default, which nobody who forges an entry can foresee.
+    report:
+        Called with the progress of the training.
+    """
+    name = f"{folder.parent.name}/{folder.name}"
+    try:
+        entry = published.read(folder)
+        made_by = from_record(entry.record, str(folder / "entry.json")) if rerun else None
+    except QrlSuiteError as error:
+        return Verdict(folder, name, False, "files", (), str(error))
+    count, length = entry.curves.shape
+    sound = f"files sound: {count} seeds of {length} epochs, hashes and label computed again"
+    if made_by is None:
+        return Verdict(folder, name, True, "files", (), sound)
+    chooser = generator or np.random.default_rng()
+    places = sorted(int(i) for i in chooser.choice(count, size=min(rerun, count), replace=False))
+    seeds = tuple(entry.seeds[place] for place in places)
+    problem = _beginning(entry, made_by, places)
+    if problem:
+        return Verdict(folder, name, False, "plausible", seeds, problem)
+    again = _train(made_by, seeds, length, report)
+    differs = _elsewhere(entry, made_by, places)
+    if differs is None:
+        return _equal(entry, name, places, seeds, again)
+    return _plausible(entry, name, places, seeds, again, differs)
+
+
+def _beginning(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:
+    """Say what differs before training, None where everything agrees."""
+    seeds = [entry.seeds[place] for place in places]
+    here, stated = fingerprint(made_by, seeds), entry.fingerprint
+    parts = {
+        "initial parameters": (here.parameters, stated.parameters),
+        "the first epoch's episodes": (here.episodes, stated.episodes),
+        "the score before training": (here.before, stated.before),
+    }
+    for words, (computed, published_values) in parts.items():
+        given = published_values[list(places)]
+        if computed.shape != given.shape:
+            return f"seeds {_list(seeds)}: {words} are of another number"
+        away = np.abs(computed - given) > AGREEMENT * np.maximum(1, np.abs(given))
+        if away.any():
+            most = np.abs(computed - given).max()
+            return f"seeds {_list(seeds)}: {words} differ by {most:.2g}, more than {AGREEMENT:g}"
+    return None
+
+
+def _train(
+    made_by: Entry, seeds: Sequence[int], epochs: int, report: Callable[[Progress], None]
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Train seeds from nothing in a temporary folder; returns their curves."""
+    with tempfile.TemporaryDirectory(prefix="qrlsuite-verify-") as temporary:
+        store = EntryStore.create(Path(temporary), made_by)
+        GroupRun(made_by, store, seeds, epochs, report=report).run()
+        return np.stack([store.seed(seed).curve().curve for seed in seeds])
+
+
+def _elsewhere(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:
+    """Say in what this machine differs from the one that made the seeds; None where bits must be equal."""
+    here = provenance.collect([registry.load().get("models", made_by.model.name).distribution])
+    for place in places:
+        there = entry.provenance[place]
+        versions = there.get("versions")
+        for name, version in here["versions"].items():
+            other = versions.get(name) if isinstance(versions, dict) else None
+            if other != version:
+                return f"{name} {version} here, {other} there"
+        for name in ("processor", "system", "python"):
+            if there.get(name) != here[name]:
+                return f"{name} {here[name]} here, {there.get(name)} there"
+    return None
+
+
+def _equal(
+    entry: Published, name: str, places: Sequence[int], seeds: tuple[int, ...], again: np.ndarray[Any, Any]
+) -> Verdict:
+    stated = entry.curves[list(places)]
+    if np.array_equal(again, stated):
+        message = (
+            f"seeds {_list(seeds)} trained again: curves equal, bit for bit (same versions and processor)"
+        )
+        return Verdict(entry.folder, name, True, "equal", seeds, message)
+    row, epoch = np.argwhere(again != stated)[0]
+    message = (
+        f"seed {seeds[row]} trained again differs from epoch {epoch + 1} on ({again[row, epoch]:.6f}, published "
+        f"{stated[row, epoch]:.6f}), with the same versions on the same processor"
+    )
+    return Verdict(entry.folder, name, False, "equal", seeds, message)
+
+
+def _plausible(
+    entry: Published,
+    name: str,
+    places: Sequence[int],
+    seeds: tuple[int, ...],
+    again: np.ndarray[Any, Any],
+    differs: str,
+) -> Verdict:
+    from scipy.stats import mannwhitneyu
+
+    others = np.delete(entry.curves[:, -1], list(places))
+    begun = f"seeds {_list(seeds)} begin alike to {AGREEMENT:g}"
+    if not len(others):
+        return Verdict(
+            entry.folder, name, True, "plausible", seeds, f"{begun} ({differs}); no others to rank them with"
+        )
+    p = float(mannwhitneyu(again[:, -1], others, alternative="two-sided").pvalue)
+    p = 1.0 if np.isnan(p) else p  # all scores equal
+    verdict = "plausible" if p > P_VALUE else "not plausible"
+    message = (
+        f"{begun}; their final scores are {verdict} among the others (rank test, p = {p:.2g}); {differs}"
+    )
+    return Verdict(entry.folder, name, p > P_VALUE, "plausible", seeds, message)
+
+
+def _list(seeds: Sequence[int]) -> str:
+    return ", ".join(map(str, seeds))

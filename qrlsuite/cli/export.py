@@ -1,0 +1,58 @@
+"""`qrlsuite export`: entries in the form in which they are published."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qrlsuite.cli.app import RunsOption
+
+
+def export(
+    entries: Annotated[
+        list[str] | None, typer.Argument(metavar="[ENTRY]...", help="Names, or the beginnings of them.")
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/TASK/ENTRY/.")] = Path(
+        "leaderboard/entries"
+    ),
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
+    ] = False,
+    runs: RunsOption = Path("runs"),
+) -> None:
+    """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
+
+    Only finished seeds are written. `qrlsuite leaderboard verify` checks what was written, and can train some
+    seeds again.
+
+    Example: qrlsuite export "mlp width=64" --out leaderboard/entries
+    """
+    from qrlsuite.errors import OptionError, QrlSuiteError
+    from qrlsuite.leaderboard import collect
+    from qrlsuite.leaderboard.export import export as write
+
+    if everything == bool(entries):
+        raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
+    if everything:
+        found, refused = collect.collect(runs)
+        for line in refused:
+            typer.echo(f"left out: {line}", err=True)
+    else:
+        found = [collect.find(runs, name) for name in dict.fromkeys(entries or [])]
+    failed = 0
+    for entry in found:
+        try:
+            folder = write(entry, out, force)
+        except QrlSuiteError as error:
+            if not everything:
+                raise
+            typer.echo(f"left out: {error}", err=True)
+            failed += 1
+            continue
+        size = sum(path.stat().st_size for path in folder.iterdir())
+        typer.echo(f"wrote {folder} ({len(entry.seeds)} seeds, {size / 1000:.0f} kB)")
+    if len(found) > failed:
+        typer.echo(f"next: qrlsuite leaderboard verify {out} --rerun 2")

@@ -1,0 +1,330 @@
+"""Published entries: written from runs, read without trust, trained again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from qrlsuite.cli.app import build
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.leaderboard import collect, published, verify
+from qrlsuite.leaderboard.export import export
+from qrlsuite.store import EntryStore
+from qrlsuite.task import digest
+
+EPOCHS = 3
+
+
+@pytest.fixture
+def folder(train: Callable[..., Path], tmp_path: Path) -> Path:
+    """Eight seeds of a tiny task, published."""
+    runs = train("runs", range(8), EPOCHS)
+    entry = collect.read_entry(EntryStore(runs))
+    assert entry is not None
+    return export(entry, tmp_path / "entries")
+
+
+def rewrite(path: Path, change: Callable[[dict[str, list[Any]]], Any]) -> None:
+    """Change a parquet file's columns."""
+    table = pyarrow.parquet.read_table(path)
+    columns = table.to_pydict()
+    change(columns)
+    arrays = {name: pyarrow.array(values, table.schema.field(name).type) for name, values in columns.items()}
+    pyarrow.parquet.write_table(pyarrow.table(arrays), path)
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change `entry.json`."""
+    record = json.loads((folder / "entry.json").read_text())
+    change(record)
+    (folder / "entry.json").write_text(json.dumps(record))
+
+
+def test_what_is_published_is_what_was_run(folder: Path, tmp_path: Path) -> None:
+    runs, refused = collect.collect(tmp_path / "runs")
+    there, refused_there = collect.collect(tmp_path / "entries")
+    assert refused == refused_there == []
+    (one,), (other,) = runs, there
+    assert np.array_equal(one.curves, other.curves)
+    assert other.source == "published"
+    same = (
+        "name",
+        "label",
+        "task",
+        "task_hash",
+        "task_file",
+        "parameters",
+        "seeds",
+        "identity",
+        "executions",
+    )
+    same += ("preset", "versions", "processors", "options", "algorithm", "model")
+    assert {name: getattr(one, name) for name in same} == {name: getattr(other, name) for name in same}
+    assert other.hours == pytest.approx(one.hours)
+
+
+def test_writing_again_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (entry,), _ = collect.collect(tmp_path / "runs")
+    export(entry, tmp_path / "entries")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
+    folder: Path, train: Callable[..., Path], tmp_path: Path
+) -> None:
+    entry = collect.read_entry(EntryStore(train("few", range(2), EPOCHS)))
+    assert entry is not None
+    with pytest.raises(QrlSuiteError, match=r"has 8 seeds of 3 epochs.*--force"):
+        export(entry, tmp_path / "entries")
+    assert len(published.read(folder).seeds) == 8
+    export(entry, tmp_path / "entries", force=True)
+    assert len(published.read(folder).seeds) == 2
+
+
+def test_the_beginning_of_a_seed_does_not_depend_on_its_company(folder: Path) -> None:
+    from qrlsuite.entry import from_record
+    from qrlsuite.fingerprint import fingerprint
+
+    stated = published.read(folder)
+    alone = fingerprint(from_record(stated.record, ""), [5])
+    assert np.array_equal(alone.parameters[0], stated.fingerprint.parameters[5])
+    assert np.array_equal(alone.episodes[0], stated.fingerprint.episodes[5])
+    assert alone.before[0] == stated.fingerprint.before[5]
+    assert len(np.unique(stated.fingerprint.parameters[:, 0])) == 8
+
+
+def put(name: str, place: int, value: Any) -> Callable[[dict[str, list[Any]]], None]:
+    def change(columns: dict[str, list[Any]]) -> None:
+        columns[name][place] = value
+
+    return change
+
+
+def drop(place: int) -> Callable[[dict[str, list[Any]]], None]:
+    def change(columns: dict[str, list[Any]]) -> None:
+        for values in columns.values():
+            del values[place]
+
+    return change
+
+
+CURVES = {
+    "missing epoch": (drop(1), "seed 0 has 2 of 3 epochs"),
+    "a missing last epoch": (drop(-1), "seed 7 has 2 of 3 epochs"),
+    "duplicate seed": (put("seed", 3, 0), "is there twice|of 3 epochs"),
+    "above one": (put("score", 4, 1.5), "outside \\[0, 1\\]"),
+    "below zero": (put("score", 4, -0.1), "outside \\[0, 1\\]"),
+    "not a number": (put("score", 4, float("nan")), "finite"),
+    "empty cell": (put("score", 4, None), "empty cells"),
+    "negative seed": (lambda c: c.update(seed=[s - 1 for s in c["seed"]]), "seed -1 is negative"),
+    "other seeds": (lambda c: c.update(seed=[s + 1 for s in c["seed"]]), "hold different seeds"),
+    "an epoch 0": (lambda c: c.update(epoch=[e - 1 for e in c["epoch"]]), "are missing"),
+}
+
+
+@pytest.mark.parametrize("case", CURVES)
+def test_wrong_curves_are_refused(folder: Path, tmp_path: Path, case: str) -> None:
+    change, message = CURVES[case]
+    rewrite(folder / "curves.parquet", change)
+    with pytest.raises(StoreError, match=str(message)):
+        published.read(folder)
+    assert len(collect.collect(tmp_path / "entries")[1]) == 1
+
+
+def rehash(record: dict[str, Any]) -> None:
+    """Make the hashes fit, as a careful forger would."""
+    record["task_hash"] = digest(record["identity"]["task"])
+    record["hash"] = digest(record["identity"])
+
+
+def other_steps(record: dict[str, Any]) -> None:
+    record["task_file"]["protocol"]["interactions"] = 4
+
+
+def other_task(record: dict[str, Any]) -> None:
+    record["identity"]["task"]["environment_options"]["degree"] = 2
+
+
+def other_task_rehashed(record: dict[str, Any]) -> None:
+    other_task(record)
+    rehash(record)
+
+
+RECORDS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "steps": (other_steps, "interactions"),
+    "task": (other_task, "definition does not have its hash"),
+    "task rehashed": (other_task_rehashed, "should be|hash"),
+    "options": (lambda r: r["identity"]["model_options"].update(width=17), "entry's hash"),
+    "label": (lambda r: r.update(label="ddqn vqc-native qubits=14"), "its label is"),
+    "hostile label": (lambda r: r.update(label="<script>alert(1)</script>"), "its label is"),
+    "name": (lambda r: r.update(name="ddqn-mlp-00000000"), "named"),
+    "place": (lambda r: r.update(task_name="../elsewhere"), "place|task"),
+    "parameters": (lambda r: r["published"]["parameters"].update(classical=-1), "classical parameters"),
+    "provenance": (lambda r: r["published"].update(provenance=[]), "provenance"),
+    "nothing published": (lambda r: r.pop("published"), "published"),
+}
+
+
+@pytest.mark.parametrize("case", RECORDS)
+def test_a_record_that_lies_is_refused(folder: Path, case: str) -> None:
+    change, message = RECORDS[case]
+    edit(folder, change)
+    with pytest.raises(StoreError, match=message):
+        published.read(folder)
+
+
+@pytest.mark.parametrize("name", ["curves.parquet", "seeds.parquet", "entry.json"])
+def test_truncated_and_missing_files_are_refused_and_the_rest_is_ranked(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    good = tmp_path / "board" / folder.parent.name / folder.name
+    shutil.copytree(folder, good)
+    bad = good.with_name("ddqn-mlp-ffffffff")
+    shutil.copytree(folder, bad)
+    content = (bad / name).read_bytes()
+    (bad / name).write_bytes(content[: len(content) // 2])
+    entries, refused = collect.collect(tmp_path / "board")
+    assert [entry.folder for entry in entries] == [good]
+    assert len(refused) == 1
+    assert "ffffffff" in refused[0]
+    (bad / name).unlink()
+    if name == "seeds.parquet":
+        assert "seeds.parquet is missing" in collect.collect(tmp_path / "board")[1][0]
+
+
+def test_a_table_that_unpacks_to_too_much_is_not_unpacked(folder: Path) -> None:
+    count = published.MAX_BYTES // 8 + 1
+    zeros = pyarrow.array(np.zeros(count, np.int64))
+    table = pyarrow.table({"seed": zeros, "epoch": zeros, "score": zeros.cast("float64")})
+    pyarrow.parquet.write_table(table, folder / "curves.parquet", compression="zstd")
+    assert (folder / "curves.parquet").stat().st_size < 100_000
+    with pytest.raises(StoreError, match="unpacks to more than"):
+        published.read(folder)
+
+
+def test_any_bytes_are_read_or_refused(folder: Path) -> None:
+    originals = {path: path.read_bytes() for path in sorted(folder.iterdir())}
+
+    @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(st.data())
+    def check(data: st.DataObject) -> None:
+        path = data.draw(st.sampled_from(sorted(originals)))
+        content = bytearray(originals[path])
+        for _ in range(data.draw(st.integers(1, 8))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        path.write_bytes(bytes(content))
+        with contextlib.suppress(StoreError):  # any other exception fails the test
+            published.read(folder)
+        path.write_bytes(originals[path])
+
+    check()
+
+
+def test_seeds_trained_again_here_are_equal(folder: Path) -> None:
+    verdict = verify.verify(folder, rerun=2, generator=np.random.default_rng(1))
+    assert verdict.ok
+    assert verdict.check == "equal"
+    assert len(verdict.seeds) == 2
+    assert "bit for bit" in verdict.message
+
+
+def test_a_curve_that_was_changed_is_found_out_here(folder: Path) -> None:
+    rewrite(folder / "curves.parquet", lambda c: c.update(score=[s + 1e-3 for s in c["score"]]))
+    verdict = verify.verify(folder, rerun=1)
+    assert not verdict.ok
+    assert verdict.check == "equal"
+    assert "differs from epoch 1 on" in verdict.message
+
+
+def elsewhere(record: dict[str, Any]) -> None:
+    for made in record["published"]["provenance"]:
+        made["processor"] = "another processor"
+
+
+def test_elsewhere_the_beginning_must_agree_and_the_end_be_plausible(
+    train: Callable[..., Path], tmp_path: Path
+) -> None:
+    entry = collect.read_entry(
+        EntryStore(train("runs", range(14), EPOCHS))
+    )  # 4 of 8 could not be implausible
+    assert entry is not None
+    folder = export(entry, tmp_path / "entries")
+    edit(folder, elsewhere)
+    verdict = verify.verify(folder, rerun=3)
+    assert verdict.ok, verdict.message
+    assert verdict.check == "plausible"
+    assert "another processor there" in verdict.message
+    # scores that no re-run comes near
+    rewrite(folder / "curves.parquet", lambda c: c.update(score=[0.999] * len(c["score"])))
+    verdict = verify.verify(folder, rerun=4)
+    assert not verdict.ok
+    assert "not plausible" in verdict.message
+
+
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [
+        ("before", "score before training"),
+        ("parameters", "initial parameters"),
+        ("episodes", "first epoch's"),
+    ],
+)
+def test_a_beginning_that_differs_is_found_out(folder: Path, column: str, words: str) -> None:
+    def change(columns: dict[str, list[Any]]) -> None:
+        columns[column] = [v + 1e-3 if column == "before" else [x + 1e-3 for x in v] for v in columns[column]]
+
+    rewrite(folder / "seeds.parquet", change)
+    verdict = verify.verify(folder, rerun=1)
+    assert not verdict.ok
+    assert words in verdict.message
+
+
+def command(*words: str) -> Any:
+    return CliRunner().invoke(build(), list(words))
+
+
+def test_commands(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = command("export", "--all", "--runs", str(tmp_path / "runs"), "--out", str(out))
+    assert done.exit_code == 0
+    assert "8 seeds" in done.stdout
+    done = command("leaderboard", "verify", str(out), "--rerun", "1", "--choice", "3", "--json")
+    assert done.exit_code == 0
+    told = json.loads(done.stdout)
+    assert told["choice"] == 3
+    assert [entry["check"] for entry in told["entries"]] == ["equal"]
+    rewrite(next(out.glob("*/*")) / "curves.parquet", put("score", 0, 2.0))
+    done = command("leaderboard", "verify", str(out))
+    assert done.exit_code == 1
+    assert "outside [0, 1]" in done.stdout
+    done = command("leaderboard", "--runs", str(tmp_path / "entries"), "--format", "csv")
+    header, line = done.stdout.splitlines()
+    assert header.startswith("task,horizon,cell,tier")
+    assert line.startswith("tiny,")
+    with pytest.raises(QrlSuiteError, match="--all"):
+        CliRunner().invoke(build(), ["export", "--runs", str(tmp_path / "runs")], catch_exceptions=False)
+
+
+def test_own_runs_of_a_published_entry_are_shown_once(
+    folder: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(published, "SHIPPED", tmp_path / "entries")
+    train("mine", range(2), EPOCHS)
+    entries, refused = collect.collect(tmp_path / "mine", shipped=True)
+    assert [len(entry.seeds) for entry in entries] == [8]
+    assert "2 seeds; shown once" in refused[0]
+    assert len(collect.collect(tmp_path / "nothing", shipped=True)[0]) == 1
