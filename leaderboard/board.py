@@ -48,13 +48,23 @@ class Complexity:
 
 @dataclass(frozen=True)
 class Row:
-    """One entry of a section. `tier` is None for an undecided entry."""
+    """One entry of a section.
+
+    Attributes
+    ----------
+    tier:
+        None for an undecided entry.
+    wins, losses:
+        Cells of the ranking grid, over all other entries, in which it needs significantly fewer samples, and more.
+    """
 
     entry: EntryCurves
     tier: int | None
     reference: Complexity
     median_score: float
     copeland: int
+    wins: int
+    losses: int
     outperforms: tuple[str, ...]
     outperformed_by: tuple[str, ...]
     provisional: bool
@@ -184,6 +194,8 @@ def _section(
                 reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
                 median_score=float(np.median(values[:, -1])),
                 copeland=place.copeland,
+                wins=int(board.better_cells[board.names.index(place.name)].sum()),
+                losses=int(board.better_cells[:, board.names.index(place.name)].sum()),
                 outperforms=tuple(labels[name] for name in place.outperforms),
                 outperformed_by=tuple(labels[name] for name in place.outperformed_by),
                 provisional=len(entry.seeds) < wanted,
@@ -331,6 +343,8 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "unsettled": row.reference.unsettled,
         "median_score": row.median_score,
         "copeland": row.copeland,
+        "wins": row.wins,
+        "losses": row.losses,
         "outperforms": list(row.outperforms),
         "outperformed_by": list(row.outperformed_by),
         "core_hours": entry.hours,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -97,10 +98,21 @@ def _page(board: Leaderboard, path: Path) -> None:
     typer.echo(f"wrote {path}")
 
 
-COLUMNS = ("tier", "entry", "parameters", "seeds", "S_hat (5%-95%)", "score", "beats", "beaten by", "hours")
+COLUMNS = (
+    "tier",
+    "entry",
+    "parameters",
+    "seeds",
+    "S_hat (5%-95%)",
+    "score",
+    "cells +/-",
+    "outperforms",
+    "outperformed by",
+    "hours",
+)
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(section: Section, row: Row) -> tuple[str, ...]:
     from qrlsuite.leaderboard import board as boards
 
     entry = row.entry
@@ -112,10 +124,20 @@ def _cells(row: Row) -> tuple[str, ...]:
         f"{len(entry.seeds)}" + "*" * row.provisional,
         boards.complexity_text(row.reference),
         f"{row.median_score:.3f}",
-        ", ".join(row.outperforms) or "-",
-        ", ".join(row.outperformed_by) or "-",
+        f"{row.wins}/{row.losses}",
+        _names(row.outperforms, [r for r in section.rows if (r.tier or 0) > (row.tier or 0)], "all below"),
+        _names(
+            row.outperformed_by, [r for r in section.rows if 0 < (r.tier or 0) < (row.tier or 0)], "all above"
+        ),
         f"{entry.hours:.2f}",
     )
+
+
+def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
+    """List a few names; many that are all the entries on one side of the board are called so."""
+    if len(names) > 1 and sorted(names) == sorted(row.entry.label for row in others):
+        return everyone
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") or "-"
 
 
 def _notes(section: Section) -> list[str]:
@@ -134,7 +156,10 @@ def _notes(section: Section) -> list[str]:
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
-    return [*notes, "score: median over seeds after the last epoch; hours: core-hours"]
+    notes.append(
+        "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
+    )
+    return [*notes, "score: median over seeds after the last epoch; hours: core-hours, by the clock"]
 
 
 def _title(section: Section) -> str:
@@ -159,11 +184,11 @@ def _table(section: Section) -> None:
         caption_justify="left",
         pad_edge=False,
     )
-    numeric = {"parameters", "seeds", "score", "hours"}
+    numeric = {"parameters", "seeds", "score", "cells +/-", "hours"}
     for name in COLUMNS:
         table.add_column(Text(name), justify="right" if name in numeric else "left", overflow="fold")
     for row in section.rows:
-        table.add_row(*(Text(cell) for cell in _cells(row)))
+        table.add_row(*(Text(cell) for cell in _cells(section, row)))
     console = Console()
     Console(width=None if console.is_terminal else max(console.width, 130)).print(table)
 
@@ -173,7 +198,7 @@ def _markdown(board: Leaderboard) -> str:
     for section in board.sections:
         lines += [f"### {_title(section)}", "", f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
         for row in section.rows:
-            cells = (cell.replace("|", "\\|").replace("<", "&lt;") for cell in _cells(row))
+            cells = (cell.replace("|", "\\|").replace("<", "&lt;") for cell in _cells(section, row))
             lines.append(f"| {' | '.join(cells)} |")
         lines += ["", *(f"{note.replace('*', chr(92) + '*')}  " for note in _notes(section)), ""]
     return "\n".join(lines)
