@@ -159,7 +159,8 @@ class TuneDisplay:
         self.close()
         done = sum(len(search.trials) for search in self.searches)
         self.console.print(
-            f"stopped after {done} trials; every finished epoch is saved. The same command continues from there."
+            f"stopped after {done} trials; every finished epoch is saved. The same command continues from there.",
+            soft_wrap=True,
         )
 
 

@@ -1,0 +1,144 @@
+"""`qrlsuite tune` as a user meets it: killed, interrupted, continued, and its preset used."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite.cli.app import build
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.store import EntryStore
+from tests.cli.test_cli import qrlsuite
+from tests.conftest import TINY
+from tests.core.test_tuning import SETTINGS, finish, varied, without_hours
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> str:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return str(path)
+
+
+def stop(words: list[str], folder: Path, sign: signal.Signals) -> tuple[int, str]:
+    """Start a command in a session of its own and send it a signal once some seed has begun to learn."""
+    before = len(list(folder.glob("*/*/*/epochs.*")))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qrlsuite", *words], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while len(list(folder.glob("*/*/*/epochs.*"))) <= before:
+        assert process.poll() is None, "it ended before it could be stopped"
+        time.sleep(0.02)
+    os.kill(process.pid, sign)
+    _, message = process.communicate(timeout=120)
+    return process.returncode, message
+
+
+def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path: Path) -> None:
+    from qrlsuite.tuning import search
+
+    wanted = search.Request(
+        task,
+        "mlp",
+        settings=SETTINGS,
+        varied=varied("lr=1e-2,1e-3"),
+        seeds=search.tuning_seeds("1"),
+        epochs=80,
+    )
+    straight = search.Search(wanted, tmp_path / "straight")
+    finish(straight)
+    straight.write(straight.path)
+
+    words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--set", "depth=1"]
+    words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "80", "--workers", "1"]
+    words += ["--runs", str(tmp_path / "stopped")]
+    trials = tmp_path / "stopped" / "tuning"
+    code, _ = stop(words, trials, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    code, message = stop(words, trials, signal.SIGINT)
+    assert code == 130, message
+    assert "The same command continues from there" in " ".join(message.split())
+    assert not list(trials.glob("*.toml")), "no preset before all trials have ended"
+
+    done = qrlsuite(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    (found,) = content["searches"]
+    assert content["complete"]
+    assert len(found["trials"]) == 2
+    path = Path(found["preset"])
+    assert path.name == straight.path.name
+    assert without_hours(path.read_text()) == without_hours(straight.path.read_text())
+
+    used = qrlsuite(
+        "run", "--task", task, "--model", "mlp", "--preset", str(path), "--seeds", "1", "--epochs", "1",
+        "--runs", str(tmp_path / "runs"), "--json",
+    )  # fmt: skip
+    assert used.returncode == 0, used.stderr
+    store = EntryStore(Path(json.loads(used.stdout)["folder"]))
+    assert store.record()["tuning"]["seeds"] == "1000000:1000001"
+    shown = json.loads(qrlsuite("show", str(store.path), "--json").stdout)
+    assert shown["tuning"]["trials"] == 2
+
+
+def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
+    words = ["tune", "--task", task, "--equal-budget", "mlp width=4", "mlp width=5 depth=1"]
+    words += ["--vary", "lr=1e-2,1e-3,1e-4", "--set", "lr=1e-2", "--vary", "gamma=.9,.99"]
+    words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
+    done = qrlsuite(*words)
+    assert done.returncode == 0, done.stderr
+    assert "trials of mlp and mlp: 2 (" in done.stdout
+    assert done.stdout.count("next: qrlsuite run") == 2
+    content = json.loads(CliRunner().invoke(build(), [*words, "--json"]).stdout)
+    assert [len(each["trials"]) for each in content["searches"]] == [2, 2]
+    assert {"algorithm.gamma"} == set(content["searches"][0]["space"]), "--set takes lr out"
+
+
+def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tmp_path: Path) -> None:
+    words = ["tune", "--task", task, "--model", "mlp", "--grid", "paper", "--runs", str(tmp_path / "runs")]
+    planned = CliRunner().invoke(build(), [*words, "--dry-run"])
+    assert planned.exit_code == 0
+    assert "2160 trials" in planned.stderr
+    refused = CliRunner().invoke(build(), words)
+    assert isinstance(refused.exception, QrlSuiteError)
+    assert "--yes starts them all" in str(refused.exception)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "give either --model NAME or --equal-budget A B"),
+        (["--model", "mlp", "--grid", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
+        (
+            ["--model", "mlp", "--vary", "lr=1,2", "--seeds", "0:20"],
+            "--seeds 0:20: tuning uses seeds from 1000000",
+        ),
+        (["--model", "mlp", "--vary", "lr=1,2", "--budget", "soon"], "--budget soon: write a time"),
+        (["--model", "mlp", "--vary", "lr"], "write a name and its values"),
+        (["--model", "mlp", "--vary", "lr=1,2", "--out", "p.json"], "one file ending in .toml"),
+    ],
+)
+def test_wrong_input(words: list[str], message: str, task: str) -> None:
+    result = CliRunner().invoke(build(), ["tune", "--task", task, *words])
+    assert isinstance(result.exception, QrlSuiteError), result.output
+    assert message in str(result.exception)
+
+
+def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> None:
+    words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--vary", "lr=1e-2,1e-3"]
+    words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
+    first = CliRunner().invoke(build(), [*words, "--budget", "1s"])
+    assert "the budget is spent, 1 trials are left" in first.stdout, "after the first trial, no other fits"
+    rest = CliRunner().invoke(build(), words)
+    assert rest.exit_code == 0
+    assert "the budget is spent" not in rest.stdout
+    assert "wrote " in rest.stdout
