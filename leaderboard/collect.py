@@ -131,7 +131,7 @@ def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
         found = [read(EntryStore(Path(name)))]
     else:
         everything, _ = collect(runs, shipped=shipped)
-        exact = [e for e in everything if name in (e.name, e.label)]
+        exact = [e for e in everything if name in _names(e)]
         found = list(exact or [e for e in everything if _matches(e, name)])
         if not found:
             known = [e.name for e in everything]
@@ -145,8 +145,12 @@ def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
 
 
 def _matches(entry: EntryCurves, name: str) -> bool:
-    parts = (entry.name, entry.label, entry.label.partition(" ")[2], entry.name.rpartition("-")[2])
-    return any(part.startswith(name) for part in parts)
+    return any(known.startswith(name) for known in _names(entry))
+
+
+def _names(entry: EntryCurves) -> tuple[str, ...]:
+    """Return what an entry answers to: name, label, label without the algorithm, hash."""
+    return entry.name, entry.label, entry.label.partition(" ")[2], entry.name.rpartition("-")[2]
 
 
 def read(store: EntryStore) -> EntryCurves | None:
