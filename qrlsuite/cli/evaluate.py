@@ -51,16 +51,25 @@ def evaluate(
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
     import json
+    from dataclasses import replace
 
     from qrlsuite import evaluation
     from qrlsuite.leaderboard import collect
     from qrlsuite.store import EntryStore
 
     format_ = _format(out)
-    stores = [EntryStore(collect.find(runs, name).folder) for name in dict.fromkeys(entries)]
+    folders = dict.fromkeys(collect.find(runs, name).folder.resolve() for name in entries)
+    stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
     with _progress(json_output) as report:
         played = [evaluation.trained(store, best, episodes, seed, report=report) for store in stores]
+        labels = [each.name for each in played]
+        played = [
+            each
+            if labels.count(each.name) == 1
+            else replace(each, name=f"{each.name} {store.path.name[-8:]}")
+            for each, store in zip(played, stores)
+        ]
         entry = stores[0].entry()
         played += evaluation.references(entry, episodes, seed, report)
     if out is not None:
