@@ -90,7 +90,7 @@ def test_a_search_that_was_stopped_ends_with_the_same_preset(
     assert straight.path.name == resumed.path.name
     assert without_hours(straight.path.read_text()) == without_hours(resumed.path.read_text())
     assert resumed.preset().tuning is not None
-    assert [t.point for t in straight.trials] == [t.point for t in resumed.trials]
+    assert [(t.point, t.merit) for t in straight.trials] == [(t.point, t.merit) for t in resumed.trials]
 
 
 def test_the_preset_is_the_best_trial_and_the_entry_says_so(tiny_task: str, tmp_path: Path) -> None:
