@@ -348,4 +348,5 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "outperforms": list(row.outperforms),
         "outperformed_by": list(row.outperformed_by),
         "core_hours": entry.hours,
+        "tuning": entry.tuning,
     }

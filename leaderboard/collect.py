@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError, nearest
 from qrlsuite.leaderboard import origin
+from qrlsuite.preset import TUNING_SEEDS
 from qrlsuite.store import EntryStore, SeedCurve, entries
 from qrlsuite.task import TaskFile
 
@@ -42,6 +43,8 @@ class EntryCurves:
         Every code revision and processor that occurs among the seeds.
     executions:
         Circuit executions of the N runs in all.
+    tuning:
+        How the settings were found, where a preset file says so.
     source:
         Whether the curves were read from a results folder or from a published entry.
     """
@@ -66,6 +69,7 @@ class EntryCurves:
     commits: tuple[str, ...] = ()
     processors: tuple[str, ...] = ()
     executions: int = 0
+    tuning: Mapping[str, Any] | None = None
     source: Literal["runs", "published"] = "runs"
 
     @property
@@ -169,7 +173,7 @@ def read(store: EntryStore) -> EntryCurves | None:
 
 
 def read_entry(store: EntryStore) -> EntryCurves | None:
-    """Read one entry from its runs; None where no run has finished an epoch.
+    """Read one entry from its runs; None where no run has finished an epoch. Tuning seeds do not count.
 
     Raises
     ------
@@ -177,7 +181,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         If a file is damaged, or a score is outside [0, 1].
     """
     record = store.record()
-    runs = [store.seed(seed) for seed in store.seeds()]
+    runs = [store.seed(seed) for seed in store.seeds() if seed < TUNING_SEEDS]
     curves = [run.curve() for run in runs]
     curves = [curve for curve in curves if len(curve.scores)]
     if not curves:
@@ -218,6 +222,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         versions=origin.versions(provenance),
         commits=origin.texts(provenance, "commit"),
         processors=origin.texts(provenance, "processor"),
+        tuning=record["tuning"],
         executions=sum(origin.executions(seed) for seed in stores),
     )
 

@@ -103,6 +103,7 @@ class Published:
             commits=origin.texts(provenance, "commit"),
             processors=origin.texts(provenance, "processor"),
             executions=int(self.executions.sum()),
+            tuning=record["tuning"],
             source="published",
         )
 

@@ -67,14 +67,26 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
         ("Core-hours", f"{entry.hours:.2f}"),
-        ("Circuit executions", _told(getattr(entry, "executions", None))),
-        ("Preset", _told(getattr(entry, "preset", None))),
-        ("Versions", _told(getattr(entry, "versions", None))),
-        ("Code revision", _told(getattr(entry, "commits", None))),
-        ("Processor", _told(getattr(entry, "processors", None))),
-        ("Source", _told(getattr(entry, "source", None))),
+        ("Circuit executions", _told(entry.executions)),
+        ("Preset", _told(entry.preset)),
+        ("Versions", _told(entry.versions)),
+        ("Code revision", _told(entry.commits)),
+        ("Processor", _told(entry.processors)),
+        ("Tuned", _tuned(entry.tuning)),
+        ("Source", _told(entry.source)),
         ("Task definition", clean(entry.task_hash)),
     ]
+
+
+def _tuned(record: Mapping[str, Any] | None) -> str:
+    """Say how much it took to find the settings."""
+    if record is None:
+        return ""
+    return ", ".join(
+        f"{clean(name)} {_plain(value)}"
+        for name, value in record.items()
+        if isinstance(value, str | int | float)
+    )
 
 
 def _told(value: Any) -> str:

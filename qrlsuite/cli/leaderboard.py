@@ -216,6 +216,7 @@ def _csv(board: Leaderboard) -> str:
         for row in section["rows"]:
             low, high = row.pop("interval")
             count = row.pop("parameters")
+            tuned = bool(row.pop("tuning"))
             flat = {
                 **{name: section[name] for name in ("task", "horizon", "cell")},
                 **row,
@@ -223,6 +224,7 @@ def _csv(board: Leaderboard) -> str:
                 "parameters_quantum": count["quantum"],
                 "interval_low": low,
                 "interval_high": high,
+                "tuned": tuned,
                 "rule": board.rule,
             }
             rows.append({k: "; ".join(v) if isinstance(v, list) else v for k, v in flat.items()})

@@ -328,3 +328,19 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     assert [len(entry.seeds) for entry in entries] == [8]
     assert "2 seeds; shown once" in refused[0]
     assert len(collect.collect(tmp_path / "nothing", shipped=True)[0]) == 1
+
+
+def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
+    train: Callable[..., Path], tmp_path: Path
+) -> None:
+    from qrlsuite.leaderboard import board
+
+    runs = train("runs", [0, 1_000_000], EPOCHS)
+    record = json.loads((runs / "entry.json").read_text())
+    (runs / "entry.json").write_text(json.dumps({**record, "tuning": {"steps": 7}}))
+    entry = collect.read_entry(EntryStore(runs))
+    assert entry is not None
+    assert entry.seeds == (0,)
+    there = published.read(export(entry, tmp_path / "entries")).entry_curves()
+    for found in (entry, there):
+        assert board.as_dict(board.build([found]))["sections"][0]["rows"][0]["tuning"] == {"steps": 7}
