@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import gzip
 import json
+import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored,
+# and so would every command that a test interrupts
 
 TINY = """
 format_version = 1

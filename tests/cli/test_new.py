@@ -102,8 +102,19 @@ def test_new_packages_are_clean(packages: Path) -> None:
     for kind in Kind:
         folder = packages / f"acme-{kind}"
         src = f'src = ["{folder / "src"}"]'
-        run("ruff", "check", "--isolated", "--config", src, "--select", "E,F,W,I,UP,B,RUF", str(folder))
-        run("ruff", "format", "--isolated", "--check", str(folder))
+        run(
+            sys.executable,
+            "-m",
+            "ruff",
+            "check",
+            "--isolated",
+            "--config",
+            src,
+            "--select",
+            "E,F,W,I,UP,B,RUF",
+            str(folder),
+        )
+        run(sys.executable, "-m", "ruff", "format", "--isolated", "--check", str(folder))
     (packages / "mypy.ini").write_text(MYPY)
     sources = [str(packages / f"acme-{kind}" / "src") for kind in Kind]
     env = {**os.environ, "MYPYPATH": str(ROOT)}

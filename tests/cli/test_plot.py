@@ -24,10 +24,10 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
     """Three entries in place of a results folder."""
     found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
 
-    def find(runs: Path, name: str) -> EntryCurves:
+    def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
         return next(entry for entry in found if name in entry.label)
 
-    monkeypatch.setattr(collect, "collect", lambda runs, task=None: (found, []))
+    monkeypatch.setattr(collect, "collect", lambda runs, task=None, shipped=False: (found, []))
     monkeypatch.setattr(collect, "find", find)
     return found
 

@@ -28,14 +28,14 @@ def frequent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
     """Raise KeyboardInterrupt, as Ctrl-C does, in the middle of an epoch's validation."""
-    original = run.GroupRun._validate
+    original = run.GroupRun.validate
 
     def validate(self: run.GroupRun, number: int) -> object:
         if number == epoch:
             raise KeyboardInterrupt
         return original(self, number)
 
-    monkeypatch.setattr(run.GroupRun, "_validate", validate)
+    monkeypatch.setattr(run.GroupRun, "validate", validate)
 
 
 @pytest.mark.parametrize("model", ["mlp", "vqc-native"])
