@@ -137,7 +137,7 @@ class GroupRun:
     ) -> None:
         torch.set_num_threads(1)
         self.entry, self.store, self.seeds, self.epochs = entry, entry_store, list(seeds), epochs
-        self.report = report
+        self.report, self.device = report, device
         self.progress = Progress(epochs=epochs)
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
         protocol = entry.task.file.protocol
@@ -255,7 +255,7 @@ class GroupRun:
     ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], dict[str, int], dict[str, float]]:
         """Train and validate one epoch; returns metrics, scores (S, V), circuit executions and seconds."""
         before = self.models.executions()
-        started = time.perf_counter()
+        started, processor = time.perf_counter(), time.process_time()
         self._phase("training", self.entry.task.file.protocol.rounds)
         metrics = dict(self.algorithm.train_epoch(self.entry.task.file.protocol.rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
@@ -264,7 +264,10 @@ class GroupRun:
         finished = time.perf_counter()
         executions = {name: count - before.get(name, 0) for name, count in self.models.executions().items()}
         self.progress.epoch_seconds = finished - started
-        return metrics, scores, executions, {"train": trained - started, "validate": finished - trained}
+        seconds = {"train": trained - started, "validate": finished - trained}
+        if self.device == "cpu":
+            seconds["cpu"] = time.process_time() - processor
+        return metrics, scores, executions, seconds
 
     def _training_episodes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean return and score (S,) of the training episodes that ended in this epoch; NaN without any."""

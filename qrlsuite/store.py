@@ -248,7 +248,10 @@ class SeedStore:
             self.lines.unlink(missing_ok=True)
 
     def seconds(self) -> float:
-        """Return the time spent on this seed's epochs so far: its share of its group's, one core.
+        """Return the core-seconds spent on this seed's epochs so far: its share of its group's.
+
+        Processor time where it was recorded (training on the CPU), which other work on the same cores does not
+        stretch; otherwise the time by the clock.
 
         Raises
         ------
@@ -257,7 +260,7 @@ class SeedStore:
         """
         total = 0.0
         for line in read_lines(self.timings):
-            for name in ("train", "validate"):
+            for name in ("cpu",) if "cpu" in line else ("train", "validate"):
                 value = line.get(name, 0.0)
                 if not isinstance(value, int | float) or not 0 <= value < 1e12:
                     raise StoreError(f"{self.timings}: {name} = {value!r} is not a number of seconds")

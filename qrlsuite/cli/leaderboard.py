@@ -159,7 +159,7 @@ def _notes(section: Section) -> list[str]:
     notes.append(
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
     )
-    return [*notes, "score: median over seeds after the last epoch; hours: core-hours, by the clock"]
+    return [*notes, "score: median over seeds after the last epoch; hours: core-hours"]
 
 
 def _title(section: Section) -> str:

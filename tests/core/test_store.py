@@ -152,3 +152,17 @@ def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
 def test_no_results_folder(tmp_path: Path) -> None:
     with pytest.raises(QrlSuiteError, match="there is no results folder"):
         store.entries(tmp_path / "none")
+
+
+def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[..., Path]) -> None:
+    seed = store.EntryStore(train("runs", [0], 2)).seed(0)
+    lines = store.read_lines(seed.timings)
+    assert [line["epoch"] for line in lines] == [1, 2]
+    assert seed.seconds() == pytest.approx(sum(float(line["cpu"]) for line in lines))
+    seed.timings.write_text(
+        '{"train": 2.0, "validate": 1.0, "cpu": 0.5}\n{"train": 3.0, "validate": 1.0}\n', encoding="utf-8"
+    )
+    assert seed.seconds() == 4.5, "an older version's epoch counts by the clock"
+    seed.timings.write_text('{"train": 2.0, "validate": 1.0, "cpu": -1}\n', encoding="utf-8")
+    with pytest.raises(StoreError, match="cpu = -1 is not a number of seconds"):
+        seed.seconds()
