@@ -1,0 +1,120 @@
+"""Reference speeds: processor seconds of one epoch of one seed, for the entries that estimates are scaled from.
+
+    python benchmarks/speeds.py [--only qubits=14] [--write tasks/speeds/reference.toml]
+
+Every entry is trained for a few epochs in groups of the size that stands beside it; the first epoch (compilation, an
+empty replay buffer) does not count, of the others the median does. Processor time, one thread: other work on the
+machine changes it little. `--write` puts the rows into the file, in the place of those for the same entries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from qrlsuite import provenance
+from qrlsuite.entry import resolve
+from qrlsuite.options import parse_setting
+from qrlsuite.run import GroupRun
+from qrlsuite.store import EntryStore, read_lines
+
+HEADER = """\
+# Processor seconds of one epoch of one seed, training and validation, measured by benchmarks/speeds.py in groups of
+# 2 to 50 seeds. They serve estimates before anything was measured on a machine, and for the ratios between entries
+# after that. Sizes between those measured are near enough to one of them.
+format_version = 1
+"""
+
+WIDTHS = [("beam6g", "ddqn", "mlp", {"width": width, "depth": 2}, 50) for width in (16, 32, 64, 128, 256)]
+DEPTHS = [
+    ("beam6g", "ddqn", "mlp", {"width": width, "depth": depth}, 50) for width in (32, 64) for depth in (1, 4)
+]
+CIRCUITS = [
+    ("beam6g", "ddqn", "vqc-native", {"qubits": qubits, "layers": 4}, seeds)
+    for qubits, seeds in ((4, 20), (6, 20), (8, 20), (10, 10), (12, 4), (14, 2))
+]
+DEEPER = [("beam6g", "ddqn", "vqc-native", {"qubits": qubits, "layers": 6}, 10) for qubits in (8, 10)]
+ON_POLICY = [
+    ("beam6g", "ppo", "mlp", {"width": 16, "depth": 2}, 20),
+    ("beam6g", "ppo", "mlp", {"width": 64, "depth": 2}, 20),
+    ("beam6g", "ppo", "vqc-native", {"qubits": 6, "layers": 4}, 10),
+    ("beam6g", "ppo", "vqc-native", {"qubits": 10, "layers": 4}, 4),
+]
+CARTPOLE = [
+    ("cartpole", "reinforce", "mlp", {"width": 16, "depth": 1}, 50),
+    ("cartpole", "reinforce", "vqc-native", {"qubits": 4, "layers": 1}, 50),
+    ("cartpole", "ppo", "mlp", {"width": 64, "depth": 2}, 20),
+    ("cartpole", "ddqn", "mlp", {"width": 64, "depth": 2}, 20),
+]
+ENTRIES = WIDTHS + DEPTHS + CIRCUITS + DEEPER + ON_POLICY + CARTPOLE
+
+Row = dict[str, Any]
+
+
+def measure(task: str, algorithm: str, model: str, options: dict[str, int], seeds: int, epochs: int) -> Row:
+    """Train a group and return its row."""
+    entry = resolve(
+        task, model, algorithm, [parse_setting(f"{name}={value}") for name, value in options.items()]
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        store = EntryStore.create(Path(folder), entry)
+        GroupRun(entry, store, range(seeds), epochs).run()
+        lines = read_lines(store.seed(0).timings)
+    seconds = statistics.median(float(line["cpu"]) for line in lines[1:])
+    return {
+        "environment": entry.task.environment.name,
+        "algorithm": algorithm,
+        "model": model,
+        "options": options,
+        "seconds": float(f"{seconds:.2g}"),
+    }
+
+
+def written(row: Row) -> str:
+    """Return a row as TOML."""
+    options = ", ".join(f"{name} = {value}" for name, value in row["options"].items())
+    names = "".join(f'{name} = "{row[name]}"\n' for name in ("environment", "algorithm", "model"))
+    return f"\n[[speeds]]\n{names}options = {{ {options} }}\nseconds = {row['seconds']}\n"
+
+
+def merge(path: Path, machine: str, rows: list[Row]) -> str:
+    """Return the file's text with new rows; rows of other entries stay if they are of the same machine."""
+    before = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    kept = before.get("speeds", []) if before.get("machine") == machine else []
+
+    def key(row: Row) -> tuple[Any, ...]:
+        return (row["environment"], row["algorithm"], row["model"], sorted(row["options"].items()))
+
+    new = {str(key(row)) for row in rows}
+    merged = sorted(
+        [*(row for row in kept if str(key(row)) not in new), *rows], key=lambda row: str(key(row)[:3])
+    )
+    return f'{HEADER}machine = "{machine}"\n' + "".join(map(written, merged))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--epochs", type=int, default=4)
+    parser.add_argument(
+        "--only", default="", help="entries that have this in their name, for example qubits=14"
+    )
+    parser.add_argument("--write", type=Path, help="a file of reference speeds")
+    given = parser.parse_args()
+    machine = f"one core of {provenance.processor()}"
+    rows: list[Row] = []
+    for task, algorithm, model, options, seeds in ENTRIES:
+        name = " ".join([task, algorithm, model, *(f"{key}={value}" for key, value in options.items())])
+        if given.only not in name:
+            continue
+        rows.append(measure(task, algorithm, model, options, seeds, given.epochs))
+        print(f"{name}: {rows[-1]['seconds']} s per epoch and seed, {seeds} seeds together", flush=True)
+        if given.write:
+            given.write.write_text(merge(given.write, machine, rows), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
