@@ -213,8 +213,11 @@ def _duplicate(kind: str, name: str, owners: list[str]) -> str:
 
 
 def words(error: BaseException) -> str:
-    """Return an error's type and message."""
-    return f"{type(error).__name__}: {error}"
+    """Return an error's type and message, also where the message cannot be made."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:  # a stranger's `__str__`
+        return type(error).__name__
 
 
 def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:

@@ -8,12 +8,13 @@ import sys
 import warnings
 from typing import Any
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import PluginError, QrlSuiteError
 
 
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
     from qrlsuite.cli.app import build
+    from qrlsuite.cli.terminal import printable, printable_lines
     from qrlsuite.registry import STRICT, PluginWarning
 
     options = itertools.takewhile(lambda word: word.startswith("-"), sys.argv[1:])
@@ -24,7 +25,7 @@ def main() -> None:
 
         def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
             if issubclass(category, PluginWarning):
-                print(f"qrlsuite: warning: {message}", file=sys.stderr)
+                print(f"qrlsuite: warning: {printable(message)}", file=sys.stderr)
             else:
                 original(message, category, *rest, **more)
 
@@ -33,7 +34,8 @@ def main() -> None:
         try:
             build()()
         except QrlSuiteError as error:
-            print(f"qrlsuite: {error}", file=sys.stderr)
+            shown = printable if isinstance(error, PluginError) else printable_lines
+            print(f"qrlsuite: {shown(error)}", file=sys.stderr)
             sys.exit(2)
         except BrokenPipeError:
             sys.stderr.close()  # the reader (head, less) has gone

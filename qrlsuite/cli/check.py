@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.app import JsonOption
+from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,13 +58,13 @@ def check(
 
 
 def _findings(item: Item, settings: dict[str, Any]) -> list[Finding]:
-    from qrlsuite import testing
+    from qrlsuite import registry, testing
     from qrlsuite.testing.findings import Finding as Found
 
     try:
         return testing.check(item.kind, item.name, settings)
-    except Exception as error:  # a plugin whose code fails outside of any rule: the rest is still checked
-        return [Found("check", False, f"{type(error).__name__}: {error}")]
+    except (Exception, SystemExit) as error:  # code that fails outside of any rule: the rest is still checked
+        return [Found("check", False, registry.words(error))]
 
 
 def _plain(item: Item, finding: Finding) -> dict[str, Any]:
@@ -81,21 +82,22 @@ def _plain(item: Item, finding: Finding) -> dict[str, Any]:
 def _show(items: list[Item], settings: dict[str, Any]) -> list[tuple[Item, list[Finding]]]:
     """Check things one after another, with what is going on in the last line of a terminal."""
     from rich.console import Console
+    from rich.text import Text
 
     from qrlsuite.testing.findings import watching
 
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     found = []
     with console.status("") as status:
 
         def announce(item: Item) -> Callable[[str], None]:
-            return lambda rule: status.update(f"{_clean(item.title)}: {rule}".replace("[", r"\["))
+            return lambda rule: status.update(Text(printable(f"{item.title}: {rule}")))
 
         for item in items:
             with watching(announce(item)):
                 findings = _findings(item, settings)
             found.append((item, findings))
-            console.print(_clean(item.title), style="bold")
+            console.print(printable(item.title), style="bold")
             for finding in findings:
                 _print(console, finding)
     broken = sum(not finding.ok for _, findings in found for finding in findings)
@@ -110,12 +112,7 @@ def _show(items: list[Item], settings: dict[str, Any]) -> list[tuple[Item, list[
 def _print(console: Any, finding: Finding) -> None:
     mark, style = ("\u2713", "green") if finding.ok else ("\u2717", "red")
     console.print(f"  {mark} ", style=style, end="")
-    console.print(_clean(f"{finding.rule}: {finding.message}"), style="dim" if finding.ok else "")
-
-
-def _clean(text: str) -> str:
-    """Keep control characters of a stranger's messages away from the terminal."""
-    return "".join(c if c.isprintable() else " " for c in text)
+    console.print(printable(f"{finding.rule}: {finding.message}"), style="dim" if finding.ok else "")
 
 
 def _teach(json_output: bool) -> None:
@@ -134,6 +131,6 @@ def _teach(json_output: bool) -> None:
     typer.echo("qrlsuite check DISTRIBUTION    everything that a package registers")
     typer.echo("\nIn a package's own tests: from qrlsuite.testing import assert_conforms")
     if others:
-        typer.echo(f"\nInstalled plugins of others: {', '.join(_clean(name) for name in others)}")
+        typer.echo(f"\nInstalled plugins of others: {', '.join(printable(name) for name in others)}")
     else:
         typer.echo("\nNo plugin of others is installed. Begin one: qrlsuite new plugin --help")

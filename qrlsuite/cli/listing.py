@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qrlsuite.cli.app import JsonOption
+from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
     from qrlsuite.registry import Registry
@@ -90,22 +91,22 @@ def _list_plugins(known: Registry, json_output: bool) -> None:
             needs = f", for qrlsuite{plugin.requires}" if plugin.requires else ""
             if not needs and plugin.distribution != "qrlsuite":
                 needs = ", for any qrlsuite (its pyproject.toml should say dependencies = ['qrlsuite>=...'])"
-            typer.echo(("\n" if last else "") + f"{plugin.distribution} {plugin.version}{needs}")
+            typer.echo(("\n" if last else "") + printable(f"{plugin.distribution} {plugin.version}{needs}"))
             last = plugin.distribution
-        typer.echo(f"  {plugin.module}")
+        typer.echo(f"  {printable(plugin.module)}")
         for kind, names in plugin.registered.items():
             shown = ", ".join(names[:SHOWN]) + (
                 f", and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
             )
             typer.echo(f"    {kind.replace('_', ' ')}: {shown}")
         if plugin.problem:
-            typer.echo(f"    SKIPPED: {plugin.problem}")
+            typer.echo(f"    SKIPPED: {printable(plugin.problem)}")
         elif not plugin.registered:
             typer.echo("    registers nothing by name")
     skipped = tuple(plugin.problem for plugin in known.plugins if plugin.problem)
     others = [text for text in known.problems if not text.startswith(skipped)]
     if others:
-        typer.echo("\n" + "\n".join(f"problem: {text}" for text in others))
+        typer.echo("\n" + "\n".join(f"problem: {printable(text)}" for text in others))
 
 
 def _print(rows: list[dict[str, str]]) -> None:
@@ -116,4 +117,4 @@ def _print(rows: list[dict[str, str]]) -> None:
             typer.echo(("" if last is None else "\n") + row["kind"].replace("_", " "))
             last = row["kind"]
         origin = "" if row["distribution"] == "qrlsuite" else f"  [{row['distribution']}]"
-        typer.echo(f"  {row['name']:<{width}}  {row['summary']}{origin}")
+        typer.echo(printable(f"  {row['name']:<{width}}  {row['summary']}{origin}"))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
     from qrlsuite.survey import EntrySurvey
@@ -93,11 +94,6 @@ def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
         size_text(entry.size),
         f"{duration(max(0.0, now - entry.last_activity))} ago",
     )
-
-
-def printable(text: str) -> str:
-    """Keep control characters of a damaged file away from the terminal."""
-    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: bool) -> None:

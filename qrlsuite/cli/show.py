@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.terminal import printable_lines
 
 
 def show(
@@ -50,7 +51,7 @@ def show(
         folder = _entry_folder(runs, wanted)
         if folder is not None:
             content = _entry(folder)
-            typer.echo(json.dumps(content) if json_output else _text(content))
+            typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not found:
         names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
@@ -61,7 +62,7 @@ def show(
     content = _content(found[0], wanted)
     if found[0] == "ansatzes":
         content["drawing"] = _draw(wanted, qubits, layers, settings or [], figure, content)
-    typer.echo(json.dumps(content) if json_output else _text(content))
+    typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
 
 
 def _hook(first: str, second: str | None) -> dict[str, str] | None:

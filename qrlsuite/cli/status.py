@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
     from qrlsuite.survey import GroupStatus
@@ -63,7 +64,6 @@ def _plain(group: GroupStatus) -> dict[str, Any]:
 
 def _print(row: dict[str, Any]) -> None:
     from qrlsuite.cli.display import duration
-    from qrlsuite.cli.runs import printable
     from qrlsuite.engine.groups import format_seeds
 
     seeds = ", ".join(f"{count} {status}" for status, count in row["seeds"].items()) or "none"

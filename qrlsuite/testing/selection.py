@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from dataclasses import dataclass
 
 from qrlsuite import events, registry
@@ -26,6 +27,9 @@ class Item:
 def select(word: str) -> list[Item]:
     """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, or the module of a tracker.
 
+    A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
+    own; `distribution:NAME` says so where it is not.
+
     Raises
     ------
     QrlSuiteError
@@ -34,26 +38,24 @@ def select(word: str) -> list[Item]:
     known = registry.load()
     kind, colon, name = word.partition(":")
     if colon:
-        wanted = plural(kind)
-        if wanted != "trackers":
-            known.get(wanted, name)
-        elif name not in known.entries[wanted] and not _is_module(name):
-            raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[wanted])}")
-        return [Item(wanted, name)]
-    kinds = [kind for kind in registry.KINDS if word in known.entries[kind]]
-    distributions = {plugin.distribution for plugin in known.plugins}
-    if len(kinds) > 1 or (kinds and word in distributions):
+        return _of_kind(kind, name)
+    owners = {kind: _owners(kind, word) for kind in registry.KINDS if word in known.entries[kind]}
+    kinds, distribution = list(owners), _distribution(word)
+    if word == distribution and {owner for own in owners.values() for owner in own} <= {word}:
+        return of_distribution(word)
+    if len(kinds) > 1 or (kinds and word == distribution):
         ways = [f"{registry.SINGULAR[kind].replace('_', '-')}:{word}" for kind in kinds]
+        ways += [f"distribution:{word}"] * (word == distribution)
         raise QrlSuiteError(
             f"'{word}' is several things; write qrlsuite check {' or qrlsuite check '.join(ways)}"
         )
     if kinds:
-        return [Item(kinds[0], word)]
-    if word in distributions:
-        return of_distribution(word)
+        return _of_kind(kinds[0], word)
     if _is_module(word) and (word in _watching() or "." in word):
         return [Item("trackers", word)]
-    names = {name for kind in registry.KINDS for name in known.entries[kind]} | distributions
+    if distribution is not None:
+        return of_distribution(distribution)
+    names = {name for kind in registry.KINDS for name in known.entries[kind]} | _distributions()
     raise UnknownNameError(f"nothing called '{word}' is registered{nearest(word, names)}")
 
 
@@ -63,15 +65,59 @@ def of_distribution(distribution: str) -> list[Item]:
     Raises
     ------
     QrlSuiteError
-        If one of its plugins was skipped: why.
+        If one of its plugins was skipped: why. If it brings nothing that there are rules for.
     """
     known = registry.load()
     problems = [p.problem for p in known.plugins if p.distribution == distribution and p.problem]
     if problems:
         raise QrlSuiteError("; ".join(problems))
-    found = [Item(kind, entry.spec.name) for kind, entry in known if entry.distribution == distribution]
+    found = [
+        Item(kind, entry.spec.name) for kind, entry in known if distribution in _owners(kind, entry.spec.name)
+    ]
     found += [Item("trackers", module) for module, owner in _watching().items() if owner == distribution]
+    if not found:
+        raise QrlSuiteError(
+            f"'{distribution}' registers nothing by name and watches no run; commands have no rules. Nothing to check: "
+            "if there should be, is every hook under @hookimpl, in the module that the entry point names?"
+        )
     return found
+
+
+def _of_kind(kind: str, name: str) -> list[Item]:
+    """Return what `KIND:NAME` stands for."""
+    if kind == "distribution":
+        distribution = _distribution(name)
+        if distribution is None:
+            raise UnknownNameError(
+                f"no plugin is of a distribution '{name}'{nearest(name, _distributions())}"
+            )
+        return of_distribution(distribution)
+    known, wanted = registry.load(), plural(kind)
+    if wanted != "trackers" or (wanted, name) in known.duplicates:
+        known.get(wanted, name)
+    elif name not in known.entries[wanted] and not _is_module(name):
+        raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[wanted])}")
+    return [Item(wanted, name)]
+
+
+def _owners(kind: str, name: str) -> list[str]:
+    """Return the distributions that registered a name: more than one where it is a duplicate."""
+    known = registry.load()
+    return known.duplicates.get((kind, name)) or [known.entries[kind][name].distribution]
+
+
+def _distributions() -> set[str]:
+    return {plugin.distribution for plugin in registry.load().plugins}
+
+
+def _distribution(name: str) -> str | None:
+    """Return the distribution of that name, spelled as it is; `_`, `-`, `.` and case are alike, as they are to pip."""
+    names = _distributions()
+    return name if name in names else next((d for d in sorted(names) if _folded(d) == _folded(name)), None)
+
+
+def _folded(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _watching() -> dict[str, str]:
@@ -82,7 +128,8 @@ def _watching() -> dict[str, str]:
 
 
 def _is_module(name: str) -> bool:
+    """Tell whether there is a module of that name; its packages are imported, and may fail."""
     try:
         return importlib.util.find_spec(name) is not None
-    except (ImportError, ValueError):
+    except (Exception, SystemExit):
         return False

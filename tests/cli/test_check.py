@@ -1,0 +1,302 @@
+"""`qrlsuite check` as a plugin author meets it: names, distributions, exit codes; what hostile plugins can print."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import registry
+from qrlsuite.cli import main
+from tests.core.test_hooks import install, suite
+
+ENGINES = """
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from qrlsuite import hookimpl
+from qrlsuite.specs import EngineSpec, SignificanceTestSpec
+
+@dataclass(frozen=True)
+class Options:
+    slots: Annotated[int, Field(description="groups at a time")] = 2
+
+class Engine:
+    def __init__(self, options):
+        self.slots = options.slots
+
+    def workers(self, asked):
+        return asked or self.slots
+
+    def queued(self, store):
+        return set()
+
+    def run(self, work, show):
+        raise AssertionError("a check starts nothing")
+
+@hookimpl
+def register_engines(register):
+    for name in {names}:
+        register(EngineSpec(name, "Where nothing runs", f"{{__name__}}:Engine", f"{{__name__}}:Options"))
+"""
+TWICE = """
+@hookimpl
+def register_significance_tests(register):
+    register(SignificanceTestSpec("twice", "A rule beside an engine", f"{__name__}:Engine"))
+"""
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def engines(*names: str) -> str:
+    return ENGINES.format(names=names)
+
+
+DISTRIBUTIONS = {
+    "tidy": engines("tidy", "tidy-too"),  # its own name among what it registers
+    "local": engines("elsewhere"),  # the name of an engine of the suite
+    "twice": engines("twice") + TWICE,
+    "some_more": engines("more"),
+    "first": engines("shared"),
+    "second": engines("shared"),
+    "silent": "from qrlsuite import hookimpl\n\ndef register_engines(register):\n    pass\n",
+    "failing": "raise RuntimeError('no license')",
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Distributions as pip leaves them, found by this process too."""
+    folder = tmp_path_factory.mktemp("site")
+    for name, code in DISTRIBUTIONS.items():
+        install(folder, name, code)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        registry.load.cache_clear()
+        yield folder
+    registry.load.cache_clear()
+    for name in DISTRIBUTIONS:
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+
+
+@pytest.fixture
+def check(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Type `qrlsuite check ...`; returns exit code, stdout and stderr without the warnings at start."""
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["qrlsuite", "check", *words])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        printed = capsys.readouterr()
+        lines = [line for line in printed.err.splitlines() if not line.startswith("qrlsuite: warning")]
+        return int(stopped.value.code or 0), printed.out, "\n".join(lines)
+
+    return run
+
+
+def test_by_name_every_rule_is_shown(check: Command) -> None:
+    code, out, err = check("tidy-too")
+    lines = out.splitlines()
+    assert (code, err) == (0, "")
+    assert lines[0] == "engine tidy-too"
+    assert "  ✓ queued: no seed of an entry that was never submitted waits" in lines
+    assert lines[-1] == f"all {len(lines) - 2} rules hold"
+    assert check("engine:tidy-too") == check("engines:tidy-too") == (code, out, err)
+
+
+def test_settings_are_checked_and_a_broken_rule_is_exit_code_1(check: Command) -> None:
+    assert check("tidy-too", "--set", "slots=3")[0] == 0
+    code, out, _ = check("tidy-too", "--set", "slots=0")
+    assert code == 1
+    assert "  ✗ workers: workers(None) returned 0, and must return how many groups" in out
+    assert out.splitlines()[-1] == "1 of 10 rules broken"
+    code, out, _ = check("tidy-too", "--set", "slot=3")
+    assert code == 1
+    assert "did you mean 'slots'" in out
+
+
+def test_json_is_one_row_per_rule(check: Command) -> None:
+    code, out, err = check("tidy-too", "--set", "slots=0", "--json")
+    rows = json.loads(out)
+    assert (code, err) == (1, "")
+    assert {(row["kind"], row["name"]) for row in rows} == {("engine", "tidy-too")}
+    assert [row["rule"] for row in rows if not row["ok"]] == ["workers"]
+    assert all(row["message"] for row in rows)
+
+
+def test_a_distribution_stands_for_all_that_it_registers(check: Command) -> None:
+    code, out, _ = check("tidy", "--json")
+    assert code == 0
+    assert {row["name"] for row in json.loads(out)} == {"tidy", "tidy-too"}
+    assert {row["name"] for row in json.loads(check("engine:tidy", "--json")[1])} == {"tidy"}
+    assert {row["name"] for row in json.loads(check("some-more", "--json")[1])} == {"more"}, (
+        "as pip spells it"
+    )
+    code, _, err = check("tidy", "--set", "slots=3")
+    assert code == 2
+    assert "--set is for one thing" in err
+
+
+def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check: Command) -> None:
+    for distribution in ("first", "second"):
+        code, out, _ = check(distribution)
+        assert code == 1
+        assert "engine 'shared' is registered by both first and second" in out
+    assert check("shared")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("tidi", "nothing called 'tidi' is registered; did you mean 'tidy'?"),
+        ("engine:tidi", "unknown engine 'tidi'; did you mean 'tidy'?"),
+        ("engin:tidy", "unknown kind 'engin'; did you mean 'engine'?"),
+        ("distribution:tidi", "no plugin is of a distribution 'tidi'; did you mean 'tidy'?"),
+        ("tracker:no_such_module", "unknown tracker 'no_such_module'"),
+        ("no_such_package.module", "nothing called 'no_such_package.module' is registered"),
+        ("failing.module", "nothing called 'failing.module' is registered"),
+        (
+            "cartpole",
+            "'cartpole' is several things; write qrlsuite check environment:cartpole or qrlsuite check "
+            "task:cartpole or qrlsuite check study:cartpole",
+        ),
+        (
+            "local",
+            "'local' is several things; write qrlsuite check engine:local or qrlsuite check distribution:local",
+        ),
+        ("failing", "'failing' cannot be imported: RuntimeError: no license"),
+        ("silent", "is every hook under @hookimpl"),
+    ],
+)
+def test_wrong_names_are_one_clear_line(word: str, message: str, check: Command) -> None:
+    code, out, err = check(word)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert len(err.splitlines()) == 1
+
+
+def test_what_the_messages_tell_to_type_works(check: Command) -> None:
+    assert {row["name"] for row in json.loads(check("distribution:local", "--json")[1])} == {"elsewhere"}
+    assert check("twice", "--json")[0] == 1, "both things are the distribution's, and its rule is none"
+    assert check("engine:twice")[0] == 0
+    assert check("significance-test:twice")[0] == 1
+
+
+def test_without_a_name_it_says_what_can_be_checked(check: Command) -> None:
+    code, out, _ = check()
+    assert code == 0
+    assert "Installed plugins of others: failing, first, local" in out
+    assert json.loads(check("--json")[1])["distributions"] == sorted(DISTRIBUTIONS)
+
+
+DIRT = r"\x1b[2J[bold]red[/bold]:warning:\r\u202e\x85\udc9b"
+CLEAN = r"\x1b[2J[bold]red[/bold]:warning: \u202e \udc9b"
+
+HOSTILE = f'''
+import typer
+from qrlsuite import hookimpl
+from qrlsuite.specs import EngineSpec
+
+@hookimpl
+def register_engines(register):
+    register(EngineSpec("evil", "{DIRT}", "evil:engine"))
+
+@hookimpl
+def register_commands(app):
+    app.command("ev\\x1bil")(lambda: None)
+
+def engine(options):
+    raise RuntimeError("first\\n{DIRT}")
+'''
+UNSPEAKABLE = f'''
+class Error(Exception):
+    def __str__(self):
+        raise ValueError
+
+raise type("{DIRT}", (Error,), {{}})
+'''
+SHOUTING = f'raise RuntimeError("""first\nqrlsuite: {DIRT}""")'
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hostile")
+    install(folder, "evil", HOSTILE)
+    install(folder, "shouting", SHOUTING)
+    install(folder, "unspeakable", UNSPEAKABLE)
+    info = folder / "evil-1.0.dist-info"
+    (info / "METADATA").write_text("Name: e\x1b[31mvil\nVersion: 1\x1b[0m\nRequires-Dist: qrlsuite>=0.1\n")
+    return folder
+
+
+def assert_harmless(done: subprocess.CompletedProcess[str]) -> None:
+    for stream in (done.stdout, done.stderr):
+        bad = {character for character in stream if not character.isprintable()} - {"\n"}
+        assert not bad, (bad, stream)
+
+
+def test_names_and_messages_of_a_hostile_plugin_control_no_terminal(hostile: Path) -> None:
+    listed = suite(hostile, "list", "engines")
+    assert_harmless(listed)
+    assert CLEAN in listed.stdout
+    assert r"[e\x1b[31mvil]" in listed.stdout
+    warned = listed.stderr.splitlines()
+    assert len(warned) == 3, "a line of one's own for each"
+    assert all(line.startswith("qrlsuite: warning: plugin '") for line in warned), warned
+    assert f"RuntimeError: first qrlsuite: {CLEAN}; skipped" in listed.stderr
+    assert r"nobody can type the command name 'ev\x1bil'" in listed.stderr
+    for words in (["list", "plugins"], ["show", "engine", "evil"], ["--strict", "list"], ["check"]):
+        done = suite(hostile, *words)
+        assert_harmless(done)
+        assert "\\x1b" in done.stdout + done.stderr, words
+        assert "Traceback" not in done.stderr
+
+
+def test_check_shows_a_hostile_plugin_as_it_is(hostile: Path) -> None:
+    done = suite(hostile, "check", "evil")
+    assert done.returncode == 1
+    assert_harmless(done)
+    assert f"✗ builds: RuntimeError: first {CLEAN}" in done.stdout
+    terminal = suite(hostile, "check", "evil", FORCE_COLOR="1", TERM="xterm-256color")
+    assert "\x1b[1m" in terminal.stdout, "it believes to write to a terminal"
+    assert "\x1b[2J" not in terminal.stdout
+    assert f"RuntimeError: first {CLEAN}" in terminal.stdout
+
+
+COMMANDS = """
+import typer
+from qrlsuite import hookimpl
+
+@hookimpl
+def register_commands(app):
+    {body}
+"""
+UNBUILDABLE = "call = lambda x: None; call.__annotations__ = {'x': 'nosuch'}; app.command('call')(call)"
+SUB = "sub = typer.Typer(); sub.command('list')(lambda: None); app.add_typer(sub)"
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (UNBUILDABLE, "hook 'register_commands': NameError: name 'nosuch'"),
+        (SUB, "there is a command 'list' already"),
+        ("[app.command('twin')(lambda: None) for _ in range(2)]", "there is a command 'twin' already"),
+        ("app.callback()(lambda: None)", "may only add commands"),
+        ("app.registered_commands.clear()", "may only add commands"),
+        ("app.command('two words')(lambda: None)", "nobody can type the command name 'two words'"),
+        ("app.command('--list')(lambda: None)", "nobody can type the command name '--list'"),
+    ],
+)
+def test_commands_that_would_break_others_are_left_out(tmp_path: Path, body: str, message: str) -> None:
+    install(tmp_path, "pushy", COMMANDS.format(body=body))
+    done = suite(tmp_path, "--version")
+    assert done.stdout.startswith("qrlsuite "), done.stderr
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
