@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from qrlsuite import rules
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.app import JsonOption, PublishedOption, RunsOption
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,6 +51,7 @@ def calibrate(
     ] = None,
     board: Annotated[int, typer.Option("--board", min=2, max=100, help="Entries of a simulated board.")] = 5,
     runs: RunsOption = Path("runs"),
+    published: PublishedOption = False,
     json_output: JsonOption = False,
 ) -> None:
     """Measure how often each rule declares a winner where there is none, and how often it finds one that is there.
@@ -68,7 +69,7 @@ def calibrate(
     from qrlsuite.leaderboard.board import grid_of, learning_curves
     from qrlsuite.leaderboard.pictures.cells import choose_horizon
 
-    chosen = _entries(runs, entries or [], task)
+    chosen = _entries(runs, published, entries or [], task)
     horizon = choose_horizon(chosen)
     judges = [rules.load(name) for name in dict.fromkeys(rule or ["intervals", "difference"])]
     names = [entry.label.removeprefix(f"{entry.algorithm} ") for entry in chosen]
@@ -105,20 +106,21 @@ def calibrate(
         _show(heading, lines)
     for judge in judges:
         typer.echo(f"'{judge.name}' promises {judge.promise}")
-    typer.echo("\nOn these entries:")
-    for judge in judges:
-        typer.echo(f"- {summary(found, judge.name, board)}")
+    if said := [words for judge in judges if (words := summary(found, judge.name, board))]:
+        typer.echo("\nOn these entries:")
+        for words in said:
+            typer.echo(f"- {words}")
 
 
-def _entries(runs: Path, names: Sequence[str], task: str | None) -> list[EntryCurves]:
-    """Return the entries to simulate from: of one task, with two seeds or more."""
+def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None) -> list[EntryCurves]:
+    """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long."""
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
     if names:
-        found = [collect.find(runs, name) for name in dict.fromkeys(names)]
+        found = [collect.find(runs, name, published) for name in dict.fromkeys(names)]
     else:
-        found, refused = collect.collect(runs, task)
+        found, refused = collect.collect(runs, task, shipped=published)
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
     single = [entry.label for entry in found if len(entry.seeds) < 2]
@@ -131,6 +133,14 @@ def _entries(runs: Path, names: Sequence[str], task: str | None) -> list[EntryCu
     tasks = sorted({entry.task for entry in found})
     if len({entry.task_hash for entry in found}) > 1:
         raise OptionError(f"the entries belong to several tasks ({', '.join(tasks)}): choose one with --task")
+    longest = max(entry.curves.shape[1] for entry in found)
+    for entry in found:
+        if entry.curves.shape[1] < longest:
+            reached = f"at epoch {entry.curves.shape[1]} of {longest}"
+            typer.echo(
+                f"left out, {reached}: {entry.label}; repeat the `qrlsuite run` that made it", err=True
+            )
+    found = [entry for entry in found if entry.curves.shape[1] == longest]
     return sorted(found, key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
 
 
@@ -233,6 +243,9 @@ def summary(found: Sequence[Finding], rule: str, board: int) -> str:
         parts.append(
             f"declares a false winner between two equal entries of {seeds} seeds in {_range(rates)} of cases"
         )
+    halves = [each.winner for each in own if each.part == "halves"]
+    if halves and not equal:
+        parts.append(f"declares a false winner between halves of one entry in {_range(halves)} of splits")
     boards = [each.winner for each in own if each.part == "boards"]
     if boards:
         parts.append(f"finds one somewhere on {_range(boards)} of boards of {board} equals")

@@ -154,6 +154,12 @@ def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryCurves]) -
     assert 0 <= content["rates"][0]["winner"] <= 1
     with pytest.raises(OptionError, match="--seeds 20;30: write two numbers"):
         call("calibrate", "--seeds", "20;30")
+    halves = call("calibrate", "qubits=6", "--draws", "4", "--part", "halves", "--rule", "difference")
+    assert "'difference' declares a false winner between halves of one entry in" in halves
+    object.__setattr__(entries[0], "curves", entries[0].curves[:, :10])
+    cut = json.loads(call("calibrate", "--draws", "4", "--part", "halves", "--json").splitlines()[-1])
+    assert len(cut["entries"]) == 2, "an entry at epoch 10 of 100 would cut the others' curves to 10 epochs"
+    assert cut["horizon"] == 100 * entries[1].steps_per_epoch
     object.__setattr__(entries[2], "curves", np.zeros((1, 100)))
     object.__setattr__(entries[2], "seeds", (0,))
     with pytest.raises(UnknownNameError, match="no entry with two seeds or more"):
