@@ -1,4 +1,4 @@
-"""Everything that is registered passes the checks that plugin authors run."""
+"""Everything that the suite registers itself passes the checks that plugin authors run, and every rule of its kind."""
 
 from __future__ import annotations
 
@@ -7,25 +7,19 @@ import importlib.util
 import pytest
 
 from qrlsuite import registry
-from qrlsuite.testing import assert_conforms, check
+from qrlsuite.testing import check
+from qrlsuite.testing.selection import Item, of_distribution
 
-EVERYTHING = [(kind, found.spec.name) for kind, found in registry.load()]
+EVERYTHING = of_distribution("qrlsuite")
 NEEDS = {("tasks", "lunarlander"): "Box2D"}
 
-
-@pytest.mark.parametrize(("kind", "name"), EVERYTHING)
-def test_it_conforms(kind: str, name: str) -> None:
-    package = NEEDS.get((kind, name))
-    if package is not None and importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} is not installed")
-    assert_conforms(kind, name)
-
-
+COMMON = ["name", "references", "lazy imports", "spawn"]
+OPTIONS = ["options documented", "options"]
 RULES = {
     "ansatzes": ["builds", "pure", "inputs used", "parameters used", "layers", "gradients", "backends"],
-    "circuit_backends": ["shapes", "values", "gradients", "repeatable", "seed independence"],
+    "circuit_backends": ["builds", "shapes", "values", "gradients", "repeatable", "seed independence"],
     "models": [
-        "shapes", "parameters registered", "quantum parameters", "same seed", "different seed",
+        "builds", "shapes", "parameters registered", "quantum parameters", "same seed", "different seed",
         "global randomness", "pure", "gradients", "finite differences", "copies", "population",
         "seed independence", "state",
     ],
@@ -38,17 +32,35 @@ RULES = {
         "state is seed-first", "seed independence", "state",
     ],
     "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "ranking", "scores"],
+    "significance_tests": ["builds", "signs", "repeatable", "antisymmetric", "equal entries", "direction"],
+    "engines": ["builds", "methods", "workers", "queued"],
+    "studies": [],
+    "trackers": ["builds", "target", "events"],
 }  # fmt: skip
+"""Rules of each kind, after those that all have in common."""
+
+WHERE_OFFERED = {
+    ("circuit_backends", "pennylane"): ["shots"],
+    ("circuit_backends", "qiskit"): ["shots"],
+    ("significance_tests", "intervals"): ["against"],
+}
+"""Rules about what a thing need not have."""
 
 
-@pytest.mark.parametrize("kind", RULES)
-def test_no_rule_is_left_out(kind: str) -> None:
-    """A rule that is silently skipped would pass every test above."""
-    name = {"tasks": "beam6g", "models": "mlp", "circuit_backends": "native"}.get(
-        kind, registry.load().names(kind)[0]
-    )
-    rules = [finding.rule for finding in check(kind, name)]
-    common = ["name", "references", "lazy imports", "spawn"]
-    if kind != "tasks":
-        common += ["options documented", "options"]
-    assert [rule for rule in rules if rule != "builds"] == common + [r for r in RULES[kind] if r != "builds"]
+@pytest.mark.parametrize("item", EVERYTHING, ids=lambda item: f"{item.kind}-{item.name}")
+def test_it_conforms(item: Item) -> None:
+    """A rule that is silently skipped would never be broken: so every one is named."""
+    package = NEEDS.get((item.kind, item.name))
+    if package is not None and importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    findings = check(item.kind, item.name)
+    broken = [f"{finding.rule}: {finding.message}" for finding in findings if not finding.ok]
+    assert not broken
+    spec = registry.load().get(item.kind, item.name).spec
+    options = OPTIONS if getattr(spec, "options", None) else []
+    offered = WHERE_OFFERED.get((item.kind, item.name), [])
+    assert [finding.rule for finding in findings] == [*COMMON, *options, *RULES[item.kind], *offered]
+
+
+def test_no_kind_is_left_out() -> None:
+    assert RULES.keys() == registry.KINDS.keys() == {item.kind for item in EVERYTHING}
