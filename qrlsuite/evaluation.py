@@ -22,6 +22,7 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, StoreError
 from qrlsuite.run import MAX_EPISODE_STEPS, ModelBuilder, build_envs
 from qrlsuite.seeding import Streams
+from qrlsuite.standardization import RunningStatistics
 from qrlsuite.store import EntryStore, SeedStore
 
 LANES = 100
@@ -183,14 +184,19 @@ class Agents:
         streams = [Streams(entry.task.hash, seed) for seed in seeds]
         envs = build_envs(entry, len(self.seeds), lambda: None)
         size = int(np.prod(envs.single_observation_space.shape or (1,)))
+        place = torch.device(device)
+        self.statistics: RunningStatistics | None = None
+        if envs.inner.running_statistics:
+            self.statistics = RunningStatistics(len(self.seeds), 1, size, place)
+        models = ModelBuilder(entry, size, streams, self.statistics)
         factory = specs.resolve(entry.algorithm.factory)
-        self.algorithm = factory(
-            envs, ModelBuilder(entry, size, streams), entry.algorithm_options, streams, torch.device(device)
-        )
+        self.algorithm = factory(envs, models, entry.algorithm_options, streams, place)
         self._load(store, stored)
 
     def _load(self, store: EntryStore, stored: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-        own: dict[str, torch.Tensor] = self.algorithm.policy_state()
+        own: dict[str, torch.Tensor] = dict(self.algorithm.policy_state())
+        if self.statistics is not None:
+            own |= self.statistics.published()
         for seed, arrays in zip(self.seeds, stored):
             problem = _misfit({name: value[0] for name, value in own.items()}, arrays)
             if problem:
@@ -201,9 +207,11 @@ class Agents:
             for name, value in own.items():
                 together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
                 value.copy_(together.reshape(value.shape))
-        loaded = self.algorithm.policy_state()
-        for name, value in own.items():
-            if not torch.equal(value.cpu(), loaded[name].cpu()) and not bool(torch.isnan(value).any()):
+        if self.statistics is not None:
+            self.statistics.refresh()
+        for name, loaded in self.algorithm.policy_state().items():
+            value = own[name]
+            if not torch.equal(value.cpu(), loaded.cpu()) and not bool(torch.isnan(value).any()):
                 raise PluginError(
                     f"algorithm '{type(self.algorithm).__name__}': policy_state() returns copies; it has to return "
                     "the tensors that act() uses, into which trained parameters are loaded"

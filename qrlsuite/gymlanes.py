@@ -80,6 +80,7 @@ class GymLanes(LaneEnv):
                 f"and its observations are {self._raw_space}"
             )
         self._normalize = Normalization(normalization, flat, low, high, f"environment '{env_id}'")
+        self.running_statistics = normalization == "running"
         self.envs = [first, *(make(env_id, given) for _ in range(num_envs - 1))]
         batched_spaces(self, self._normalize.space, spaces.Discrete(int(self._action_space.n)), num_envs)
         limit = first.spec.max_episode_steps if first.spec is not None else None

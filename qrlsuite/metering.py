@@ -20,6 +20,8 @@ class MeteredEnv(LaneEnv):
     ----------
     returns:
         Undiscounted return of every lane's unfinished episode (num_envs,).
+    observe:
+        Called with the observations (num_envs, ...) that every step returns, unless None.
     finished:
         (lane, return, score) of every episode that ended since `take_finished` was last called.
     """
@@ -31,6 +33,7 @@ class MeteredEnv(LaneEnv):
         self.tick = tick
         batched_spaces(self, inner.single_observation_space, inner.single_action_space, inner.num_envs)
         self.returns = np.zeros(inner.num_envs)
+        self.observe: Callable[[NDArray[np.float32]], None] | None = None
         self.finished: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
 
     def reset(
@@ -47,6 +50,8 @@ class MeteredEnv(LaneEnv):
         """Step every lane."""
         try:
             observations, rewards, terminated, truncated, infos = self.inner.step(actions)
+            if self.observe is not None:
+                self.observe(observations)
         except Exception as error:
             raise self._failure(error) from error
         self.returns += rewards

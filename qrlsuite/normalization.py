@@ -1,7 +1,8 @@
-"""Normalizing observations: named ways, fixed before training, that are stored with the environment's options.
+"""Normalizing observations: named ways that are stored with the environment's options.
 
-Running means and variances are not among them: training and validation would need the same statistics, which a
-seed gathers while it trains, and those belong to the agent rather than to its environments.
+Three are fixed before training, and the environment applies them. Running statistics are gathered while a seed trains,
+and training and validation need the same: they belong to the agent, which applies them itself
+(`qrlsuite.standardization`), and its environment only asks for them.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
 
-Kind = Literal["none", "bounds", "arctan"]
+Kind = Literal["none", "bounds", "arctan", "running"]
 KIND = (
     "none: as they are; bounds: low..high linearly to -1..1, not clipped; "
-    "arctan: the arcus tangens of each value, in -pi/2..pi/2"
+    "arctan: the arcus tangens of each value, in -pi/2..pi/2; "
+    "running: standardized by the mean and variance of what the agent has trained on, clipped to -10..10"
 )
 """The description of an option of this kind."""
 
@@ -30,11 +32,12 @@ class Normalization:
     - `bounds` maps [low, high] linearly to [-1, 1]. Values outside are not clipped: nothing is lost.
     - `arctan` bounds values that have no bounds to (-pi/2, pi/2), angles a circuit can take (Skolik, Jerbi &
       Dunjko 2022, "Quantum agents in the Gym", section 3.2, for CartPole's velocities).
+    - `running` returns them as they are, too: the agent standardizes them, see `qrlsuite.standardization`.
 
     Parameters
     ----------
     kind:
-        One of the three.
+        One of the four.
     space:
         The observations' box, of shape (n,).
     low, high:

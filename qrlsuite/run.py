@@ -29,6 +29,7 @@ from qrlsuite.events import EventSink, asked
 from qrlsuite.interrupts import Interruptible
 from qrlsuite.metering import MeteredEnv
 from qrlsuite.seeding import Streams, pack, unpack
+from qrlsuite.standardization import PREFIX, RunningStatistics
 
 CHECKPOINT_SECONDS = 60.0
 MAX_EPISODE_STEPS = 100_000
@@ -72,12 +73,22 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
 
 
 class ModelBuilder:
-    """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one."""
+    """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
 
-    def __init__(self, entry: Entry, observation_size: int, streams: Sequence[Streams]) -> None:
+    With `statistics`, all of them standardize their observations by these.
+    """
+
+    def __init__(
+        self,
+        entry: Entry,
+        observation_size: int,
+        streams: Sequence[Streams],
+        statistics: RunningStatistics | None = None,
+    ) -> None:
         self.entry = entry
         self.observation_size = observation_size
         self.streams = streams
+        self.statistics = statistics
         self.built: list[nn.Module] = []
         self.parameters: list[tuple[int, int]] = []
 
@@ -95,6 +106,8 @@ class ModelBuilder:
             together = population.stack(agents)
         else:
             together = specs.resolve(spec.population)(agents, given)
+        if self.statistics is not None:
+            self.statistics.attach(together)
         self.built.append(together)
         return together
 
@@ -146,7 +159,11 @@ class GroupRun:
         self.validation = build_envs(entry, self.S * self.V, self._tick)
         self.validation.inner.autoreset = False
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
-        self.models = ModelBuilder(entry, size, self.streams)
+        self.statistics: RunningStatistics | None = None
+        if self.envs.inner.running_statistics:
+            self.statistics = RunningStatistics(self.S, self.E, size, torch.device(device))
+            self.envs.observe = self.statistics.observe
+        self.models = ModelBuilder(entry, size, self.streams, self.statistics)
         factory = specs.resolve(entry.algorithm.factory)
         self.algorithm = factory(
             self.envs, self.models, entry.algorithm_options, self.streams, torch.device(device)
@@ -257,6 +274,8 @@ class GroupRun:
         before = self.models.executions()
         started, processor = time.perf_counter(), time.process_time()
         self._phase("training", self.entry.task.file.protocol.rounds)
+        if self.statistics is not None:
+            self.statistics.adopt()
         metrics = dict(self.algorithm.train_epoch(self.entry.task.file.protocol.rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained = time.perf_counter()
@@ -351,6 +370,8 @@ class GroupRun:
         for name, array in self.envs.state_dict().items():
             arrays[f"environment.{name}"] = array.reshape(self.S, self.E, *array.shape[1:]).copy()
         arrays["streams"] = pack(self.envs.inner.streams).reshape(self.S, self.E, -1)
+        if self.statistics is not None:
+            arrays |= {f"{PREFIX}{name}": array for name, array in self.statistics.state_dict().items()}
         return arrays
 
     def _restore(self, epoch: int, arrays: checkpoint.Arrays) -> None:
@@ -376,6 +397,14 @@ class GroupRun:
                 if name.startswith("algorithm.")
             }
             self.algorithm.load_state_dict(state)
+            if self.statistics is not None:
+                self.statistics.load_state_dict(
+                    {
+                        name.removeprefix(PREFIX): array
+                        for name, array in arrays.items()
+                        if name.startswith(PREFIX)
+                    }
+                )
         except (KeyError, ValueError, RuntimeError) as error:
             raise StoreError(
                 f"{self.store.path}: its checkpoint does not fit this version: {error}"
@@ -397,7 +426,10 @@ class GroupRun:
         """Publish the trained agents, compact the lines, and mark every seed as finished."""
         from safetensors.numpy import save as encode
 
-        policy = {name: value.detach().cpu().numpy() for name, value in self.algorithm.policy_state().items()}
+        tensors = self.algorithm.policy_state()
+        if self.statistics is not None:
+            tensors = {**tensors, **self.statistics.published()}
+        policy = {name: value.detach().cpu().numpy() for name, value in tensors.items()}
         for s, seed in enumerate(self.seeds):
             folder = self.store.seed(seed)
             agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}

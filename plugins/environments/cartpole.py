@@ -100,6 +100,8 @@ class CartPole(CartPoleEnv):
     With `normalization = "arctan"` each value is replaced by its arcus tangens, in (-pi/2, pi/2), as in Skolik,
     Jerbi and Dunjko, "Quantum agents in the Gym" (2022). With `"bounds"` each is divided by its bound; the
     default bounds are those of Jerbi et al., "Parametrized quantum policies for reinforcement learning" (2021).
+    With `"running"`, in tasks only, the environment leaves them and each agent standardizes them by the mean and
+    variance of what it has trained on (`qrlsuite.standardization`).
 
     ## Rewards
 
@@ -119,7 +121,7 @@ class CartPole(CartPoleEnv):
     | Argument        | Default               | Meaning                                                |
     |-----------------|-----------------------|--------------------------------------------------------|
     | `steps`         | 500                   | time limit                                             |
-    | `normalization` | "none"                | "none", "bounds" or "arctan"                           |
+    | `normalization` | "none"                | "none", "bounds", "arctan"; in tasks also "running"    |
     | `bounds`        | (2.4, 2.5, 0.21, 2.5) | what becomes 1 with "bounds"                           |
     | `render_mode`   | None                  | "rgb_array" or "human", which need pygame              |
 
@@ -142,6 +144,11 @@ class CartPole(CartPoleEnv):
     ) -> None:
         given = {"steps": steps, "normalization": normalization, "bounds": bounds}
         self.options = parse(given)
+        if self.options.normalization == "running":
+            raise OptionError(
+                "environment 'cartpole': running statistics belong to an agent, which keeps them in a task; "
+                "of a single environment, gymnasium.wrappers.NormalizeObservation keeps some"
+            )
         super().__init__(render_mode=render_mode)
         self._normalize = _normalization(self.options)
         self.observation_space = self._normalize.space
@@ -188,6 +195,7 @@ class CartPoleLanes(LaneEnv):
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.options = options
         self._normalize = _normalization(options)
+        self.running_statistics = options.normalization == "running"
         batched_spaces(self, self._normalize.space, Discrete(2), num_envs)
         self.streams = []
         self.state = np.zeros((4, num_envs))

@@ -249,9 +249,10 @@ def test_normalizations() -> None:
     raw = np.array(start, dtype=np.float32)
     got = {
         kind: lanes(2, normalization=kind).reset(options={"state": start})[0]
-        for kind in ("none", "bounds", "arctan")
+        for kind in ("none", "bounds", "arctan", "running")
     }
     np.testing.assert_array_equal(got["none"], raw)
+    np.testing.assert_array_equal(got["running"], raw)
     np.testing.assert_allclose(got["bounds"], [[1, -1, 1, 0], [-0.5, 0.5, 0, 2]], rtol=1e-6)
     np.testing.assert_allclose(got["arctan"], np.arctan(raw.astype(np.float64)), rtol=1e-6)
     assert all(values.dtype == np.float32 for values in got.values())
@@ -294,6 +295,13 @@ def test_the_single_environment_passes_gymnasiums_check_and_agrees(normalization
         np.testing.assert_array_equal(infos["final_obs"][0] if infos else observations[0], expected)
 
 
+def test_running_statistics_are_asked_for_in_lanes_and_refused_alone() -> None:
+    assert lanes(1, normalization="running").running_statistics
+    assert not lanes(1, normalization="arctan").running_statistics
+    with pytest.raises(OptionError, match=r"belong to an agent.*gymnasium.wrappers.NormalizeObservation"):
+        gymnasium.make(ID, normalization="running")
+
+
 def test_importing_twice_and_the_factory() -> None:
     from qrlsuite.plugins.environments import cartpole
 
@@ -306,7 +314,7 @@ def test_importing_twice_and_the_factory() -> None:
     [
         ({"steps": 0}, "environment 'cartpole': steps = 0: .*greater than or equal to 1"),
         ({"normalisation": "none"}, "no option 'normalisation'; did you mean 'normalization'"),
-        ({"normalization": "running"}, "normalization = 'running': .*'none', 'bounds' or 'arctan'"),
+        ({"normalization": "z"}, "normalization = 'z': .*'none', 'bounds', 'arctan' or 'running'"),
         ({"bounds": [1, 2, 3]}, "bounds"),
         ({"bounds": [1, 2, 3, 0]}, "every bound must be a positive, finite number"),
     ],

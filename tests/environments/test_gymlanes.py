@@ -309,9 +309,19 @@ def test_normalizations_that_cannot_be(given: dict[str, Any], message: str) -> N
         GymLanes("CartPole-v1", 1, **given)
 
 
-def test_normalization_is_for_boxes() -> None:
-    with pytest.raises(OptionError, match=r"'arctan' is for boxes, and its observations are Discrete\(16\)"):
-        GymLanes("FrozenLake-v1", 1, normalization="arctan")
+@pytest.mark.parametrize("kind", ["arctan", "running"])
+def test_normalization_is_for_boxes(kind: Any) -> None:
+    with pytest.raises(OptionError, match=rf"'{kind}' is for boxes, and its observations are Discrete\(16\)"):
+        GymLanes("FrozenLake-v1", 1, normalization=kind)
+
+
+def test_running_statistics_are_asked_for_and_observations_left() -> None:
+    raw, asked = lanes(WALK, 2), GymLanes(WALK, 2, normalization="running")
+    assert asked.running_statistics
+    assert not raw.running_statistics
+    raw.seed_from(0)
+    asked.seed_from(0)
+    np.testing.assert_array_equal(raw.reset()[0], asked.reset()[0])
 
 
 def test_normalizations() -> None:
@@ -367,7 +377,7 @@ def test_misuse() -> None:
         ({"arguments": {"max_episode_steps": 5}}, "'max_episode_steps' cannot be given here; use the option"),
         ({"arguments": {"render_mode": "human"}}, "'render_mode' cannot be given here; use nothing"),
         ({"max_episode_steps": 0}, "max_episode_steps = 0"),
-        ({"normalization": "running"}, "normalization = 'running'"),
+        ({"normalization": "z"}, "normalization = 'z'"),
     ],
 )
 def test_options_that_cannot_be(values: dict[str, Any], message: str) -> None:
