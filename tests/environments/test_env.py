@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -55,6 +56,21 @@ def test_released_episode(episode):
 )
 def test_gymnasium_checker(options):
     check_env(gymnasium.make(ID, **options).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("pygame", ["there", "missing"])
+def test_gymnasium_checker_renders_in_every_declared_mode(pygame):
+    if pygame == "there":
+        pytest.importorskip("pygame")
+    code = (
+        "import sys, gymnasium, qrlsuite; from gymnasium.utils.env_checker import check_env;"
+        f"there = {pygame == 'there'};"
+        "there or sys.modules.update(pygame=None);"
+        f"env = gymnasium.make('{ID}', steps=5).unwrapped;"
+        "assert ('human' in env.metadata['render_modes']) is there;"
+        "check_env(env)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "SDL_VIDEODRIVER": "dummy"})
 
 
 @pytest.mark.parametrize("mode", ["rgb_array", "ansi"])
