@@ -31,6 +31,7 @@ def build() -> typer.Typer:
         calibrate,
         check,
         compare,
+        doctor,
         evaluate,
         export,
         import_,
@@ -73,6 +74,7 @@ def build() -> typer.Typer:
     app.command("list")(listing.list_things)
     app.command("show")(show.show)
     app.command("check")(check.check)
+    app.command("doctor")(doctor.doctor)
     app.add_typer(study.app, name="study")
     app.add_typer(new.app, name="new")
 

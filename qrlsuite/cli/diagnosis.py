@@ -1,0 +1,232 @@
+"""What `qrlsuite doctor` looks at: facts by section, and what is wrong with them."""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qrlsuite.cli import installed
+
+VARIABLES = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "CUDA_", "QRLSUITE_", "XDG_CACHE_HOME", "PYTHONPATH")
+"""Environment variables, by how they begin, that change how fast or from where things run."""
+
+LITTLE = 1_000_000_000
+"""Bytes of free space below which it is worth a word; a finished seed takes a quarter of a megabyte."""
+
+Facts = dict[str, Any]
+
+
+@dataclass
+class Diagnosis:
+    """Facts by section, and problems.
+
+    Attributes
+    ----------
+    broken:
+        What must be mended before the suite can be used.
+    remarks:
+        What is left out, or may surprise; the rest works.
+    """
+
+    facts: dict[str, Facts] = field(default_factory=dict)
+    broken: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+
+def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -> Diagnosis:
+    """Look at everything; a section that fails is itself a finding.
+
+    Parameters
+    ----------
+    runs:
+        The results folder.
+    announce:
+        Called with what is being done, before every step that takes a while.
+    """
+    from qrlsuite.registry import words
+
+    found = Diagnosis()
+    sections: dict[str, Callable[[Diagnosis], Facts]] = {
+        "suite": _suite,
+        "python": _python,
+        "machine": _machine,
+        "packages": _packages,
+        "extras": _extras,
+        "tried": functools.partial(_tried, announce),
+        "plugins": _plugins,
+        "runs": functools.partial(_runs, runs),
+        "slurm": _slurm,
+    }
+    for name, look in sections.items():
+        try:
+            found.facts[name] = look(found)
+        except Exception as error:
+            found.facts[name] = {"error": words(error)}
+            found.broken.append(f"{name}: {words(error)}")
+    return found
+
+
+def _suite(found: Diagnosis) -> Facts:
+    import qrlsuite
+    from qrlsuite.provenance import collect
+
+    location, stated = Path(qrlsuite.__file__).parent, installed.about()["version"]
+    if not stated:
+        found.broken.append(f"{location} is on the path, and not installed: pip install it")
+    elif stated != qrlsuite.__version__:
+        found.broken.append(
+            f"{location} is qrlsuite {qrlsuite.__version__}, and what is installed is {stated}: install it again"
+        )
+    return {"version": qrlsuite.__version__, "location": str(location), "commit": collect([])["commit"]}
+
+
+def _python(found: Diagnosis) -> Facts:
+    from packaging.specifiers import SpecifierSet
+
+    needed = installed.about()["python"]
+    if not SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
+        found.broken.append(f"Python {platform.python_version()} is not supported: qrlsuite needs {needed}")
+    return {
+        "version": platform.python_version(),
+        "executable": sys.executable,
+        "virtual_environment": sys.prefix != sys.base_prefix,
+    }
+
+
+def _machine(found: Diagnosis) -> Facts:
+    from qrlsuite.provenance import processor
+
+    usable, quota = len(os.sched_getaffinity(0)), _quota()
+    if quota is not None and quota < usable:
+        found.remarks.append(
+            f"this container may use {quota:g} of {usable} cores: qrlsuite run --workers {max(1, int(quota))}"
+        )
+    return {
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "usable_cores": usable,
+        "quota_cores": quota,
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "variables": {
+            name: value for name, value in sorted(os.environ.items()) if name.startswith(VARIABLES)
+        },
+    }
+
+
+def _quota() -> float | None:
+    """Return how many cores a container may use at a time, None where that is not limited."""
+    try:
+        limit, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return None if limit == "max" else int(limit) / int(period)
+    except (OSError, ValueError):
+        return None
+
+
+def _packages(found: Diagnosis) -> Facts:
+    needed = list(installed.requirements())
+    found.broken += filter(None, map(installed.lacking, needed))
+    return {requirement.name: installed.version(requirement) for requirement in needed}
+
+
+def _extras(found: Diagnosis) -> Facts:
+    facts: Facts = {}
+    for extra in installed.about()["extras"]:
+        needed = list(installed.requirements(extra=extra))
+        facts[extra] = {
+            "versions": {requirement.name: installed.version(requirement) for requirement in needed},
+            "missing": [requirement.name for requirement in needed if installed.lacking(requirement)],
+            "install": f"pip install 'qrlsuite[{extra}]'",
+        }
+    return facts
+
+
+def _tried(announce: Callable[[str], None], found: Diagnosis) -> Facts:
+    answers, failed = installed.attempt(announce)
+    found.broken += failed
+    facts = {name: answers.get(name, {}) for name in ("torch", "simulator")}
+    driver = Path("/proc/driver/nvidia/version").exists()
+    if driver and not facts["torch"].get("devices"):
+        found.remarks.append(
+            "there is an NVIDIA driver, and this torch sees no GPU: --device cuda needs a CUDA build of torch"
+        )
+    temporary = Path(tempfile.gettempdir())
+    for folder in map(Path, facts["simulator"].get("cache", [])):
+        if temporary in folder.parents:
+            found.remarks.append(
+                f"the compiled simulator is kept in {temporary} only: set QRLSUITE_CACHE to a folder that stays"
+            )
+    return {**facts, "nvidia_driver": driver}
+
+
+def _plugins(found: Diagnosis) -> Facts:
+    from packaging.specifiers import SpecifierSet
+
+    import qrlsuite
+    from qrlsuite import registry
+
+    known = registry.load()
+    facts: Facts = {"loaded": {}, "failed": {}, "incompatible": {}, "problems": list(known.problems)}
+    for plugin in known.plugins:
+        fits = SpecifierSet(plugin.requires).contains(qrlsuite.__version__, prereleases=True)
+        state = "loaded" if not plugin.problem else "failed" if fits else "incompatible"
+        names = facts[state].setdefault(f"{plugin.distribution} {plugin.version}".strip(), [])
+        names += (
+            [plugin.problem] if plugin.problem else [n for some in plugin.registered.values() for n in some]
+        )
+        if plugin.problem and plugin.distribution == "qrlsuite":
+            found.broken.append(plugin.problem)
+    if not any(plugin.distribution == "qrlsuite" for plugin in known.plugins):
+        found.broken.append("the suite's own models and tasks are not there: install it again, with pip")
+    found.remarks += [problem for problem in known.problems if not problem.startswith(tuple(found.broken))]
+    return facts
+
+
+def _runs(folder: Path, found: Diagnosis) -> Facts:
+    from qrlsuite.store import entries
+
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    facts: Facts = {"folder": str(folder), "exists": folder.exists(), "entries": 0, "seeds": 0}
+    facts["free_bytes"] = shutil.disk_usage(there).free
+    try:
+        with tempfile.TemporaryFile(dir=there) as file:
+            file.write(b"\0" * 4096)
+            file.flush()
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        facts["writable"] = True
+    except OSError as error:
+        facts["writable"] = False
+        found.broken.append(f"{there} cannot be written and locked: {error.strerror}; use --runs DIR")
+    if facts["free_bytes"] < LITTLE:
+        found.remarks.append(f"little space is left at {there}: {facts['free_bytes'] / 1e6:.0f} MB")
+    if folder.is_dir():
+        stores = entries(folder)
+        facts |= {"entries": len(stores), "seeds": sum(len(store.seeds()) for store in stores)}
+    return facts
+
+
+def _slurm(found: Diagnosis) -> Facts:
+    sbatch = shutil.which("sbatch")
+    facts: Facts = {"sbatch": sbatch, "job": os.environ.get("SLURM_JOB_ID")}
+    if sbatch is not None:
+        try:
+            said = subprocess.run(
+                [sbatch, "--version"], capture_output=True, text=True, timeout=20, check=True
+            )
+            facts["version"] = said.stdout.strip()
+        except (OSError, subprocess.SubprocessError) as error:
+            found.remarks.append(f"{sbatch} --version fails: {error}")
+        missing = found.facts.get("extras", {}).get("slurm", {})
+        if missing.get("missing"):
+            found.remarks.append(f"SLURM is here, and --engine slurm needs {missing['install']}")
+    return facts

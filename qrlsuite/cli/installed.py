@@ -1,0 +1,110 @@
+"""What the suite's own metadata says it needs, what is installed of it, and whether it works when it is used."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+PATIENCE = 600
+"""Seconds that importing everything and compiling the simulator may take."""
+
+
+def about() -> dict[str, Any]:
+    """Return the suite's metadata: version, the Python that it needs, its extras; empty where it is not installed."""
+    try:
+        found = metadata.metadata("qrlsuite")
+    except metadata.PackageNotFoundError:
+        return {"version": "", "python": "", "extras": []}
+    return {
+        "version": found["Version"],
+        "python": found["Requires-Python"] or "",
+        "extras": found.get_all("Provides-Extra") or [],
+    }
+
+
+def requirements(distribution: str = "qrlsuite", extra: str = "") -> Iterator[Requirement]:
+    """Yield what a distribution requires, or what an extra of it adds to that, with the extras of those."""
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    try:
+        lines = metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        return
+    for line in lines:
+        try:
+            requirement = Requirement(line)
+        except InvalidRequirement:
+            continue
+        always = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        added = requirement.marker is not None and requirement.marker.evaluate({"extra": extra})
+        if always if not extra else added and not always:
+            yield requirement
+            for nested in sorted(requirement.extras):
+                yield from requirements(requirement.name, nested)
+
+
+def version(requirement: Requirement) -> str | None:
+    """Return the installed version of what is required, None where there is none."""
+    try:
+        return metadata.version(requirement.name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def lacking(requirement: Requirement) -> str:
+    """Say what is wrong with what is installed, and what to type; `""` where nothing is."""
+    found = version(requirement)
+    if found is not None and requirement.specifier.contains(found, prereleases=True):
+        return ""
+    what = "is not installed" if found is None else f"{found} is installed, and does not fit"
+    return f"{requirement.name} {what}: pip install '{requirement.name}{requirement.specifier}'"
+
+
+def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]:
+    """Import every required package and compute a circuit, in a process that may end as it likes.
+
+    Returns
+    -------
+    tuple
+        What `qrlsuite.cli.probe` found, by step; and what failed, one line each.
+    """
+    names = [requirement.name.lower().replace("-", "_") for requirement in requirements()]
+    modules = [name for name in names if importlib.util.find_spec(name) is not None]
+    answers: dict[str, Any] = {}
+    doing = "start Python"
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "qrlsuite.cli.probe", *modules],
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+        timer = threading.Timer(PATIENCE, process.kill)
+        timer.start()
+        with process:
+            for line in process.stdout or ():
+                answer = json.loads(line)
+                doing = answer.pop("doing", doing)
+                announce(doing)
+                answers |= answer
+        timer.cancel()
+        errors.seek(0)
+        said = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
+    failed = [
+        f"{step}: {answer['error']}"
+        for step, answer in answers.items()
+        if isinstance(answer, dict) and "error" in answer
+    ]
+    if process.returncode:
+        failed.append(f"{doing}: the process ended with code {process.returncode}: {said}")
+    return answers, failed
