@@ -7,6 +7,7 @@ Gymnasium was imported before it, every environment of the suite and its plugins
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = ["__version__", "hookimpl", "register_environments"]
+
+# Python started in a checkout finds this folder before an installed package, and without the folders that an
+# installation maps below it (`qrlsuite.plugins` and others); there they lie beside it.
+_CHECKOUT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+if all(
+    os.path.isfile(os.path.join(_CHECKOUT, *path))
+    for path in (("pyproject.toml",), ("plugins", "__init__.py"))
+):
+    __path__.append(_CHECKOUT)
 
 
 def __getattr__(name: str) -> object:

@@ -86,6 +86,22 @@ def test_the_package_list_names_every_folder() -> None:
         assert setup["package-dir"][name] == str(folder.relative_to(ROOT))
 
 
+def test_python_started_in_a_checkout_finds_every_folder() -> None:
+    program = (
+        "import importlib, sys;"
+        # Where the suite was not installed from this checkout as editable, nothing leads to its folders.
+        "sys.meta_path[:] = [f for f in sys.meta_path if 'editable' not in f'{f} {type(f).__module__}'];"
+        "sys.path[:] = [p for p in sys.path if 'editable' not in p];"
+        f"found = [importlib.import_module(name).__file__ for name in {sorted(FOLDERS)}];"
+        f"expected = [f'{{folder}}/__init__.py' for folder in {[str(FOLDERS[name]) for name in sorted(FOLDERS)]}];"
+        "assert found == expected, found;"
+        "import gymnasium, qrlsuite;"
+        "qrlsuite.register_environments();"
+        "gymnasium.make('qrlsuite/BeamManagement6G-v1').reset(seed=0)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
 def test_registering_imports_nothing_heavy() -> None:
     program = (
         "import sys, qrlsuite.registry as r; assert not r.create(strict=True).problems; "
