@@ -24,6 +24,10 @@ class Algorithm(Protocol):
     `qrlsuite.environment.LaneEnv` of S * E seed-major lanes that has not been reset, `streams` a list of S
     `qrlsuite.seeding.Streams`. Randomness is drawn per seed, from streams that carry the epoch as index where
     a whole epoch's numbers are drawn at once.
+
+    Observations are to be stored as they come and given to the networks as they are: where a task normalizes by
+    running statistics, the populations of `build_model` standardize what they are given (`qrlsuite.standardization`),
+    by statistics that stand still during an epoch.
     """
 
     def start(self) -> None:
