@@ -48,6 +48,8 @@ class Progress:
     total: int = 0
     """Rounds of the current phase, 0 where unknown."""
     median_score: float | None = None
+    seed_scores: list[float] = dataclasses.field(default_factory=list)
+    """Each seed's score after `epoch`, for a median over all groups."""
     epoch_seconds: float | None = None
     warnings: list[str] = dataclasses.field(default_factory=list)
     """What the user should know although nothing failed: a tracker that was left out."""
@@ -359,7 +361,8 @@ class GroupRun:
             run = {**self._seed_record(seed), "folder": str(folder.path)}
             self.events.send("epoch_finished", run=run, record=line)
         self.progress.epoch = self.epoch
-        self.progress.median_score = float(np.median(scores.mean(axis=1)))
+        self.progress.seed_scores = scores.mean(axis=1).tolist()
+        self.progress.median_score = float(np.median(self.progress.seed_scores))
         self.report(self.progress)
 
     def _capture(self) -> checkpoint.Arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,7 @@ class CostEstimate:
         self.epochs = epochs
         self.workers = min(workers, max(1, len(groups)))
         self._first: dict[str, tuple[float, int]] = {}
+        self._measured: dict[str, float] = {}
 
     def remaining(self, snapshot: dict[str, dict[str, Any]], now: float) -> float | None:
         """Return the seconds left on these workers, None before anything was measured."""
@@ -70,15 +72,11 @@ class CostEstimate:
         if state.get("epoch_seconds"):
             return float(state["epoch_seconds"])
         done, total = int(state.get("done") or 0), int(state.get("total") or 0)
-        if state.get("phase") != "training" or not total or not done:
-            return None
-        if name not in self._first:
-            self._first[name] = (now, done)
-            return None
-        began, before = self._first[name]
-        if done - before < 2 or now - began < 2.0:
-            return None
-        return 1.25 * total * (now - began) / (done - before)
+        if state.get("phase") == "training" and total and done:
+            began, before = self._first.setdefault(name, (now, done))
+            if done - before >= 2 and now - began >= 2.0:
+                self._measured[name] = 1.25 * total * (now - began) / (done - before)
+        return self._measured.get(name)  # the first epoch's validation adds nothing: what was measured stays
 
 
 class RunDisplay:
@@ -140,7 +138,8 @@ class RunDisplay:
         left = self.estimate.remaining(snapshot, now)
         if left is not None and not self._announced:
             self._announce(left)
-        done, completed, epochs, scores = 0.0, 0, [], []
+        done, completed, epochs = 0.0, 0, []
+        scores: list[float] = []
         for group in self.groups:
             state = snapshot.get(group.id, {})
             epoch = int(state.get("epoch") or group.epoch)
@@ -150,13 +149,12 @@ class RunDisplay:
             done += min(self.epochs, epoch + fraction) * len(group.seeds)
             completed += len(group.seeds) * (state.get("phase") == "finished")
             epochs.append(epoch)
-            if state.get("median_score") is not None:
-                scores.append(float(state["median_score"]))
+            scores += state.get("seed_scores") or []
         words = [
             f"seeds {completed}/{sum(len(g.seeds) for g in self.groups)}",
             f"epoch {min(epochs)}/{self.epochs}",
         ]
-        words += [f"median score {sum(scores) / len(scores):.3f}"] if scores else []
+        words += [f"median score {statistics.median(scores):.3f}"] if scores else []
         words += [f"{duration(left)} left"] if left is not None else ["measuring"]
         text = "  ".join(words)
         if self.live is not None:

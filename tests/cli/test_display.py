@@ -1,0 +1,47 @@
+"""The progress display: what it says from what the groups report."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from qrlsuite.cli.display import CostEstimate, RunDisplay
+from qrlsuite.cli.run import summarize
+from qrlsuite.engine.groups import Group, ProgressFile
+from qrlsuite.entry import Entry, resolve
+from qrlsuite.options import parse_setting
+from qrlsuite.store import EntryStore
+
+PAIR = [Group((0, 1, 2), 0), Group((3, 4), 0)]
+
+
+@pytest.fixture
+def entry(tiny_task: str) -> Entry:
+    return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+
+
+def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, monkeypatch) -> None:
+    path: Path = train("runs", [0, 1, 2])
+    train("runs", [3, 4])
+    store = EntryStore(path)
+    snapshot = {group.id: ProgressFile(store, group.id).read() for group in PAIR}
+    monkeypatch.setattr("qrlsuite.cli.display.PLAIN_SECONDS", 0.0)
+    RunDisplay(entry, store, range(5), 3, PAIR, 2, quiet=False).update(snapshot)
+    shown = re.search(r"median score (\S+)", capsys.readouterr().err)
+    expected = summarize(entry, store, list(range(5)), 3)["median_score"]
+    assert shown is not None
+    assert shown[1] == f"{expected:.3f}"
+    assert len({state["median_score"] for state in snapshot.values()}) == 2, "the groups must differ"
+
+
+def test_an_estimate_outlives_the_first_epoch_s_validation() -> None:
+    estimate = CostEstimate(PAIR[:1], epochs=10, workers=1)
+    name = PAIR[0].id
+    training = {"phase": "training", "epoch": 0, "total": 100}
+    assert estimate.remaining({name: {**training, "done": 10}}, now=0.0) is None
+    # 20 rounds in 10 seconds: 50 seconds for an epoch's training, and a quarter more for its validation.
+    assert estimate.remaining({name: {**training, "done": 30}}, now=10.0) == pytest.approx(62.5 * 9.76)
+    validating = {"phase": "validation", "epoch": 0, "done": 1, "total": 20}
+    assert estimate.remaining({name: validating}, now=60.0) == pytest.approx(62.5 * 10)
