@@ -3,84 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-import qrlsuite
-from qrlsuite import specs
 from qrlsuite.environment import LaneEnv
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.testing import reproducible
 from qrlsuite.testing.common import Subject
-from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.lanes import LONGEST, Lanes, S, actions, choices, register
 
-S, E = 5, 2
-LONGEST = 10_000
-"""Steps within which an episode must end."""
-_STREAMS = (
-    "draw from self.np_random in a gymnasium.Env, from self.streams in lanes, and from nothing global; set all state "
-    "in reset()"
-)
-
-
-class Lanes:
-    """Builds lanes of the environment that is checked, as a run does."""
-
-    def __init__(self, subject: Subject) -> None:
-        spec = subject.spec
-        assert isinstance(spec, specs.EnvironmentSpec)
-        self.spec, self.options = spec, subject.options()
-
-    def make(self, seeds: Sequence[int], autoreset: bool = True) -> LaneEnv:
-        """Return two lanes for each seed, with streams of their own."""
-        lanes = len(seeds) * E
-        if self.spec.vector is not None:
-            envs: LaneEnv = specs.resolve(self.spec.vector)(self.options, lanes)
-        else:
-            from qrlsuite.gymlanes import GymLanes
-
-            register(self.spec)
-            envs = GymLanes(self.spec.gymnasium_id, lanes, dataclasses.asdict(self.options))
-        envs.autoreset = autoreset
-        envs.seed_lanes(
-            [np.random.Generator(np.random.Philox(key=1000 * s + e)) for s in seeds for e in range(E)]
-        )
-        return envs
-
-
-def register(spec: specs.EnvironmentSpec) -> None:
-    """Make the environment known to Gymnasium, as the suite does with registered ones."""
-    qrlsuite.register_environments()
-    if spec.entry_point is not None and spec.gymnasium_id not in gymnasium.registry:
-        gymnasium.register(spec.gymnasium_id, entry_point=spec.entry_point)
-
-
-def actions(seeds: Sequence[int], choices: int, steps: int) -> NDArray[np.int64]:
-    """Return every lane's actions (steps, 2 len(seeds)); those of a seed do not depend on the others."""
-    columns = [
-        np.random.Generator(np.random.Philox(key=77 + s)).integers(choices, size=(steps, E)) for s in seeds
-    ]
-    return np.concatenate(columns, axis=1).astype(np.int64)
-
-
-def play(envs: LaneEnv, given: NDArray[np.int64], reset: bool = True) -> dict[str, NDArray[Any]]:
-    """Return everything that lanes show under actions (T, L), lane-first."""
-    seen: dict[str, list[NDArray[Any]]] = {
-        "observations": [],
-        "rewards": [],
-        "terminated": [],
-        "truncated": [],
-    }
-    if reset:
-        seen["observations"].append(np.array(envs.reset()[0]))
-    for row in given:
-        observations, rewards, terminated, truncated, _ = envs.step(row)
-        for values, value in zip(seen.values(), (observations, rewards, terminated, truncated)):
-            values.append(np.array(value))
-    return {name: np.stack(values, axis=1) for name, values in seen.items()}
+HARMLESS = ("infinity", "recommend", "values are equal")
+"""Words of warnings of `check_env` that concern taste, or learners other than the suite's."""
+_SEEDING = ": is super().reset(seed=seed) called in reset, and every number drawn from self.np_random?"
 
 
 def check(subject: Subject, deterministic: bool = False) -> list[Finding]:
@@ -94,13 +35,14 @@ def check(subject: Subject, deterministic: bool = False) -> list[Finding]:
     lanes = Lanes(subject)
     rules = Checklist()
     rules.run("gymnasium", "passes gymnasium.utils.env_checker.check_env", lambda: _gymnasium(lanes))
-    cause = "options are handed to the environment as keyword arguments"
+    cause = "in __init__, call qrlsuite.environment.batched_spaces(self, observation_space, action_space, num_envs)"
     if not rules.run(
         "spaces", "discrete actions, and boxes or numbers to observe", lambda: _spaces(lanes), cause
     ):
         return rules.findings
+    cause = "step takes (L,) integers and returns observations, rewards, terminated, truncated and infos"
     if not rules.run(
-        "shapes", "lanes first, of the right types, finite, in their space", lambda: _shapes(lanes)
+        "shapes", "lanes first, of the right types, finite, in their space", lambda: _shapes(lanes), cause
     ):
         return rules.findings
     length: list[int] = []
@@ -109,18 +51,38 @@ def check(subject: Subject, deterministic: bool = False) -> list[Finding]:
     ):
         return rules.findings
     steps = min(length[0] + 5, 300)
-    rules.run("score", "in [0, 1] where info has one", lambda: _score(lanes, length[0]))
-    rules.run("same seed", "the same streams and actions give the same bits", lambda: _same(lanes, steps))
-    if not deterministic:
-        rules.run("different seed", "other streams give other episodes", lambda: _different(lanes, steps))
+    cause = "infos['final_info'] is a dict that may hold 'score' (L,) with its mask '_score'"
+    rules.run("score", "in [0, 1] where info has one", lambda: _score(lanes, length[0]), cause)
     rules.run(
-        "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(lanes, steps)
+        "same seed",
+        "the same streams and actions give the same bits",
+        lambda: reproducible.same_seed(lanes, steps),
     )
-    rules.run("state", "saved, sliced and restored exactly", lambda: _state(lanes, steps))
+    if not deterministic:
+        rules.run(
+            "different seed",
+            "other streams give other episodes",
+            lambda: reproducible.different_seed(lanes, steps),
+        )
+    rules.run(
+        "seed independence",
+        "alone, in pairs, shuffled: the same bits",
+        lambda: reproducible.seed_independence(lanes, steps),
+    )
+    cause = (
+        "state_dict() gives arrays with the lane first; load_state_dict() takes them, or slices of them, in new lanes "
+        "that were never reset"
+    )
+    rules.run("state", "saved, sliced and restored exactly", lambda: reproducible.state(lanes, steps), cause)
+    cause = (
+        "in validation a stream serves several lanes, lane l by self.streams[l * len(self.streams) // self.num_envs], "
+        "and lanes whose episode ended are stepped on"
+    )
     rules.run(
         "validation",
-        "without autoreset, lanes that ended can be stepped on",
-        lambda: _validation(lanes, steps),
+        "the same episodes, and ended lanes are stepped on",
+        lambda: reproducible.validation(lanes),
+        cause,
     )
     return rules.findings
 
@@ -144,88 +106,121 @@ def _gymnasium(lanes: Lanes) -> None:
         try:
             check_env(env.unwrapped, skip_render_check=True)
         except Exception as error:
-            raise BrokenRuleError(f"check_env: {type(error).__name__}: {error}") from error
+            hint = _SEEDING if "deterministic" in str(error) else ""
+            raise BrokenRuleError(
+                f"check_env: {type(error).__name__}: {str(error).rstrip('.')}{hint}"
+            ) from error
         finally:
             env.close()
-    ours = [str(w.message) for w in caught if "check_env" in str(w.message) or "WARN" in str(w.message)]
-    serious = [
-        text for text in ours if "should" in text and "not within" not in text and "recommend" not in text
-    ]
-    require(
-        not serious or lanes.spec.entry_point is None, f"check_env warns: {serious[0] if serious else ''}"
-    )
+    if lanes.spec.entry_point is None:  # Gymnasium's own, or another package's: not the plugin's to mend
+        return
+    texts = [re.sub(r"\x1b\[\d+m", "", str(warning.message)) for warning in caught]
+    for text in texts:
+        require(
+            not text.startswith("WARN: ") or any(word in text for word in HARMLESS),
+            f"check_env warns: {text.removeprefix('WARN: ')}",
+        )
 
 
 def _spaces(lanes: Lanes) -> None:
-    envs = lanes.make([0])
+    try:
+        envs = lanes.make([0])
+    except QrlSuiteError as error:
+        raise BrokenRuleError(str(error)) from error
+    action, observation = envs.single_action_space, envs.single_observation_space
     require(
-        isinstance(envs.single_action_space, gymnasium.spaces.Discrete),
-        f"actions are {envs.single_action_space}; the algorithms choose among discrete ones",
+        isinstance(action, gymnasium.spaces.Discrete),
+        f"actions are {action}; the algorithms choose among discrete ones: use gymnasium.spaces.Discrete(n)",
     )
     require(
-        isinstance(envs.single_observation_space, gymnasium.spaces.Box),
-        f"observations are {envs.single_observation_space}; networks need a Box",
+        int(action.start) == 0,  # type: ignore[attr-defined]
+        f"actions are {action}; in lanes they count from 0: use gymnasium.spaces.Discrete(n), and add start in step",
     )
-
-
-def _choices(envs: LaneEnv) -> int:
-    return int(envs.single_action_space.n)  # type: ignore[attr-defined]
+    require(
+        isinstance(observation, gymnasium.spaces.Box),
+        f"observations are {observation}; networks need a gymnasium.spaces.Box",
+    )
 
 
 def _shapes(lanes: Lanes) -> None:
     envs = lanes.make(range(S))
     n = envs.num_envs
-    require(n == S * E, f"asked for {S * E} lanes, num_envs is {n}")
     shape = (n, *(envs.single_observation_space.shape or ()))
-    first, _ = envs.reset()
-    row = actions(range(S), _choices(envs), 1)[0]
-    after, rewards, terminated, truncated, infos = envs.step(row)
-    for name, value, expected, dtype in (
-        ("reset's observations", first, shape, np.float32),
-        ("observations", after, shape, np.float32),
-        ("rewards", rewards, (n,), np.float64),
-        ("terminated", terminated, (n,), np.bool_),
-        ("truncated", truncated, (n,), np.bool_),
-    ):
-        got = np.asarray(value)
+    before = envs.reset()[0]
+    _array("reset's observations", before, shape, np.float32)
+    for observation in before:
+        _within(envs, observation, "reset")
+    for step, row in enumerate(actions(range(S), choices(envs), 50), start=1):
+        kept = np.array(before)
+        after, rewards, terminated, truncated, infos = envs.step(row)
         require(
-            got.shape == expected and got.dtype == dtype,
-            f"{name} are {got.dtype} of shape {got.shape}, and must be {np.dtype(dtype)} of shape {expected}",
+            np.array_equal(kept, before),
+            "a step changes the observations that were returned before it: return a copy, for learners keep them",
         )
-        require(bool(np.isfinite(got).all()), f"{name} are not finite")
-    require(isinstance(infos, dict), f"infos are {type(infos).__name__}, and must be a dict")
-    outside = [o for o in np.asarray(after) if not envs.single_observation_space.contains(o)]
-    require(not outside, f"observation {outside[:1]} is outside {envs.single_observation_space}")
-    kept = np.array(after)
-    envs.step(row)
+        for name, value, expected, dtype in (
+            ("observations", after, shape, np.float32),
+            ("rewards", rewards, (n,), np.float64),
+            ("terminated", terminated, (n,), np.bool_),
+            ("truncated", truncated, (n,), np.bool_),
+        ):
+            _array(name, value, expected, dtype)
+        require(
+            isinstance(infos, dict),
+            f"infos are {type(infos).__name__}, and must be a dict, empty where there is nothing to say",
+        )
+        for observation in after:
+            _within(envs, observation, f"step {step}")
+        before = after
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type) -> None:
+    """Require an array of a shape and a type, and numbers in it."""
+    require(isinstance(value, np.ndarray), f"{name} are {type(value).__name__}, and must be a numpy array")
     require(
-        np.array_equal(kept, after),
-        "a step changes the observations that the step before returned: return a copy, for learners keep them",
+        value.shape == shape,
+        f"{name} have shape {value.shape}, and must have {shape}: lanes come first, then what the space says",
+    )
+    wanted = np.dtype(dtype)
+    require(
+        value.dtype == wanted,
+        f"{name} are {value.dtype}, and must be {wanted}: convert with .astype(np.{wanted})",
+    )
+    require(
+        bool(np.isfinite(value).all()),
+        f"{name} are not finite: is there a division by zero, or a logarithm of zero?",
+    )
+
+
+def _within(envs: LaneEnv, observation: NDArray[Any], when: str) -> None:
+    space = envs.single_observation_space
+    require(
+        space.contains(observation),
+        f"the observation {observation} of {when} is outside {space}: widen the space, or clip the observation",
     )
 
 
 def _end(lanes: Lanes) -> int:
     """Return the length of the first episode that ends."""
-    envs = lanes.make([0])
-    envs.reset()
-    rows = actions([0], _choices(envs), LONGEST)
-    for step, row in enumerate(rows, start=1):
+    envs, unreset = lanes.make([0]), lanes.make([0], autoreset=False)
+    alike = np.array_equal(envs.reset()[0], unreset.reset()[0])
+    given = iter(actions([0], choices(envs), LONGEST + 5))
+    for step in range(1, LONGEST + 1):
+        row = next(given)
         after, _, terminated, truncated, infos = envs.step(row)
+        last = unreset.step(row)[0]
         done = terminated | truncated
         if not done.any():
+            alike = alike and np.array_equal(after, last)
             continue
-        for key in ("final_obs", "_final_obs"):
-            require(
-                key in infos,
-                f"an episode ended after {step} steps and infos have no '{key}': the last observation, before the "
-                "reset in the same step, is what learners bootstrap from",
-            )
+        _final(infos, done, after, last if alike else after, step)
+        for _ in range(5):
+            _, _, terminated, truncated, _ = envs.step(next(given))
+            done = done & (terminated | truncated)
         require(
-            np.array_equal(np.asarray(infos["_final_obs"], dtype=bool), done),
-            "the mask infos['_final_obs'] is not where episodes ended",
+            step == 1 or not done.any(),
+            f"an episode ended after {step} steps, and again at each of the 5 steps after it: reset the lanes whose "
+            "episode ends, in the same step",
         )
-        final = np.asarray(infos["final_obs"])
-        require(final.shape == np.asarray(after).shape, f"infos['final_obs'] has shape {final.shape}")
         return step
     raise BrokenRuleError(
         f"no episode ended within {LONGEST} steps of random actions: give it a time limit (gymnasium.register("
@@ -233,100 +228,61 @@ def _end(lanes: Lanes) -> int:
     )
 
 
-def _score(lanes: Lanes, length: int) -> None:
-    envs = lanes.make([0])
-    envs.reset()
-    for row in actions([0], _choices(envs), length):
-        _, _, terminated, truncated, infos = envs.step(row)
-        done = terminated | truncated
-        scores = infos.get("final_info", {}).get("score") if done.any() else None
-        if scores is not None:
-            mine = np.asarray(scores, dtype=np.float64)[done]
-            require(
-                bool(np.isfinite(mine).all() and (mine >= 0).all() and (mine <= 1 + 1e-9).all()),
-                f"info['score'] at an episode's end is {mine[0]:.6g}, and must lie in [0, 1]: divide by the best "
-                "possible, or leave it out and state max_return in the task file",
-            )
-
-
-def _differs(a: dict[str, NDArray[Any]], b: dict[str, NDArray[Any]]) -> str | None:
-    return next((name for name, value in a.items() if not np.array_equal(value, b[name])), None)
-
-
-def _same(lanes: Lanes, steps: int) -> None:
-    first, second = (lanes.make([0, 1]) for _ in range(2))
-    given = actions([0, 1], _choices(first), steps)
-    name = _differs(play(first, given), play(second, given))
-    require(name is None, f"the same streams and actions give other {name}: {_STREAMS}")
-    first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
-    again = lanes.make([0, 1])
-    again.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
-    name = _differs(play(first, given), play(again, given))
-    require(name is None, f"a used environment, reset, shows other {name} than a new one: {_STREAMS}")
-
-
-def _different(lanes: Lanes, steps: int) -> None:
-    envs, others = lanes.make([0]), lanes.make([5])
-    given = actions([0], _choices(envs), steps)
+def _final(
+    infos: Mapping[str, Any], done: NDArray[np.bool_], after: NDArray[Any], last: NDArray[Any], step: int
+) -> None:
+    """Require that infos hold the last observation; `after` is what the step returned, `last` what it did in lanes
+    without autoreset.
+    """
+    for key in ("final_obs", "_final_obs"):
+        require(
+            key in infos,
+            f"an episode ended after {step} steps and infos have no '{key}': the last observation, before the "
+            "reset in the same step, is what learners bootstrap from",
+        )
     require(
-        _differs(play(envs, given), play(others, given)) is not None,
-        f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
-        "deterministic=True",
+        np.array_equal(infos["_final_obs"], done),
+        f"infos['_final_obs'] is {infos['_final_obs']} where episodes ended as {done}: it is the mask "
+        "terminated | truncated",
+    )
+    final = np.asarray(infos["final_obs"])
+    require(
+        final.shape == after.shape,
+        f"infos['final_obs'] has shape {final.shape}, and must have that of observations, {after.shape}",
+    )
+    was_reset = np.array_equal(last[done], after[done])  # without autoreset, it need not be left out
+    require(
+        was_reset or np.array_equal(final[done], last[done]),
+        f"an episode's last observation is {last[done][0]} without autoreset, and infos['final_obs'] holds "
+        f"{final[done][0]}: copy the observations before the reset in the same step",
     )
 
 
-def _independence(lanes: Lanes, steps: int) -> None:
+def _score(lanes: Lanes, length: int) -> None:
     envs = lanes.make(range(S))
-    choices = _choices(envs)
-    whole = play(envs, actions(range(S), choices, steps))
-    for members in SIZES:
-        part = play(lanes.make(members), actions(members, choices, steps))
-        rows = [s * E + e for s in members for e in range(E)]
-        name = _differs(part, {key: value[rows] for key, value in whole.items()})
-        require(
-            name is None,
-            f"seeds {list(members)} among themselves see other {name} than among all {S}: a lane may depend on its own "
-            f"stream and actions alone; {_STREAMS}",
-        )
-
-
-def _state(lanes: Lanes, steps: int) -> None:
-    envs = lanes.make(range(S))
-    given = actions(range(S), _choices(envs), 2 * steps)
-    play(envs, given[: max(1, steps // 2)])
-    state = {name: np.array(value) for name, value in envs.state_dict().items()}
-    for name, value in state.items():
-        require(
-            value.ndim > 0 and value.shape[0] == S * E,
-            f"state '{name}' of shape {value.shape} has no leading axis of {S * E} lanes: checkpoints are sliced",
-        )
-    from qrlsuite.seeding import pack, unpack
-
-    streams = pack(envs.streams)
-    expected = play(envs, given[steps:], reset=False)
-    for members in (tuple(range(S)), (3,), (4, 1)):
-        rows = [s * E + e for s in members for e in range(E)]
-        other = lanes.make(members)
-        other.reset()
-        other.seed_lanes(unpack(streams[rows]))
-        other.load_state_dict({name: value[rows].copy() for name, value in state.items()})
-        got = play(other, given[steps:][:, rows], reset=False)
-        lost = _differs(got, {key: value[rows] for key, value in expected.items()})
-        require(
-            lost is None,
-            f"restored from state_dict() in the middle of an episode, seeds {list(members)} see other {lost}: "
-            "something that the rest of the episode depends on is not in the state, or is shared between lanes",
-        )
-
-
-def _validation(lanes: Lanes, steps: int) -> None:
-    envs = lanes.make([0], autoreset=False)
     envs.reset()
-    over = np.zeros(envs.num_envs, dtype=bool)
-    for row in actions([0], _choices(envs), LONGEST):
-        _, _, terminated, truncated, _ = envs.step(row)
-        over |= terminated | truncated
-        if over.all():
-            for _ in range(3):
-                envs.step(row)
-            return
+    scored: list[bool] = []
+    for row in actions(range(S), choices(envs), min(4 * length, LONGEST)):
+        _, _, terminated, truncated, infos = envs.step(row)
+        done = terminated | truncated
+        if not done.any():
+            continue
+        scores = infos.get("final_info", {}).get("score")
+        scored.append(scores is not None)
+        require(
+            len(set(scored)) == 1,
+            "some episodes end with info['score'] and some without: set it at every end, truncated ones too, or never",
+        )
+        if scores is None:
+            continue
+        require(
+            np.shape(scores) == done.shape,
+            f"infos['final_info']['score'] has shape {np.shape(scores)}, and must have one number per lane, "
+            f"{done.shape}",
+        )
+        for score in np.asarray(scores, dtype=np.float64)[done]:
+            require(
+                bool(0 <= score <= 1 + 1e-9),
+                f"info['score'] at an episode's end is {score:.6g}, and must lie in [0, 1]: divide by the best "
+                "possible, or leave it out and state max_return in the task file",
+            )

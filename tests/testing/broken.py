@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +29,15 @@ class Broken:
     spec: Spec
     message: str
     also: frozenset[str] = field(default_factory=frozenset)
+
+
+Cases = Sequence[tuple[str, Broken]]
+"""Broken plugins by the rule that they break; a rule may be broken in several ways."""
+
+
+def ids(cases: Cases) -> list[str]:
+    """Return what pytest calls each case: the rule, and the spec's name."""
+    return [f"{rule.replace(' ', '-')}-{case.spec.name}" for rule, case in cases]
 
 
 def own_rules(kind: str, spec: Spec, settings: Mapping[str, Any] | None = None) -> list[Finding]:

@@ -1,0 +1,129 @@
+"""Lanes of an environment that is checked: built as a run builds them, and played under given actions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+import qrlsuite
+from qrlsuite import specs
+from qrlsuite.environment import LaneEnv
+from qrlsuite.testing.common import Subject
+from qrlsuite.testing.findings import require
+
+S, E = 5, 2
+"""Seeds, and lanes of every seed."""
+LONGEST = 10_000
+"""Steps within which an episode must end."""
+
+Seen = dict[str, NDArray[Any]]
+"""What lanes showed, lane-first: `observations`, `rewards`, `terminated`, `truncated` and `scores`, NaN where none."""
+
+
+class Lanes:
+    """Builds lanes of the environment that is checked, as a run does."""
+
+    def __init__(self, subject: Subject) -> None:
+        spec = subject.spec
+        assert isinstance(spec, specs.EnvironmentSpec)
+        self.spec, self.options = spec, subject.options()
+
+    def make(self, seeds: Sequence[int], autoreset: bool = True, shared: bool = False) -> LaneEnv:
+        """Return two lanes for each seed, with streams of their own, or one that they share, as in validation.
+
+        Raises
+        ------
+        BrokenRuleError
+            If the factory returns something else.
+        """
+        lanes = len(seeds) * E
+        if self.spec.vector is not None:
+            envs: LaneEnv = specs.resolve(self.spec.vector)(self.options, lanes)
+            require(
+                isinstance(envs, LaneEnv),
+                f"{self.spec.vector} returned {type(envs).__name__}, and must return a "
+                "qrlsuite.environment.LaneEnv: is `return` there?",
+            )
+        else:
+            from qrlsuite.gymlanes import GymLanes
+
+            register(self.spec)
+            envs = GymLanes(self.spec.gymnasium_id, lanes, dataclasses.asdict(self.options))
+        require(
+            envs.num_envs == lanes,
+            f"asked for {lanes} lanes, num_envs is {envs.num_envs}: the second argument of {self.spec.vector} says how "
+            "many",
+        )
+        envs.autoreset = autoreset
+        keys = [1000 * s + e for s in seeds for e in range(1 if shared else E)]
+        envs.seed_lanes([np.random.Generator(np.random.Philox(key=key)) for key in keys])
+        return envs
+
+
+def register(spec: specs.EnvironmentSpec) -> None:
+    """Make the environment known to Gymnasium, as the suite does with registered ones."""
+    qrlsuite.register_environments()
+    if spec.entry_point is not None and spec.gymnasium_id not in gymnasium.registry:
+        gymnasium.register(spec.gymnasium_id, entry_point=spec.entry_point)
+
+
+def rows(seeds: Sequence[int]) -> list[int]:
+    """Return the lanes of seeds, among those of all."""
+    return [s * E + e for s in seeds for e in range(E)]
+
+
+def choices(envs: LaneEnv) -> int:
+    """Return the number of actions."""
+    return int(envs.single_action_space.n)  # type: ignore[attr-defined]
+
+
+def actions(seeds: Sequence[int], count: int, steps: int) -> NDArray[np.int64]:
+    """Return every lane's actions (steps, 2 len(seeds)); those of a seed do not depend on the others."""
+    columns = [
+        np.random.Generator(np.random.Philox(key=77 + s)).integers(count, size=(steps, E)) for s in seeds
+    ]
+    return np.concatenate(columns, axis=1).astype(np.int64)
+
+
+def play(envs: LaneEnv, given: NDArray[np.int64], reset: bool = True) -> Seen:
+    """Return everything that lanes show under actions (T, L); observations have one more where they are reset."""
+    names = ("observations", "rewards", "terminated", "truncated", "scores")
+    seen: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    if reset:
+        seen["observations"].append(np.array(envs.reset()[0]))
+    for row in given:
+        *shown, infos = envs.step(row)
+        for values, value in zip(seen.values(), (*shown, _scores(infos, envs.num_envs))):
+            values.append(np.array(value))
+    return {name: np.stack(values, axis=1) for name, values in seen.items()}
+
+
+def _scores(infos: Mapping[str, Any], lanes: int) -> NDArray[np.float64]:
+    """Return the scores of the episodes that end in a step (L,), NaN where none ends."""
+    given = infos.get("final_info", {}).get("score")
+    if given is None or np.shape(given) != (lanes,):  # the rule `score` looks at the form
+        return np.full(lanes, np.nan)
+    return np.where(infos["_final_obs"], given, np.nan)
+
+
+def differs(a: Seen, b: Seen) -> str | None:
+    """Return the name of the first that is not the same in both, or None."""
+    return next((name for name, value in a.items() if not _same(value, b[name])), None)
+
+
+def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+
+
+def first_episodes(seen: Seen) -> list[Seen]:
+    """Return what every lane showed in its first episode, without the observation that follows its last step."""
+    found = []
+    for lane, ended in enumerate(seen["terminated"] | seen["truncated"]):
+        length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
+        found.append({name: value[lane, :length] for name, value in seen.items()})
+    return found

@@ -1,0 +1,132 @@
+"""What lanes keep to so that results are reproducible: nothing but streams and actions decides what they show."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.environment import LaneEnv
+from qrlsuite.seeding import pack, unpack
+from qrlsuite.testing.findings import SIZES, BrokenRuleError, require
+from qrlsuite.testing.lanes import LONGEST, E, Lanes, S, actions, choices, differs, first_episodes, play, rows
+
+_STREAMS = (
+    "draw from self.np_random in a gymnasium.Env, from self.streams in lanes, and from nothing global; set all state "
+    "in reset()"
+)
+
+
+def same_seed(lanes: Lanes, steps: int) -> None:
+    """The same streams and actions give the same bits, in new and in used lanes."""
+    first, second = (lanes.make([0, 1]) for _ in range(2))
+    given = actions([0, 1], choices(first), steps)
+    name = differs(play(first, given), play(second, given))
+    require(name is None, f"the same streams and actions give other {name}: {_STREAMS}")
+    first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
+    again = lanes.make([0, 1])
+    again.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
+    name = differs(play(first, given), play(again, given))
+    require(name is None, f"a used environment, reset, shows other {name} than a new one: {_STREAMS}")
+
+
+def different_seed(lanes: Lanes, steps: int) -> None:
+    """Other streams give other episodes."""
+    envs, others = lanes.make([0]), lanes.make([5])
+    given = actions([0], choices(envs), steps)
+    require(
+        differs(play(envs, given), play(others, given)) is not None,
+        f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
+        "deterministic=True",
+    )
+
+
+def seed_independence(lanes: Lanes, steps: int) -> None:
+    """Seeds alone, in pairs and shuffled see what they see among all."""
+    envs = lanes.make(range(S))
+    count = choices(envs)
+    whole = play(envs, actions(range(S), count, steps))
+    for members in SIZES:
+        part = play(lanes.make(members), actions(members, count, steps))
+        name = differs(part, {key: value[rows(members)] for key, value in whole.items()})
+        require(
+            name is None,
+            f"seeds {list(members)} among themselves see other {name} than among all {S}: a lane may depend on its own "
+            f"stream and actions alone; {_STREAMS}",
+        )
+
+
+def state(lanes: Lanes, steps: int) -> None:
+    """Saved in the middle of an episode, sliced, and restored in new lanes, episodes go on as they would have."""
+    envs = lanes.make(range(S))
+    given = actions(range(S), choices(envs), 2 * steps)
+    play(envs, given[: max(1, steps // 2)])
+    saved = {}
+    for name, value in envs.state_dict().items():
+        require(
+            isinstance(value, np.ndarray) and value.dtype.kind in "biuf",
+            f"state '{name}' is {getattr(value, 'dtype', type(value).__name__)}, and checkpoints hold arrays of "
+            "numbers: use np.array(...)",
+        )
+        require(
+            value.ndim > 0 and value.shape[0] == S * E,
+            f"state '{name}' of shape {value.shape} has no leading axis of {S * E} lanes: checkpoints are sliced",
+        )
+        saved[name] = value.copy()
+    streams = pack(envs.streams)
+    expected = play(envs, given[steps:], reset=False)
+    for members in (tuple(range(S)), (3,), (4, 1)):
+        mine = rows(members)
+        other = lanes.make(members)
+        other.seed_lanes(unpack(streams[mine]))
+        other.load_state_dict({name: value[mine].copy() for name, value in saved.items()})
+        got = play(other, given[steps:][:, mine], reset=False)
+        lost = differs(got, {key: value[mine] for key, value in expected.items()})
+        require(
+            lost is None,
+            f"restored from state_dict() in the middle of an episode, seeds {list(members)} see other {lost}: "
+            "something that the rest of the episode depends on is not in the state, or is shared between lanes",
+        )
+
+
+def validation(lanes: Lanes) -> None:
+    """Lanes play the same first episodes whether or not they are reset, and whoever is beside them."""
+    count = choices(lanes.make([0]))
+    given = actions(range(S), count, LONGEST)
+    envs = lanes.make(range(S), autoreset=False, shared=True)
+    length = _until_all_ended(envs, given)
+    whole = first_episodes(play(lanes.make(range(S), autoreset=False, shared=True), given[:length]))
+    for members in ((3,), (4, 1)):
+        mine = rows(members)
+        alone = lanes.make(members, autoreset=False, shared=True)
+        part = first_episodes(play(alone, given[:length, mine]))
+        name = next((name for a, lane in zip(part, mine) if (name := differs(a, whole[lane]))), None)
+        require(
+            name is None,
+            f"where a stream serves several lanes, seeds {list(members)} among themselves see other {name} than among "
+            f"all {S}: lane l draws from self.streams[l * len(self.streams) // self.num_envs], and from no other",
+        )
+    with_reset = first_episodes(play(lanes.make(range(S)), given[:length]))
+    without = first_episodes(play(lanes.make(range(S), autoreset=False), given[:length]))
+    name = next((name for a, b in zip(with_reset, without) if (name := differs(a, b))), None)
+    require(
+        name is None,
+        f"with autoreset = False the same streams and actions give other {name} in the first episode: a lane may "
+        "depend on autoreset only after its end, and what infos hold is copied before the reset in the same step",
+    )
+
+
+def _until_all_ended(envs: LaneEnv, given: NDArray[np.int64]) -> int:
+    """Step lanes that are not reset until an episode ended in each, and on; return the number of steps."""
+    envs.reset()
+    over = np.zeros(envs.num_envs, dtype=bool)
+    for step, row in enumerate(given, start=1):
+        _, _, terminated, truncated, _ = envs.step(row)
+        over |= terminated | truncated
+        if over.all():
+            for _ in range(3):
+                envs.step(row)
+            return step
+    raise BrokenRuleError(
+        f"without autoreset, {np.count_nonzero(~over)} of {len(over)} lanes have not ended after {len(given)} steps of "
+        "random actions: every episode needs a time limit, for validation waits until each lane has ended"
+    )
