@@ -26,6 +26,10 @@ class OptionError(QrlSuiteError):
     """An option has a value that it cannot have."""
 
 
+class CircuitError(OptionError):
+    """A circuit was described wrongly: a gate, wire, angle or parameter that there cannot be."""
+
+
 class PluginError(QrlSuiteError):
     """A plugin broke a rule of registration; the message names its distribution."""
 

@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.errors import CircuitError, OptionError, nearest
 
 MAX_QUBITS = 20
 
@@ -96,7 +96,7 @@ class Angle:
         for a, b in ((self, other), (other, self)):
             if isinstance(b, Angle) and a.is_bare_input and b.is_bare_weight:
                 return Angle(input=a.input, scale=b.weight)
-        raise OptionError("an angle is affine: only input * parameter can be multiplied")
+        raise CircuitError("an angle is affine: only input * parameter can be multiplied")
 
     def __add__(self, other: Angle | float) -> Angle:
         """Add two angles: at most one input term and one weight may remain."""
@@ -105,7 +105,7 @@ class Angle:
         if not isinstance(other, Angle):
             return NotImplemented
         if (self.input is not None and other.input is not None) or (self.weight and other.weight):
-            raise OptionError("an angle holds at most one input term and one weight: scale * input + weight")
+            raise CircuitError("an angle holds at most one input term and one weight: scale * input + weight")
         term = self if self.input is not None else other
         return Angle(
             constant=self.constant + other.constant,
@@ -145,7 +145,7 @@ class Parameter:
         """Return the scalar at a full multi-index as an angle."""
         position = (index,) if isinstance(index, int) else index
         if len(position) != len(self.shape) or not all(0 <= i < n for i, n in zip(position, self.shape)):
-            raise OptionError(f"parameter '{self.name}' of shape {self.shape} has no element {position}")
+            raise CircuitError(f"parameter '{self.name}' of shape {self.shape} has no element {position}")
         return Angle(weight=Element(self.name, int(np.ravel_multi_index(position, self.shape))))
 
 
@@ -197,13 +197,15 @@ class Circuit:
     def measure(self, wires: Sequence[int]) -> None:
         """Measure Pauli Z on these qubits, in this order, instead of on all."""
         if not wires or len(set(wires)) != len(wires) or not all(0 <= w < self.qubits for w in wires):
-            raise OptionError(f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1} are needed")
+            raise CircuitError(
+                f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1} are needed"
+            )
         self._observables = tuple(int(w) for w in wires)
 
     def input(self, index: int) -> Angle:
         """Return input feature `index` as an angle (radians)."""
         if not 0 <= index < self.inputs:
-            raise OptionError(f"input {index}: this circuit has inputs 0..{self.inputs - 1}")
+            raise CircuitError(f"input {index}: this circuit has inputs 0..{self.inputs - 1}")
         return Angle(input=index)
 
     def parameter(
@@ -211,11 +213,11 @@ class Circuit:
     ) -> Parameter:
         """Declare a trainable array, initially uniform in [low, high)."""
         if not name.isidentifier():
-            raise OptionError(f"parameter name {name!r} is not an identifier")
+            raise CircuitError(f"parameter name {name!r} is not an identifier")
         if name in self.parameters:
-            raise OptionError(f"parameter '{name}' is declared twice")
+            raise CircuitError(f"parameter '{name}' is declared twice")
         if not shape or any(not isinstance(n, int) or n < 1 for n in shape):
-            raise OptionError(f"parameter '{name}': shape {shape!r} needs positive integers")
+            raise CircuitError(f"parameter '{name}': shape {shape!r} needs positive integers")
         self.parameters[name] = Parameter(name, tuple(shape), low, high)
         return self.parameters[name]
 
@@ -238,18 +240,18 @@ class Circuit:
         if gate not in GATES:
             hint = COMPOSED.get(gate.upper())
             known = f"; write it as {hint}" if hint else nearest(gate, GATES)
-            raise OptionError(f"unknown gate '{gate}'{known}")
+            raise CircuitError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]
         targets = (wires,) if isinstance(wires, int) else tuple(wires)
         if control is not None and not signature.controllable:
-            raise OptionError(f"{gate} takes no extra control; use CNOT or CZ, or a controlled rotation")
+            raise CircuitError(f"{gate} takes no extra control; use CNOT or CZ, or a controlled rotation")
         touched = targets if control is None else (control, *targets)
         if len(targets) != signature.wires or len(set(touched)) != len(touched):
-            raise OptionError(f"{gate} needs {signature.wires} distinct wire(s), got {touched}")
+            raise CircuitError(f"{gate} needs {signature.wires} distinct wire(s), got {touched}")
         if not all(isinstance(w, int) and 0 <= w < self.qubits for w in touched):
-            raise OptionError(f"{gate} on qubits {touched}: this circuit has qubits 0..{self.qubits - 1}")
+            raise CircuitError(f"{gate} on qubits {touched}: this circuit has qubits 0..{self.qubits - 1}")
         if len(angles) != signature.angles:
-            raise OptionError(f"{gate} takes {signature.angles} angle(s), got {len(angles)}")
+            raise CircuitError(f"{gate} takes {signature.angles} angle(s), got {len(angles)}")
         exact = tuple(a if isinstance(a, Angle) else Angle(constant=float(a)) for a in angles)
         for angle in exact:
             self._check(angle)
@@ -257,17 +259,17 @@ class Circuit:
 
     def _check(self, angle: Angle) -> None:
         if not math.isfinite(angle.constant):
-            raise OptionError("an angle's constant must be finite")
+            raise CircuitError("an angle's constant must be finite")
         if angle.input is not None and not 0 <= angle.input < self.inputs:
-            raise OptionError(f"input {angle.input}: this circuit has inputs 0..{self.inputs - 1}")
+            raise CircuitError(f"input {angle.input}: this circuit has inputs 0..{self.inputs - 1}")
         if angle.scale is not None and angle.input is None:
-            raise OptionError("a scale needs an input to multiply")
+            raise CircuitError("a scale needs an input to multiply")
         for element in (angle.scale, angle.weight):
             if element is None:
                 continue
             parameter = self.parameters.get(element.parameter)
             if parameter is None or not 0 <= element.index < parameter.size:
-                raise OptionError(f"the angle uses {element}, which this circuit does not declare")
+                raise CircuitError(f"the angle uses {element}, which this circuit does not declare")
 
     def __iter__(self) -> Iterator[Operation]:
         return iter(self._operations)
