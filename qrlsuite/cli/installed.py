@@ -91,13 +91,17 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
         )
         timer = threading.Timer(PATIENCE, process.kill)
         timer.start()
-        with process:
+        try:
             for line in process.stdout or ():
                 answer = json.loads(line)
                 doing = answer.pop("doing", doing)
                 announce(doing)
                 answers |= answer
-        timer.cancel()
+            process.wait()
+        finally:  # Ctrl-C, or a line that is no answer
+            timer.cancel()
+            process.kill()
+            process.communicate()
         errors.seek(0)
         said = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
     failed = [
