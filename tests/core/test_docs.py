@@ -107,6 +107,12 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
         resolve(named["--task"], named["--model"], named.get("--algorithm"), settings, named.get("--preset"))
 
 
+def test_every_command_is_documented() -> None:
+    text = "\n".join(page.read_text() for page in PAGES)
+    missing = [name for name in application()[0].commands if not re.search(rf"\bqrlsuite {name}\b", text)]
+    assert not missing
+
+
 def every_option() -> set[str]:
     """Return the options of all commands."""
     waiting, found = [application()[0]], {"--help"}
