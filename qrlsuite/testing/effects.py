@@ -1,0 +1,192 @@
+"""Whether what sets an angle of a circuit changes any expectation value, and why not.
+
+A scalar need not have an effect: RZ on a qubit in 0, or right before the measurement of Z, changes no expectation
+value. In the first and last layers of a circuit that repeats one pattern this is usual (the last RZ of Skolik, Jerbi
+& Dunjko, Quantum 6, 720, 2022, for one), and it breaks no rule. What follows is never the price of a pattern:
+
+- no expectation value depends on an input feature, at some size: the agent cannot see it;
+- none depends on any scalar of a parameter, at some size: the whole parameter is trained for nothing;
+- none depends on a scalar that is used in the middle third of a circuit with three layers per qubit. As many layers
+  as there are qubits lie on either side of that third: enough for a chain of gates between neighbors to carry an
+  effect from any qubit to any other.
+
+Effects are found by gradients at random points, and their likely cause by gradients of the same circuit begun in a
+random entangled state, or measured in a random basis.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from qrlsuite import registry
+from qrlsuite.circuit import Circuit, Parameter, create_backend
+from qrlsuite.testing.findings import BrokenRuleError, require
+
+POINTS = 4
+"""Random points at which a gradient is taken."""
+
+ZERO = 1e-9
+"""Gradients below this are zero: rounding in float64 leaves some 1e-15, effects are above 1e-4 at these sizes."""
+
+Scalar = tuple[str, int]
+"""A trainable scalar: its parameter's name, and its index in the flattened (C order) array."""
+
+_START = (
+    "it acts on the starting state without effect, as gates about Z do on a qubit in 0, gates about X after H, and "
+    "gates controlled by a qubit in 0; put RY before it"
+)
+_END = (
+    "nothing after it makes a difference of it: gates about Z (RZ, CZ, RZZ) right before Z is measured change nothing, "
+    "nor do gates on a qubit that meets no measured one afterwards; put RX or RY after it, or leave it out there"
+)
+_BOTH = (
+    "neither what comes before nor what comes after lets it matter, as where every gate is about Z; put RY before "
+    "it and after it"
+)
+_CANCELS = "it cancels within the circuit, as RZ(w), X, RZ(w) does; leave it out"
+
+
+def sample(circuit: Circuit, seeds: int = 1) -> tuple[Any, dict[str, Any], Any]:
+    """Return inputs (seeds, 2, in) and parameters (seeds, ...), leaves of float64, and a cotangent (seeds, 2, out)."""
+    import torch
+
+    source = torch.Generator().manual_seed(0)
+    x = torch.rand(seeds, 2, circuit.inputs, generator=source, dtype=torch.float64) * 2 - 1
+    weights = {
+        name: 2 * math.pi * torch.rand(seeds, *p.shape, generator=source, dtype=torch.float64)
+        for name, p in circuit.parameters.items()
+    }
+    cotangent = torch.rand(seeds, 2, len(circuit.observables), generator=source, dtype=torch.float64) + 0.5
+    return x.requires_grad_(), {name: w.requires_grad_() for name, w in weights.items()}, cotangent
+
+
+def size(qubits: int, layers: int) -> str:
+    """Say how large a circuit is: `1 qubit, 2 layers`."""
+    return f"{qubits} qubit{'s' * (qubits > 1)}, {layers} layer{'s' * (layers > 1)}"
+
+
+def used_inputs(circuit: Circuit) -> set[int]:
+    """Return the input features that set an angle."""
+    return {angle.input for op in circuit.operations for angle in op.angles if angle.input is not None}
+
+
+def uses(circuit: Circuit) -> dict[Scalar, list[int]]:
+    """Return at which operations each trainable scalar sets an angle."""
+    places: dict[Scalar, list[int]] = {}
+    for place, op in enumerate(circuit.operations):
+        for angle in op.angles:
+            for element in (angle.scale, angle.weight):
+                if element is not None:
+                    places.setdefault((element.parameter, element.index), []).append(place)
+    return places
+
+
+def written(parameter: Parameter, index: int) -> str:
+    """Return a scalar as an author writes it: `weights[1, 2]`."""
+    return f"{parameter.name}{[int(i) for i in np.unravel_index(index, parameter.shape)]}"
+
+
+def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
+    """Return the input features, and the trainable scalars, that change an expectation value."""
+    names = registry.load().names("circuit_backends")
+    require(
+        bool(names), "no circuit backend is installed: install qrlsuite again, some are among its plugins"
+    )
+    x, parameters, cotangent = sample(circuit, POINTS)
+    values = create_backend("native" if "native" in names else names[0], circuit)(x, parameters)
+    if values.requires_grad:
+        values.backward(cotangent)
+
+    def felt(leaf: Any) -> list[int]:
+        if leaf.grad is None:
+            return []
+        rows = leaf.grad.flatten(0, 1) if leaf is x else leaf.grad
+        return [int(i) for i in (rows.abs() > ZERO).any(0).flatten().nonzero()]
+
+    return set(felt(x)), {(name, i) for name, leaf in parameters.items() for i in felt(leaf)}
+
+
+def require_inputs_and_parameters(circuit: Circuit, where: str) -> None:
+    """Require that every used input feature, and some scalar of every used parameter, has an effect."""
+    used = uses(circuit)
+    inputs, scalars = effective(circuit)
+    for feature in sorted(used_inputs(circuit) - inputs):
+        raise BrokenRuleError(
+            f"{where}: input {feature} sets an angle, and no expectation value depends on it, so the agent cannot "
+            f"see it: {cause(circuit, feature)}"
+        )
+    for name, parameter in circuit.parameters.items():
+        mine = [scalar for scalar in used if scalar[0] == name]
+        if mine and scalars.isdisjoint(mine):
+            raise BrokenRuleError(
+                f"{where}: no expectation value depends on any element of '{name}' of shape {parameter.shape}, so it "
+                f"is trained for nothing: {cause(circuit, mine[0])}; or refuse this size with OptionError"
+            )
+
+
+def require_middle(circuit: Circuit, where: str) -> None:
+    """Require that every trainable scalar that is used in the middle third of the gates has an effect."""
+    _, scalars = effective(circuit)
+    third = len(circuit) // 3
+    idle = [
+        scalar
+        for scalar, places in uses(circuit).items()
+        if scalar not in scalars and any(third <= place < len(circuit) - third for place in places)
+    ]
+    for name, index in idle[:1]:
+        parameter = circuit.parameters[name]
+        others = f", nor on {len(idle) - 1} more there" if len(idle) > 1 else ""
+        raise BrokenRuleError(
+            f"{where}: no expectation value depends on {written(parameter, index)} of shape {parameter.shape}, which "
+            f"is used in the middle of the circuit{others}; it is trained for nothing: {cause(circuit, (name, index))}"
+        )
+
+
+def cause(circuit: Circuit, what: int | Scalar) -> str:
+    """Say why an input feature or a trainable scalar has no effect."""
+    for before, after, why in ((True, False, _START), (False, True, _END), (True, True, _BOTH)):
+        inputs, scalars = effective(_between(circuit, before, after))
+        if what in inputs or what in scalars:
+            return why
+    return _CANCELS
+
+
+def _between(circuit: Circuit, before: bool, after: bool) -> Circuit:
+    """Return the circuit begun in a random entangled state, or measured in a random basis, or both."""
+    made = Circuit(circuit.qubits, circuit.inputs)
+    for p in circuit.parameters.values():
+        made.parameter(p.name, p.shape, p.low, p.high)
+    draw = np.random.default_rng(0)
+
+    def scramble() -> None:
+        for _ in range(2):
+            for q in range(circuit.qubits):
+                made.append("U3", q, *draw.uniform(0.5, 2.5, 3))
+            for q in range(circuit.qubits - 1):
+                made.append("CNOT", (q, q + 1))
+
+    if before:
+        scramble()
+    for op in circuit.operations:
+        made.append(op.gate, op.wires, *op.angles, control=op.control)
+    if after:
+        scramble()
+    else:
+        made.measure(circuit.observables)
+    return made
+
+
+def idle_at_the_ends(circuit: Circuit, where: str) -> str:
+    """Name the trainable scalars without effect; `""` where there are none."""
+    _, scalars = effective(circuit)
+    idle = [scalar for scalar in uses(circuit) if scalar not in scalars]
+    if not idle:
+        return ""
+    named = ", ".join(written(circuit.parameters[name], index) for name, index in idle[:3])
+    return (
+        f"; at the ends of the circuit {len(idle)} of {circuit.parameter_count} scalars do not ({where}: {named}"
+        f"{', ...' * (len(idle) > 3)})"
+    )
