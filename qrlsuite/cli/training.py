@@ -135,6 +135,7 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
     QrlSuiteError
         If a group failed; finished epochs are kept.
     """
+    from qrlsuite.cli.terminal import printable
     from qrlsuite.engine import api
     from qrlsuite.store import EntryStore
 
@@ -152,10 +153,10 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
     finally:
         display.close()
     for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
-        display.console.print(f"warning: {message}", markup=False, soft_wrap=True)
+        display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
     api.raise_failures(outcome)
     for message in outcome.taken.values():
-        display.console.print(f"left out: {message}", markup=False)
+        display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
     return outcome
 
 

@@ -202,11 +202,15 @@ CLEAN = r"\x1b[2J[bold]red[/bold]:warning: \u202e \udc9b"
 HOSTILE = f'''
 import typer
 from qrlsuite import hookimpl
-from qrlsuite.specs import EngineSpec
+from qrlsuite.specs import EngineSpec, TrackerSpec
 
 @hookimpl
 def register_engines(register):
     register(EngineSpec("evil", "{DIRT}", "evil:engine"))
+
+@hookimpl
+def register_trackers(register):
+    register(TrackerSpec("evil-eye", "Watches", "evil:engine"))
 
 @hookimpl
 def register_commands(app):
@@ -268,6 +272,31 @@ def test_check_shows_a_hostile_plugin_as_it_is(hostile: Path) -> None:
     assert "\x1b[1m" in terminal.stdout, "it believes to write to a terminal"
     assert "\x1b[2J" not in terminal.stdout
     assert f"RuntimeError: first {CLEAN}" in terminal.stdout
+
+
+def test_a_hostile_tracker_controls_no_terminal_during_a_run(
+    hostile: Path, tiny_task: str, tmp_path: Path
+) -> None:
+    words = [
+        "run",
+        "--task",
+        tiny_task,
+        "--model",
+        "mlp",
+        "--set",
+        "width=16",
+        "--seeds",
+        "1",
+        "--epochs",
+        "1",
+    ]
+    done = suite(hostile, *words, "--track", "evil-eye", "--runs", str(tmp_path / "runs"))
+    assert done.returncode == 0, done.stderr
+    assert_harmless(done)
+    assert (
+        f"warning: tracker 'evil-eye' failed in its factory and is left out: RuntimeError: first {CLEAN}"
+        in done.stderr
+    )
 
 
 COMMANDS = """
