@@ -76,7 +76,7 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
     Returns
     -------
     tuple
-        What `qrlsuite.cli.probe` found, by step; and what failed, one line each.
+        What `qrlsuite.cli.probe` found, by step; and what failed, one line for each cause.
     """
     names = [requirement.name.lower().replace("-", "_") for requirement in requirements()]
     modules = [name for name in names if importlib.util.find_spec(name) is not None]
@@ -104,11 +104,11 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
             process.communicate()
         errors.seek(0)
         said = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
-    failed = [
-        f"{step}: {answer['error']}"
-        for step, answer in answers.items()
-        if isinstance(answer, dict) and "error" in answer
-    ]
+    causes: dict[str, list[str]] = {}
+    for step, answer in answers.items():
+        if isinstance(answer, dict) and "error" in answer:
+            causes.setdefault(answer["error"], []).append(step)
+    failed = [f"{', '.join(steps)}: {error}" for error, steps in causes.items()]
     if process.returncode:
         failed.append(f"{doing}: the process ended with code {process.returncode}: {said}")
     return answers, failed

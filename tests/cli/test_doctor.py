@@ -89,7 +89,7 @@ def test_what_is_broken_is_said_with_what_to_type(tmp_path: Path) -> None:
         "is not supported: qrlsuite needs >=3.99",
         "no-such-package is not installed: pip install 'no-such-package>=1'",
         "is installed, and does not fit: pip install 'numpy<1'",
-        r"import torch: ImportError: libtorch.so: \x1b[31mno such file",
+        r"import torch, torch, simulator: ImportError: libtorch.so: \x1b[31mno such file",
         "runs cannot be written and locked: Not a directory; use --runs DIR",
     ):
         assert sum(expected in line for line in broken) == 1, (expected, broken)
