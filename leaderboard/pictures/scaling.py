@@ -183,7 +183,7 @@ def _draw_panel(
     style.tidy(axes)
     axes.set_title(f"{words}: {_seeds(panel)}", fontsize=9, loc="left")
     if cell == (0, 0):
-        axes.legend(frameon=False, fontsize=7.5)
+        axes.legend(facecolor="white", edgecolor="none", framealpha=0.9, fontsize=7.5)
 
 
 def _seeds(panel: _Panel) -> str:
