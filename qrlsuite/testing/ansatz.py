@@ -74,7 +74,7 @@ def _builds(build: Any, given: Any, circuits: Circuits) -> None:
         )
         require(
             circuit.qubits == qubits,
-            f"asked for {qubits} qubits, the circuit has {circuit.qubits}: write Circuit(qubits)",
+            f"with qubits = {qubits} the circuit has {circuit.qubits}: write Circuit(qubits)",
         )
         require(bool(circuit.operations), f"{where}: the circuit has no gate; append some before `return`")
         if qubits != LARGEST:

@@ -98,7 +98,7 @@ def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
     x, parameters, cotangent = sample(circuit, POINTS)
     values = create_backend("native" if "native" in names else names[0], circuit)(x, parameters)
     if values.requires_grad:
-        values.backward(cotangent)
+        values.backward(cotangent)  # type: ignore[no-untyped-call]
 
     def felt(leaf: Any) -> list[int]:
         if leaf.grad is None:
