@@ -3,6 +3,9 @@
 The test beside this file does it a few times. By hand, at large, with figures:
 
     python -m tests.engine.stress --kills 200 --epochs 150
+
+It prints the kills of supervisors and of workers, how many of the workers had begun to train, and how many epochs
+were trained again.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from qrlsuite.store import EntryStore
+from qrlsuite.claims import claims
+from qrlsuite.store import EntryStore, read_lines
 from tests.conftest import TINY, results
 
 
@@ -38,6 +42,16 @@ def children(pid: int) -> list[int]:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except OSError:
         return []
+
+
+def training(runs: Path) -> set[int]:
+    """Return the processes that hold a claim."""
+    return {claim.pid for path in runs.glob("tiny/*/entry.json") for claim in claims(EntryStore(path.parent))}
+
+
+def trained_again(entry: Path, seeds: int, epochs: int) -> int:
+    """Count the epochs that were lost and trained again: timings keep a line of every one."""
+    return sum(len(read_lines(EntryStore(entry).seed(seed).timings)) - epochs for seed in range(seeds))
 
 
 def finished(runs: Path, seeds: int, epochs: int) -> Path | None:
@@ -79,6 +93,7 @@ def disturbed(
                 victims = [run.pid]
             victim = dice.choice(victims)
             if run.poll() is None:
+                killed["at work"] += victim in training(runs)
                 os.kill(victim, signal.SIGKILL)
                 killed["supervisor" if victim == run.pid else "worker"] += 1
         run.wait()
@@ -123,7 +138,8 @@ def main() -> None:
                 given.pause,
             )
             compare(straight, entry, given.seeds, given.epochs)
-            total += killed + Counter(runs=1)
+            again = trained_again(entry, given.seeds, given.epochs)
+            total += killed + Counter({"runs": 1, "epochs trained again": again})
             print(json.dumps({**total, "seconds": round(time.monotonic() - began)}), flush=True)
 
 
