@@ -136,6 +136,11 @@ def resolve(
             {**defaults, **file.algorithm_options},
             file.model_options,
         )
+    model_options = options.build(
+        sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
+    )
+    if hasattr(model_options, "check"):
+        model_options.check()
     return Entry(
         task=task,
         algorithm=algorithm,
@@ -143,9 +148,7 @@ def resolve(
         algorithm_options=options.build(
             sides["algorithm"], {**defaults, **values["algorithm"]}, f"algorithm '{algorithm.name}'"
         ),
-        model_options=options.build(
-            sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
-        ),
+        model_options=model_options,
         preset=chosen,
         tuning=None if file is None or chosen is None else presets.record_of(file, chosen, values),
     )

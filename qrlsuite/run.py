@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from qrlsuite import checkpoint, options, population, provenance, registry, specs, store
+from qrlsuite.device import find as find_device
 from qrlsuite.entry import Entry
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, StoreError
@@ -136,9 +137,14 @@ class GroupRun:
     epochs:
         The epoch at which to stop.
     device:
-        Where the populations live.
+        Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:
         Called after every round with the group's progress.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the entry cannot be built, or there is no such device.
     """
 
     def __init__(
@@ -153,6 +159,7 @@ class GroupRun:
         torch.set_num_threads(1)
         self.entry, self.store, self.seeds, self.epochs = entry, entry_store, list(seeds), epochs
         self.report, self.device = report, device
+        where = find_device(device)
         self.progress = Progress(epochs=epochs)
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
         protocol = entry.task.file.protocol
@@ -163,13 +170,11 @@ class GroupRun:
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
         self.statistics: RunningStatistics | None = None
         if self.envs.inner.running_statistics:
-            self.statistics = RunningStatistics(self.S, self.E, size, torch.device(device))
+            self.statistics = RunningStatistics(self.S, self.E, size, where)
             self.envs.observe = self.statistics.observe
         self.models = ModelBuilder(entry, size, self.streams, self.statistics)
         factory = specs.resolve(entry.algorithm.factory)
-        self.algorithm = factory(
-            self.envs, self.models, entry.algorithm_options, self.streams, torch.device(device)
-        )
+        self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, where)
         self.epoch = 0
         self.events = EventSink(registry.load(), asked())
         self.progress.warnings = self.events.problems

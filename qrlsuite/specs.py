@@ -122,7 +122,8 @@ class ModelSpec(Spec):
     family:
         `"classical"` or `"quantum"`; selects family-dependent presets of a task.
     options:
-        Reference to a pydantic dataclass.
+        Reference to a pydantic dataclass. If it has a method `check()`, that is called on options that were
+        typed, and may refuse them (`OptionError`) before anything is trained.
     build:
         Reference to `build(obs_dim, out_dim, options, generator) -> torch.nn.Module`, an ordinary
         single-agent module (B, obs_dim) -> (B, out_dim), every random number drawn from `generator`

@@ -56,6 +56,16 @@ class VQCOptions:
         Literal["float32", "float64"], Field(description="precision of parameters and circuit values")
     ] = "float32"
 
+    def check(self) -> None:
+        """Build the circuit once, so that one that cannot be built is refused before anything is trained.
+
+        Raises
+        ------
+        UnknownNameError, OptionError
+            If there is no such ansatz, or it has no such size or option.
+        """
+        build_circuit(self)
+
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PennyLaneOptions(PennyLaneBackendOptions, VQCOptions):

@@ -42,7 +42,7 @@ TrackOption = Annotated[
         help="Watch with a tracker (see `qrlsuite list trackers`): --track tensorboard, --track tensorboard=DIR.",
     ),
 ]
-DeviceOption = Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda.")]
+DeviceOption = Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda or cuda:1.")]
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,14 @@ def place(
     Raises
     ------
     UnknownNameError, OptionError, QrlSuiteError
-        If there is no such engine, it has no such option or value, or a package is not installed.
+        If there is no such engine, it has no such option or value, a package is not installed, or there can be
+        no such device.
     """
+    from qrlsuite import device as devices
     from qrlsuite import options
     from qrlsuite.engine import api
 
+    devices.check(device)  # whether it is there is seen where the work is done
     given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
     built = api.create(engine, {"partition": partition, "time": time, **given})
     return Place(built, built.workers(workers), device)
