@@ -80,7 +80,9 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
     """
     known = field_names(cls)
     problems = [
-        f"{where} has no option '{name}'{nearest(name, known)}" for name in values if name not in known
+        f"{where} has no option '{name}'{nearest(name, known) if known else ': it has none'}"
+        for name in values
+        if name not in known
     ]
     try:
         result = pydantic.TypeAdapter(cls).validate_python({k: v for k, v in values.items() if k in known})

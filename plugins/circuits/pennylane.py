@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pennylane as qml
 import torch
+from pennylane.exceptions import DeviceError, QuantumFunctionError
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -125,12 +126,20 @@ class PennyLaneBackend:
             Number of lanes, needed where no angle is variable.
         seed:
             Seed of the device's sampling; None draws fresh entropy.
+
+        Raises
+        ------
+        OptionError
+            If the device finds only now that it cannot run the circuit.
         """
         qnode = self._qnode
         if self.shots is not None and "seed" in self._device_arguments():
             qnode = self._build(_device(self.options, self.circuit.qubits, _entropy(seed)))
-        with _float64():
-            values = [torch.as_tensor(value).to(angles.dtype) for value in qnode(angles)]
+        try:
+            with _float64():
+                values = [torch.as_tensor(value).to(angles.dtype) for value in qnode(angles)]
+        except (DeviceError, QuantumFunctionError) as error:
+            raise self._refusal(error) from error
         return torch.stack([value.expand(lanes) for value in values], dim=1)
 
     def _pass(self, angles: Tensor) -> Tensor:
@@ -183,11 +192,14 @@ class PennyLaneBackend:
             qnode = self._build(self._device)
             qml.workflow.construct_batch(qnode, level="device")(angles)
         except Exception as error:
-            raise OptionError(
-                f"device = {self.options.device!r} with diff_method = {self.diff_method!r} cannot run this "
-                f"circuit: {_one_line(error)}"
-            ) from error
+            raise self._refusal(error) from error
         return qnode
+
+    def _refusal(self, error: Exception) -> OptionError:
+        return OptionError(
+            f"device = {self.options.device!r} with diff_method = {self.diff_method!r} cannot run this circuit: "
+            f"{_one_line(error)}"
+        )
 
 
 class _Shift(torch.autograd.Function):

@@ -56,19 +56,9 @@ def reference(name, gate, qubits):
     return circuit, given, evaluate(create_backend("pennylane", circuit), *given)
 
 
-CONFORMANCE = [
-    (backend, name, gate, qubits)
-    for backend in BACKENDS
-    for name, gate in VARIANTS
-    for qubits in (2, 3, 5)
-    # Slow backends take seconds beyond two qubits.
-    if backend not in SLOW or qubits == 2 or (name, gate, qubits) == ("iqp", "u3", 3)
-]
-
-
-@pytest.mark.parametrize(
-    ("backend", "name", "gate", "qubits"), [c for c in CONFORMANCE if c[0] != "pennylane"]
-)
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "pennylane"])
+@pytest.mark.parametrize(("name", "gate"), VARIANTS)
+@pytest.mark.parametrize("qubits", [2, 3, 5])
 def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate, qubits):
     circuit, given, expected = reference(name, gate, qubits)
     got = evaluate(create_backend(backend, circuit), *given)
@@ -431,6 +421,20 @@ def test_options_that_cannot_be_used_say_what_to_type(backend, options, message)
     with pytest.raises(OptionError, match=message) as caught:
         create_backend(backend, ansatz("cz", 2, 1), **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:Operator")  # PennyLane's, of gates that it cannot decompose
+@pytest.mark.parametrize("device", ["default.gaussian", "default.qutrit"])
+def test_a_device_that_refuses_a_circuit_when_it_runs_says_so(device):
+    circuit = Circuit(1)
+    circuit.append("Rot", 0, 0.1, 0.2, 0.3)
+    with pytest.raises(OptionError, match=f"'{device}'.* cannot run this circuit"):
+        expectations(circuit, [[0.0]], {}, backend="pennylane", device=device)
+
+
+def test_a_backend_without_options_says_that_it_has_none():
+    with pytest.raises(OptionError, match="'native' has no option 'shots': it has none"):
+        create_backend("native", ansatz("cz", 2, 1), shots=10)
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,25 @@ def test_other_devices_in_float64(name, device):
     assert largest_error(SMALL[name], torch.float64, backend="pennylane", device=device) < 1e-10
 
 
+@pytest.mark.parametrize("name", sorted(set(CASES) - set(SMALL)))
+def test_qiskit_on_four_qubits(name):
+    """All values, and the gradients by one input's features: a whole batch's take a minute in Qiskit."""
+    case = CASES[name]
+    circuit = ansatz(case["structure"], case["qubits"], case["layers"], gate=case["gate"])
+    given = {key: torch.tensor(case[key], dtype=torch.float64) for key in ("inputs", "scaling", "weights")}
+    inputs = given.pop("inputs").requires_grad_()
+    with torch.no_grad():
+        values = expectations(circuit, inputs, given, backend="qiskit")
+    expected = torch.tensor(case["expval_z"], dtype=torch.float64)
+    assert float((values - expected).abs().max()) < 1e-10
+    expectations(circuit, inputs[:1], given, backend="qiskit").backward(
+        torch.tensor(case["cotangent"][:1], dtype=torch.float64)
+    )
+    expected = torch.tensor(case["grad_inputs"][0], dtype=torch.float64)
+    assert float((inputs.grad[0] - expected).abs().max()) < 1e-10
+    assert float(inputs.grad[1:].abs().max()) == 0
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_qiskit(name):
     assert largest_error(SMALL[name], torch.float64, backend="qiskit") < 1e-10
