@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from qrlsuite import options, registry, specs
+from qrlsuite.errors import QrlSuiteError
 from qrlsuite.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 
 LONGEST = 20_000
+"""Steps within which an episode must end."""
+EPISODES = 10
+"""How many are looked at, within `LONGEST` steps."""
 
 
 def check(subject: Subject) -> list[Finding]:
-    """Check a task's file, and one validation episode of random actions in each of two lanes."""
+    """Check a task's file, and some episodes of random actions."""
     spec = subject.spec
     assert isinstance(spec, specs.TaskSpec)
     rules = Checklist()
     made: list[Task] = []
-    rules.run("file", "an absolute path, to a file that is there", lambda: _file(spec))
-    if not rules.run("format", "valid, with an environment that exists", lambda: made.append(_parse(spec))):
+    if not rules.run("file", "an absolute path, to a file that is there", lambda: _file(spec)):
+        return rules.findings
+    cause = "values are hashed as JSON, which has neither nan nor infinity"
+    if not rules.run(
+        "format", "valid, with an environment that exists", lambda: made.append(_parse(spec)), cause
+    ):
         return rules.findings
     task = made[0]
     rules.run("says what is registered", "name and summary are the file's", lambda: _names(spec, task))
-    rules.run("identity", "plain values, the same hash every time", lambda: _identity(spec, task))
+    rules.run("identity", "the same hash every time", lambda: _identity(spec, task))
     rules.run("algorithms", "the default one and those with presets exist", lambda: _algorithms(task))
-    rules.run("ranking", "horizons hold an epoch or more", lambda: _ranking(task))
-    rules.run("scores", "an episode ends with a score, in [0, 1] where it is relative", lambda: _scores(task))
+    rules.run("ranking", "horizons are whole epochs, within a complete run", lambda: _ranking(task))
+    rules.run("scores", "episodes end with a score, in [0, 1] where it is relative", lambda: _scores(task))
     return rules.findings
 
 
@@ -44,8 +54,23 @@ def _file(spec: specs.TaskSpec) -> None:
     )
 
 
+@contextlib.contextmanager
+def _in_its_words() -> Iterator[None]:
+    """Let the suite's own errors say what is broken: they name the place and the remedy."""
+    try:
+        yield
+    except QrlSuiteError as error:
+        raise BrokenRuleError(str(error)) from error
+
+
 def _parse(spec: specs.TaskSpec) -> Task:
-    return parse(Path(spec.path).read_text(encoding="utf-8"), Path(spec.path).name)
+    path = Path(spec.path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise BrokenRuleError(f"{path.name} is not text in UTF-8, as TOML is: {error}") from error
+    with _in_its_words():
+        return parse(text, path.name)
 
 
 def _names(spec: specs.TaskSpec, task: Task) -> None:
@@ -61,60 +86,91 @@ def _names(spec: specs.TaskSpec, task: Task) -> None:
 
 
 def _identity(spec: specs.TaskSpec, task: Task) -> None:
-    json.dumps(task.definition, allow_nan=False)
     require(
         _parse(spec).hash == task.hash,
-        "read twice, the task has two hashes: do its options hold plain values?",
+        "read twice, the task has two hashes, under which results are kept: does an option of its environment take its "
+        "default from a clock, a counter or a random number?",
     )
 
 
 def _algorithms(task: Task) -> None:
-    registry.algorithm(task.file.default_algorithm)
+    _algorithm("default_algorithm", task.file.default_algorithm)
+    for name in task.file.protocol.algorithm_epochs:
+        _algorithm("protocol.algorithm_epochs", name)
     for preset, by_algorithm in task.file.presets.items():
         for name, families in by_algorithm.items():
-            where = f"[presets.{preset}.{name}]"
-            try:
-                cls = specs.resolve(registry.algorithm(name).options)
-                for family in ("classical", "quantum"):
-                    options.build(cls, {**families.get("all", {}), **families.get(family, {})}, where)
-            except Exception as error:
-                raise BrokenRuleError(f"{where} cannot be used: {error}") from error
+            for family in ("classical", "quantum"):
+                values = {**families.get("all", {}), **families.get(family, {})}
+                _algorithm(f"[presets.{preset}.{name}]", name, values)
+
+
+def _algorithm(where: str, name: str, values: Mapping[str, Any] | None = None) -> None:
+    """Require that an algorithm exists and takes values of options; `where` the file says so."""
+    try:
+        spec = registry.algorithm(name)
+        if values is not None:
+            options.build(specs.resolve(spec.options), values, f"algorithm '{name}'")
+    except QrlSuiteError as error:
+        raise BrokenRuleError(f"{where}: {error}") from error
 
 
 def _ranking(task: Task) -> None:
-    epoch, horizon = task.file.protocol.interactions, min(task.file.ranking.horizons)
-    require(
-        horizon >= epoch,
-        f"the horizon {horizon} is shorter than an epoch of {epoch} interactions: nothing could be told apart",
-    )
+    protocol = task.file.protocol
+    epoch = protocol.interactions
+    complete = max(protocol.epochs, *protocol.algorithm_epochs.values(), 0) * epoch
+    for horizon in task.file.ranking.horizons:
+        require(
+            horizon >= epoch,
+            f"the horizon {horizon} is shorter than an epoch of {epoch} interactions: nothing could be told apart",
+        )
+        require(
+            horizon % epoch == 0,
+            f"the horizon {horizon} is not a whole number of epochs of {epoch} interactions, so no curve can be cut "
+            f"there: take {horizon - horizon % epoch}",
+        )
+        require(
+            horizon <= complete,
+            f"the horizon {horizon} lies beyond a complete run, {complete} interactions: no entry would reach it; "
+            "raise protocol.epochs, or protocol.algorithm_epochs of one algorithm",
+        )
 
 
 def _scores(task: Task) -> None:
     from qrlsuite.entry import Entry
     from qrlsuite.run import build_envs
 
-    algorithm = registry.algorithm(task.file.default_algorithm)
-    known = registry.load().entries["models"]
-    model = next(entry.spec for entry in known.values())
+    known = registry.load().entries
+    algorithm, model = (
+        next(entry.spec for entry in known[kind].values()) for kind in ("algorithms", "models")
+    )
+    assert isinstance(algorithm, specs.AlgorithmSpec)
     assert isinstance(model, specs.ModelSpec)
-    envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
-    envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
-    envs.reset()
     choose = np.random.Generator(np.random.Philox(key=9))
-    choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
-    for _ in range(LONGEST):
-        envs.step(choose.integers(choices, size=2))
-        _, returns, scores = envs.take_finished()
-        if scores.size == 0:
-            continue
-        if task.file.ranking.epsilons is not None:
-            require(
-                bool(np.isfinite(scores).all() and (scores >= 0).all() and (scores <= 1 + 1e-9).all()),
-                f"an episode of random actions has the return {returns[0]:.6g} and the score {scores[0]:.6g}, outside "
-                "[0, 1]: is max_return the best possible return, and no return negative? Else rank on thresholds",
-            )
-        require(bool(np.isfinite(scores).all()), f"an episode of random actions has the score {scores[0]}")
-        return
-    raise BrokenRuleError(
-        f"no episode ended within {LONGEST} steps of random actions: the task needs a time limit"
+    ended = 0
+    with _in_its_words():
+        envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
+        envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
+        envs.reset()
+        choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+        for _ in range(LONGEST):
+            envs.step(choose.integers(choices, size=2))
+            _, returns, scores = envs.take_finished()
+            for value, score in zip(returns, scores):
+                _score(task, float(value), float(score))
+            ended += scores.size
+            if ended >= EPISODES:
+                return
+    require(
+        ended > 0, f"no episode ended within {LONGEST} steps of random actions: the task needs a time limit"
+    )
+
+
+def _score(task: Task, value: float, score: float) -> None:
+    """Require that one episode's score is usable; `value` is its return."""
+    said = f"an episode of random actions has the return {value:.6g} and the score {score:.6g}"
+    require(bool(np.isfinite(score)), f"{said}: does the environment give rewards that are nan or infinite?")
+    require(
+        task.file.ranking.epsilons is None or 0 <= score <= 1 + 1e-9,
+        f"{said}, outside [0, 1]: is max_return the best possible return, and no return negative? Else rank on "
+        "thresholds",
     )
