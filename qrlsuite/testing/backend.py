@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -12,11 +13,15 @@ from torch import Tensor
 
 from qrlsuite import specs
 from qrlsuite.circuit import GATES, Circuit
+from qrlsuite.testing.circuits import every_gate, one_gate, small
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.dense import expectation_values
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 
 S, B, SHOTS = 5, 2, 200
+
+SEEDS = (1, 2**31 + 1, 2**40 + 7, 2**62 + 1, 2**63 - 1)
+"""One per agent: runs draw them from all of 0 to 2^63 - 1."""
 
 
 def check(subject: Subject) -> list[Finding]:
@@ -33,9 +38,12 @@ def check(subject: Subject) -> list[Finding]:
         return rules.findings
     run = made[0]
     with one_thread():
-        if not rules.run(
-            "shapes", "(S, B, observables) in float32 and float64", lambda: _shapes(run, circuit)
-        ):
+        cause = (
+            "it is called with inputs (S, B, in), a dict of parameters (S, ...), and seeds: None, or S integers "
+            "from 0 to 2^63 - 1, which numpy.random.default_rng and torch.Generator take"
+        )
+        shapes = "(S, B, observables) in float32 and float64, for one agent, input or observable too"
+        if not rules.run("shapes", shapes, lambda: _shapes(factory, run, circuit, given), cause):
             return rules.findings
         if run.shots is None:
             rules.run("values", "equal to dense matrices within 1e-6", lambda: _values(factory, given))
@@ -46,73 +54,40 @@ def check(subject: Subject) -> list[Finding]:
                 "alone, in pairs, shuffled: the same bits in values and gradients",
                 lambda: _independence(run, circuit, None),
             )
-        cls = specs.resolve(spec.options)
-        if "shots" in cls.__dataclass_fields__:
-            sampled = factory(small(), cls(**{**subject.settings, "shots": SHOTS}))
+        if run.shots is not None or "shots" in specs.resolve(spec.options).__dataclass_fields__:
             rules.run(
-                "shots", "sampling of a seed depends on that seed alone", lambda: _shots(sampled, small())
+                "shots",
+                "near the exact values, and the sampling of a seed depends on that seed alone",
+                lambda: _shots(subject, factory, run.shots),
+                cause,
             )
     return rules.findings
 
 
-def every_gate() -> Circuit:
-    """Return a circuit of three qubits with every gate, controlled ones too, and angles of every form."""
-    circuit = Circuit(3, inputs=2)
-    scale = circuit.parameter("scale", (2, 3))
-    weight = circuit.parameter("weight", (12,))
-    for q in range(3):
-        circuit.append("H", q)
-    circuit.append("RX", 0, scale[0, 0] * circuit.input(0) + weight[0])
-    circuit.append("RY", 1, circuit.input(1) + 0.3)
-    circuit.append("RZ", 2, weight[1])
-    circuit.append("CNOT", (0, 1))
-    angles = [scale[0, k] * circuit.input(1) + weight[2 + k] for k in (1, 2)]
-    circuit.append("Rot", 1, weight[9], *angles)
-    circuit.append("U3", 2, scale[1, 0] * circuit.input(0) + weight[5], weight[6], 0.7)
-    circuit.append("CZ", (1, 2))
-    circuit.append("SWAP", (0, 2))
-    for gate in ("S", "T", "X", "Y", "Z"):
-        circuit.append(gate, 1)
-    circuit.append("RX", 1, weight[7], control=0)
-    circuit.append("RY", 2, scale[1, 1] * circuit.input(0), control=1)
-    circuit.append("RZ", 0, scale[1, 2] * circuit.input(1) + weight[8], control=2)
-    circuit.append("Rot", 0, weight[10], 0.4, weight[11], control=1)
-    circuit.append("U3", 1, 0.2, weight[3], weight[4], control=2)
-    circuit.append("RX", 0, 0.9)
-    assert {operation.gate for operation in circuit.operations} == set(GATES)
-    circuit.measure((2, 0))
-    return circuit
-
-
-def small() -> Circuit:
-    """Return a circuit of two qubits, for what takes long."""
-    circuit = Circuit(2)
-    weights = circuit.parameter("weights", (2,))
-    for q in range(2):
-        circuit.append("RY", q, circuit.input(q) + weights[q])
-    circuit.append("CNOT", (0, 1))
-    return circuit
-
-
 def sample(
-    circuit: Circuit, seeds: int = S, dtype: torch.dtype = torch.float64
+    circuit: Circuit, seeds: int = S, batch: int = B, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Return inputs (S, B, in), parameters (S, ...) and a cotangent (S, B, out)."""
     source = torch.Generator().manual_seed(0)
-    x = torch.randn(seeds, B, circuit.inputs, generator=source, dtype=torch.float64)
+    x = torch.randn(seeds, batch, circuit.inputs, generator=source, dtype=torch.float64)
     weights = {
         name: (2 * math.pi * torch.rand(seeds, *p.shape, generator=source, dtype=torch.float64)).to(dtype)
         for name, p in circuit.parameters.items()
     }
-    cotangent = torch.randn(seeds, B, len(circuit.observables), generator=source, dtype=torch.float64)
+    cotangent = torch.randn(seeds, batch, len(circuit.observables), generator=source, dtype=torch.float64)
     return x.to(dtype), weights, cotangent.to(dtype)
 
 
 def evaluate(
-    run: Any, x: Tensor, weights: dict[str, Tensor], cotangent: Tensor, seeds: Sequence[int] | None = None
+    run: Any,
+    x: Tensor,
+    weights: dict[str, Tensor],
+    cotangent: Tensor,
+    seeds: Sequence[int] | None = None,
+    fixed_inputs: bool = False,
 ) -> dict[str, Tensor]:
-    """Return values, and the gradients by inputs and by every parameter."""
-    x = x.clone().requires_grad_()
+    """Return values, and the gradients by inputs (unless they are fixed) and by every parameter."""
+    x = x.clone().requires_grad_(not fixed_inputs)
     weights = {name: value.clone().requires_grad_() for name, value in weights.items()}
     values = run(x, weights, seeds)
     require(
@@ -121,7 +96,7 @@ def evaluate(
     )
     values.backward(cotangent)
     result = {"values": values.detach()}
-    for name, leaf in {"inputs": x, **weights}.items():
+    for name, leaf in {**({} if fixed_inputs else {"inputs": x}), **weights}.items():
         require(
             leaf.grad is not None,
             f"no gradient reaches {name}: is it detached, or turned into numpy, on the way?",
@@ -133,50 +108,108 @@ def evaluate(
 
 def _build(factory: Any, circuit: Circuit, given: Any) -> Any:
     run = factory(circuit, given)
-    require(callable(run), f"factory returned {type(run).__name__}, which cannot be called")
+    require(
+        callable(run),
+        f"factory returned {type(run).__name__}, which cannot be called: write __call__(self, inputs, parameters, "
+        "seeds=None), and is `return` there?",
+    )
     require(
         hasattr(run, "shots"), "the backend has no attribute 'shots': set it to None where values are exact"
+    )
+    shots = run.shots
+    require(
+        shots is None or (isinstance(shots, int) and shots > 0),
+        f"the backend's attribute shots is {shots!r}: a positive integer, or None where values are exact",
     )
     return run
 
 
-def _shapes(run: Any, circuit: Circuit) -> None:
+def _shapes(factory: Any, run: Any, circuit: Circuit, given: Any) -> None:
+    single = small()
+    single.measure([1])
+    alone = factory(single, given)
     for dtype in (torch.float32, torch.float64):
-        x, weights, _ = sample(circuit, dtype=dtype)
-        values = run(x, weights, list(range(S)))
-        expected = (S, B, len(circuit.observables))
-        require(
-            tuple(values.shape) == expected,
-            f"the result has shape {tuple(values.shape)}, and it must be (seeds, batch, observables) = {expected}",
-        )
-        require(
-            values.dtype == dtype,
-            f"inputs of {dtype} give a result of {values.dtype}: convert it, a learner's loss must stay in one type",
-        )
-        low, high = float(values.detach().min()), float(values.detach().max())
-        require(
-            max(-low, high) <= 1.0 + 1e-5,
-            f"values lie in [{low:.3g}, {high:.3g}], and Pauli Z lies in [-1, 1]: is the state normalized?",
-        )
+        _shape(run, circuit, S, 3, dtype)
+    for agents, batch in ((1, 1), (S, 1), (1, 3)):
+        _shape(run, circuit, agents, batch, torch.float32)
+        _shape(alone, single, agents, batch, torch.float32)
+
+
+def _shape(run: Any, circuit: Circuit, agents: int, batch: int, dtype: torch.dtype) -> None:
+    x, weights, _ = sample(circuit, agents, batch, dtype)
+    values = run(x, weights, SEEDS[:agents])
+    require(
+        isinstance(values, Tensor),
+        f"the result is {type(values).__name__}, not a tensor: compute in torch, or wrap the simulator in a "
+        "torch.autograd.Function",
+    )
+    expected = (agents, batch, len(circuit.observables))
+    require(
+        tuple(values.shape) == expected,
+        f"the result has shape {tuple(values.shape)}, and it must be (seeds, batch, observables) = {expected}: is an "
+        "axis squeezed or transposed, or is every qubit measured instead of circuit.observables?",
+    )
+    require(
+        values.dtype == dtype,
+        f"inputs of {dtype} give a result of {values.dtype}: end with .to(inputs), a learner's loss must stay in one "
+        "type",
+    )
+    low, high = float(values.detach().min()), float(values.detach().max())
+    require(
+        max(-low, high) <= 1.0 + 1e-5,
+        f"values lie in [{low:.3g}, {high:.3g}], and Pauli Z lies in [-1, 1]: is the state normalized?",
+    )
+
+
+def _dense(circuit: Circuit, x: Tensor, weights: dict[str, Tensor]) -> Tensor:
+    """Return the expectation values (S, B, out) by dense matrices."""
+    rows = []
+    for s, inputs in enumerate(x.numpy()):
+        mine = {name: value[s].numpy() for name, value in weights.items()}
+        rows.append([expectation_values(circuit, row, mine) for row in inputs])
+    return torch.from_numpy(np.array(rows))
+
+
+def _distance(factory: Any, circuit: Circuit, given: Any, reverse: bool = False) -> float:
+    """Return how far a backend's values are from those of dense matrices."""
+    x, weights, _ = sample(circuit, batch=3)
+    expected = _dense(circuit, x, weights)
+    got = factory(circuit, given)(x, weights).detach()
+    return float((got - (expected.flip(2) if reverse else expected)).abs().max())
 
 
 def _values(factory: Any, given: Any) -> None:
     for circuit in (small(), every_gate()):
-        x, weights, _ = sample(circuit)
-        got = factory(circuit, given)(x, weights).detach().numpy()
-        for s in range(S):
-            mine = {name: value[s].numpy() for name, value in weights.items()}
-            expected = np.array([expectation_values(circuit, x[s, b].numpy(), mine) for b in range(B)])
-            difference = float(np.abs(got[s] - expected).max())
-            if difference < 1e-6:
-                continue
-            cause = "compare gate by gate with the definitions in qrlsuite.circuit.description"
-            if np.abs(got[s] - expected[:, ::-1]).max() < 1e-6:
-                cause = "they agree in reverse: observables must come in the order of circuit.observables"
-            require(
-                False,
-                f"values of {circuit.qubits} qubits differ from dense matrices by {difference:.2g}; {cause}",
+        difference = _distance(factory, circuit, given)
+        if difference < 1e-6:
+            continue
+        cause = (
+            "the gates are right one by one, so look at their order, at constants, at elements that set several "
+            "angles, and at scale * input + weight"
+        )
+        wrong = _wrong_gates(factory, given)
+        if _distance(factory, circuit, given, reverse=True) < 1e-6:
+            cause = "they agree in reverse: results come in the order of circuit.observables"
+        elif wrong:
+            cause = (
+                f"alone between rotations, these are wrong: {', '.join(wrong)}; see GATES in qrlsuite.circuit"
             )
+        require(
+            False,
+            f"values of {circuit.qubits} qubits differ from dense matrices by {difference:.2g}; {cause}",
+        )
+
+
+def _wrong_gates(factory: Any, given: Any) -> list[str]:
+    """Return the gates, each tried by itself between rotations about X and Y, whose values are wrong."""
+    tried = [
+        (gate, control) for gate, kind in GATES.items() for control in (False, True)[: 1 + kind.controllable]
+    ]
+    return [
+        f"{gate} with control" if controlled else gate
+        for gate, controlled in tried
+        if not _distance(factory, one_gate(gate, controlled), given) < 1e-6
+    ]
 
 
 def _gradients(run: Any, circuit: Circuit) -> None:
@@ -194,7 +227,14 @@ def _gradients(run: Any, circuit: Circuit) -> None:
         require(
             abs(numeric - exact) <= 1e-4 * max(1.0, abs(exact)),
             f"the derivative by {name} is {exact:.6g}, finite differences give {numeric:.6g}: the parameter-shift "
-            "rule of controlled rotations has four terms, and a factor of scaled inputs belongs to the chain rule",
+            "rule of controlled rotations has four terms, a factor of scaled inputs belongs to the chain rule, and an "
+            "element that sets several angles gets the sum",
+        )
+    fixed = evaluate(run, x, weights, cotangent, fixed_inputs=True)
+    for name, value in fixed.items():
+        require(
+            torch.allclose(value, got[name], rtol=1e-6, atol=1e-6),
+            f"where inputs need no gradient, the {name} differs: a backward pass must count on no input to need one",
         )
 
 
@@ -208,7 +248,7 @@ def _repeatable(run: Any, circuit: Circuit) -> None:
         )
 
 
-def _independence(run: Any, circuit: Circuit, seeds: list[int] | None) -> None:
+def _independence(run: Any, circuit: Circuit, seeds: Sequence[int] | None) -> None:
     x, weights, cotangent = sample(circuit)
     whole = evaluate(run, x, weights, cotangent, seeds)
     for members in SIZES:
@@ -228,17 +268,33 @@ def _independence(run: Any, circuit: Circuit, seeds: list[int] | None) -> None:
             )
 
 
-def _shots(run: Any, circuit: Circuit) -> None:
+def _shots(subject: Subject, factory: Any, shots: int | None) -> None:
+    """Check sampling with the backend's own number of shots, or with SHOTS where it is exact by default."""
+    circuit, asked = small(), shots or SHOTS
+    given = subject.options() if shots else dataclasses.replace(subject.options(), shots=asked)
+    run = factory(circuit, given)
     require(
-        run.shots == SHOTS, f"shots = {SHOTS} was asked for, and the backend's attribute says {run.shots}"
+        run.shots == asked,
+        f"shots = {asked} was asked for, and the backend's attribute says {run.shots}: write "
+        "self.shots = options.shots",
     )
     x, weights, _ = sample(circuit)
-    seeds = [11, 12, 13, 14, 15]
-    first, second = (run(x, weights, seeds).detach() for _ in range(2))
+    first, second = (run(x, weights, SEEDS).detach() for _ in range(2))
     require(torch.equal(first, second), "the same seeds give other samples: seed the simulator from `seeds`")
-    other = run(x, weights, [seed + 100 for seed in seeds]).detach()
+    other = run(x, weights, [seed - 1 for seed in SEEDS]).detach()
     require(
         not torch.equal(first, other),
-        "other seeds give the same samples: is `seeds` handed to the simulator?",
+        "other seeds give the same samples: is `seeds` handed to the simulator, and `shots`?",
     )
-    _independence(run, circuit, seeds)
+    first_fresh, second_fresh = (run(x, weights).detach() for _ in range(2))
+    require(
+        not torch.equal(first_fresh, second_fresh),
+        "without seeds two calls give the same samples: None stands for fresh entropy",
+    )
+    error = float((first - _dense(circuit, x, weights)).square().mean().sqrt())
+    require(
+        error <= 2 / math.sqrt(asked),
+        f"with {asked} shots values are {error:.2g} from the exact ones (root mean square), and sampling allows "
+        f"{1 / math.sqrt(asked):.2g}: are there fewer shots than asked for, or is there a bias?",
+    )
+    _independence(run, circuit, SEEDS)

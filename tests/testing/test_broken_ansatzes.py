@@ -398,6 +398,13 @@ def test_a_backend_that_samples_is_only_run(
     assert not broken(own_rules("ansatzes", spec("good")))
 
 
+def test_without_a_backend_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry.load().entries, "circuit_backends", {})
+    assert_breaks(
+        "ansatzes", "effects", Broken(spec("good"), "no circuit backend is installed: install qrlsuite")
+    )
+
+
 def broken(findings: list[Finding]) -> list[Finding]:
     return [finding for finding in findings if not finding.ok]
 
