@@ -5,8 +5,8 @@ mean m and variance v of each observed value sees
 
     z = clip((x - m) / sqrt(v + 1e-8), -10, 10)
 
-in place of the observation x, in all of its networks. 1e-8 and 10 are the usual constants (Gymnasium's
-`NormalizeObservation`, Stable-Baselines3's `VecNormalize`).
+in place of the observation x, in all of its networks. The constants are those of Stable-Baselines3's `VecNormalize`;
+Gymnasium's `NormalizeObservation` does not clip.
 
 - *Whose.* Statistics belong to a seed. They are gathered from every observation that a step of its training
   environments returns: after an episode's end the next one's first, so that each is one to act on. Validation and
