@@ -167,13 +167,19 @@ def _draw(
     """Draw an ansatz as text (and to a file), and add its resources to the content."""
     from qrlsuite import circuit
     from qrlsuite.circuit import drawing
+    from qrlsuite.errors import OptionError
+    from qrlsuite.leaderboard import pictures
     from qrlsuite.options import parse_setting
+    from qrlsuite.store import write_atomically
 
+    format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
+    if figure is not None and format_ not in pictures.FORMATS:
+        raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
     chosen = {setting.name: setting.value for setting in map(parse_setting, words)}
     drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
-    content["resources"] = drawing.resources(drawn)
+    content["resources"] = dataclasses.asdict(drawing.resources(drawn))
     if figure is not None:
-        drawing.draw_figure(drawn).savefig(figure, bbox_inches="tight", dpi=150)
+        write_atomically(figure, pictures.encode(drawing.draw_figure(drawn), format_))
         content["figure"] = str(figure)
     return str(drawing.draw_text(drawn))
 
@@ -187,8 +193,6 @@ def _text(content: dict[str, Any], indent: str = "") -> str:
             for row in value:
                 lines.append(f"{indent}  {row['name']} = {_value(row['default'])}    {row['values']}")
                 lines.append(f"{indent}      {row['description']}")
-        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-            lines += [f"{indent}{key}", _text(dataclasses.asdict(value), indent + "  ")]
         elif isinstance(value, dict) and value:
             lines += [f"{indent}{key}", _text(value, indent + "  ")]
         elif isinstance(value, str) and "\n" in value:

@@ -150,6 +150,7 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
         (["run", "--task", "beam6g"], "see `qrlsuite run --help`"),
         (["run", "--task", "beam6g", "--model", "mlp", "--epochs", "0"], "--epochs"),
         (["rnu"], "Did you mean 'run'"),
+        (["show", "ansatz", "iqp", "--figure", "iqp.jpeg2"], "must be .png, .pdf or .svg"),
         (["list", "modles"], "did you mean 'models'"),
         (["show", "mpl"], "did you mean 'mlp'"),
         (["leaderboard", "--runs", "nowhere"], "there is no results folder nowhere"),
@@ -175,7 +176,7 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == [], "wrong input leaves nothing behind"
 
 
-def test_list_and_show_answer_for_everything() -> None:
+def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     rows = json.loads(qrlsuite("list", "--json").stdout)
     assert {"environments", "models", "algorithms", "tasks"} <= {row["kind"] for row in rows}
     assert all(row["distribution"] for row in rows)
@@ -184,6 +185,12 @@ def test_list_and_show_answer_for_everything() -> None:
     assert "units of each hidden layer" in shown
     protocol = json.loads(qrlsuite("show", "task", "beam6g", "--json").stdout)["protocol"]
     assert protocol["interactions"] == 2000
+    ansatz = ("show", "ansatz", "cx", "--qubits", "3", "--set", "gate=u3")
+    found = json.loads(qrlsuite(*ansatz, "--figure", str(tmp_path / "cx.svg"), "--json").stdout)
+    assert found["resources"]["gates"] == {"H": 3, "U3": 6, "CNOT": 3}
+    assert "q_2: ┤ H ├┤ U3 ├" in found["drawing"]
+    assert "two_qubit_depth: 3" in qrlsuite(*ansatz).stdout
+    assert (tmp_path / "cx.svg").read_text().startswith("<?xml")
     hooks = qrlsuite("list", "hooks").stdout
     assert "register_environments" in hooks
 
