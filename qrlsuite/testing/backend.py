@@ -32,9 +32,9 @@ def check(subject: Subject) -> list[Finding]:
     circuit = every_gate()
     rules = Checklist()
     made: list[Any] = []
-    if not rules.run(
-        "builds", "factory(circuit, options)", lambda: made.append(_build(factory, circuit, given))
-    ):
+    cause = "factory takes a Circuit and the options; one that it cannot run is refused by qrlsuite.errors.OptionError"
+    builds = "from a circuit with every gate, and options"
+    if not rules.run("builds", builds, lambda: made.append(_build(factory, circuit, given)), cause):
         return rules.findings
     run = made[0]
     with one_thread():

@@ -83,6 +83,14 @@ class NoReturn(Good):
         return None
 
 
+class Unfinished(Good):
+    """Look gates up in a table that lacks one."""
+
+    def change(self, operation: Operation) -> Operation | None:
+        known = [gate for gate in GATES if gate != "T"]
+        return dataclasses.replace(operation, gate=known[known.index(operation.gate)])
+
+
 class NoShots(Good):
     def __init__(self, circuit: Circuit, options: Any) -> None:
         super().__init__(circuit, options)
@@ -265,6 +273,10 @@ def spec(cls: type[Good], options: type[Any] = Options) -> CircuitBackendSpec:
 
 CASES: Cases = [
     ("builds", Broken(spec(NoReturn), r"returned NoneType, which cannot be called: write __call__")),
+    (
+        "builds",
+        Broken(spec(Unfinished), r"ValueError: 'T' is not in list; factory takes a Circuit and the options"),
+    ),
     ("builds", Broken(spec(NoShots), r"no attribute 'shots': set it to None where values are exact")),
     ("builds", Broken(spec(ZeroShots), r"attribute shots is 0: a positive integer, or None")),
     (
