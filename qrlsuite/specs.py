@@ -218,11 +218,24 @@ class SignificanceTestSpec(Spec):
 
 @dataclass(frozen=True, slots=True)
 class EngineSpec(Spec):
-    """Where groups of seeds run: `factory` references a class with `run(plan, display)`."""
+    """Where groups of seeds run.
+
+    Attributes
+    ----------
+    factory:
+        Reference to `factory(options) -> engine`, see `qrlsuite.engine.api.Engine`.
+    options:
+        Reference to the class of its options, None where it has none.
+    extras:
+        Packages that it needs: the pip command by the name of the module.
+    submits:
+        Whether `run` hands the groups to a queue and returns: there is then nothing to watch or to interrupt.
+    """
 
     factory: str
     options: str | None = None
     extras: dict[str, str] = field(default_factory=dict)
+    submits: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.store import EntryStore, entries, read_json, read_lines
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
-"""What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files know."""
+"""What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,21 @@ def survey(runs: Path, task: str | None = None) -> list[EntrySurvey]:
     return [look(store) for store in entries(runs, task)]
 
 
-def look(store: EntryStore) -> EntrySurvey:
-    """Look at one entry."""
+def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurvey:
+    """Look at one entry.
+
+    Parameters
+    ----------
+    queued:
+        The seeds that a queue still has; None where no queue was asked, and our own files are believed.
+    """
     problems: list[str] = []
     try:
         record = store.record()
     except StoreError as error:
         problems.append(str(error))
         record = {}
-    statuses, epochs = _seeds(store, problems)
+    statuses, epochs = _seeds(store, problems, queued)
     size, newest = _usage(store.path)
     return EntrySurvey(
         folder=store.path,
@@ -83,12 +89,15 @@ def look(store: EntryStore) -> EntrySurvey:
     )
 
 
-def _seeds(store: EntryStore, problems: list[str]) -> tuple[dict[int, str], list[int]]:
+def _seeds(
+    store: EntryStore, problems: list[str], queued: Collection[int] | None
+) -> tuple[dict[int, str], list[int]]:
     """Return the status of every seed, and the epochs that those begun have recorded."""
     held = {seed for claim in living(store) for seed in claim.seeds}
     statuses: dict[int, str] = {}
     for task in waiting(store, problems):
-        statuses |= dict.fromkeys(task["seeds"], "submitted")
+        for seed in task["seeds"]:
+            statuses[seed] = "submitted" if queued is None or seed in queued else "interrupted"
     epochs = []
     for seed in store.seeds():
         folder = store.seed(seed)
@@ -161,7 +170,7 @@ class GroupStatus:
     state:
         `running`, `submitted`, `stopped` or `failed`.
     where:
-        Host and process, or the job in a queue.
+        Host and process, or the job in a queue, or the job that is no longer there.
     progress:
         Its `progress.json`: phase, epoch, epochs, median_score, epoch_seconds, error.
     """
@@ -180,23 +189,37 @@ class GroupStatus:
         return float(max(0.0, (epochs - epoch) * pace))  # type: ignore[operator]
 
 
-def groups(store: EntryStore) -> list[GroupStatus]:
-    """Return the groups of an entry that have not finished: those at work first, then waiting, then stopped."""
+def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[GroupStatus]:
+    """Return the groups of an entry that have not finished: those at work first, then waiting, then stopped.
+
+    Parameters
+    ----------
+    queued:
+        As for `look`.
+    """
     alive = living(store)
     found = [_running(store, claim) for claim in alive]
     seen = {seed for claim in alive for seed in claim.seeds}
     done = _finished(store)
+    gone: list[GroupStatus] = []
     for task in waiting(store, []):
         rest = tuple(seed for seed in task["seeds"] if seed not in seen | done)
         if rest:
             path = store.groups / checkpoint.group_id(task["seeds"]) / "progress.json"
-            found.append(GroupStatus(rest, "submitted", f"job {task['job']}", read_progress(path)))
+            progress, job = read_progress(path), f"job {task['job']}"
+            waits = tuple(seed for seed in rest if queued is None or seed in queued)
+            if waits:
+                found.append(GroupStatus(waits, "submitted", job, progress))
+            if len(waits) < len(rest):
+                left_out = tuple(seed for seed in rest if seed not in waits)
+                gone.append(GroupStatus(left_out, "stopped", f"{job} has left the queue", progress))
             seen |= set(rest)
     left = set(store.seeds()) - seen - done
     for path in sorted(store.groups.glob("*/progress.json")):
         progress = read_progress(path)
         if progress.get("error") and left:
             found.append(GroupStatus((), "failed", path.parent.name, progress))
+    found += gone
     if left:
         found.append(GroupStatus(tuple(sorted(left)), "stopped", "nobody"))
     return found

@@ -101,25 +101,34 @@ class RunDisplay:
         self._announced = False
         self._last_line = time.monotonic()
 
-    def begin(self, busy: Collection[int]) -> None:
-        """Say what will be done."""
+    def begin(self, busy: Collection[int], submits: bool = False) -> None:
+        """Say what will be done, here or by tasks that are submitted and left."""
         task = self.entry.task
         self.console.print(
             f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  ({escape(str(self.store.path))})"
         )
         if busy:
             self.console.print(
-                f"{len(busy)} of the seeds are being trained by another process and are left to it; "
-                "repeat this command when it has ended to see the whole"
+                f"{len(busy)} of the seeds "
+                + (
+                    "wait in the queue or are being trained"
+                    if submits
+                    else "are being trained by another process"
+                )
+                + " and are left to it; repeat this command when it has ended to see the whole"
             )
         todo = sum(len(group.seeds) for group in self.groups)
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
         there = len(self.seeds) - len(busy) - todo
-        parts = [f"{todo} seeds to epoch {self.epochs}, {self.workers} process{'es' * (self.workers > 1)}"]
+        places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
+        parts = [f"{todo} seeds to epoch {self.epochs}, {self.workers} {places}"]
         parts += [f"{there} seeds are already there"] * bool(there) + [f"{resumed} resume"] * bool(resumed)
-        self.console.print("; ".join(parts) + ". Ctrl-C saves; the same command continues.")
+        end = "" if submits else " Ctrl-C saves; the same command continues."
+        self.console.print("; ".join(parts) + "." + end)
+        if submits:
+            return
         if self.console.is_terminal:
             self.live = Progress(
                 TextColumn("{task.description}"),

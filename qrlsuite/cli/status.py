@@ -21,18 +21,28 @@ def status(
 ) -> None:
     """Show what is running, waiting and stopped, from any machine that sees the results folder.
 
-    Reads the results folder only: it asks no queue and disturbs no worker.
+    Reads the results folder, and disturbs no worker. Where seeds were submitted to a queue, the queue is asked
+    whether it still has them.
 
     Example: qrlsuite status --task beam6g
     """
     import json
 
+    from qrlsuite.engine.api import Queues
+    from qrlsuite.errors import QrlSuiteError
     from qrlsuite.store import entries
     from qrlsuite.survey import groups, look
 
     shown: list[dict[str, Any]] = []
+    queues = Queues()
     for store in entries(runs, task):
-        entry = look(store)
+        entry, queued, silence = look(store), None, None
+        if entry.seeds.get("submitted"):
+            try:
+                queued = queues.waiting(store)
+                entry = look(store, queued)
+            except QrlSuiteError as error:
+                silence = str(error)
         shown.append(
             {
                 "task": entry.task,
@@ -40,7 +50,8 @@ def status(
                 "label": entry.label,
                 "seeds": dict(entry.seeds),
                 "problems": list(entry.problems),
-                "groups": [_plain(group) for group in groups(store)],
+                "queue_problem": silence,
+                "groups": [_plain(group) for group in groups(store, queued)],
             }
         )
     if json_output:
@@ -70,6 +81,10 @@ def _print(row: dict[str, Any]) -> None:
     typer.echo(printable(f"{row['task']}  {row['label']}  ({row['entry']}): {seeds}"))
     for problem in row["problems"]:
         typer.echo(f"  damaged: {printable(problem)}")
+    if row["queue_problem"]:
+        typer.echo(
+            f"  what was submitted may have left the queue, which was not asked: {printable(row['queue_problem'])}"
+        )
     for group in row["groups"]:
         words = [f"  {group['state']:<9}"]
         words += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
@@ -79,6 +94,7 @@ def _print(row: dict[str, Any]) -> None:
             words.append(f"median score {group['median_score']:.3f}")
         if group["seconds_left"] is not None and group["state"] == "running":
             words.append(f"{duration(group['seconds_left'])} left")
-        words += [group["where"]] if group["state"] != "stopped" else ["continued by the same `qrlsuite run`"]
+        words += [group["where"]] if group["where"] != "nobody" else []
+        words += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
         words += [str(group["error"])] if group["error"] else []
         typer.echo(printable("  ".join(words)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -42,16 +42,25 @@ TrackOption = Annotated[
         help="Watch with a tracker (see `qrlsuite list trackers`): --track tensorboard, --track tensorboard=DIR.",
     ),
 ]
-DeviceOption = Annotated[str, typer.Option("--device", help="Where networks are trained: cpu, cuda or cuda:1.")]
+DeviceOption = Annotated[
+    str, typer.Option("--device", help="Where networks are trained: cpu, cuda or cuda:1.")
+]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where training is done: an engine, as many groups at a time as `workers`, and their device."""
+    """Where training is done: an engine, as many groups at a time as `workers`, and their device.
+
+    Attributes
+    ----------
+    submits:
+        Whether the engine hands the groups to a queue and returns.
+    """
 
     engine: Engine
     workers: int
     device: str = "cpu"
+    submits: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,13 +109,14 @@ def place(
         no such device.
     """
     from qrlsuite import device as devices
-    from qrlsuite import options
+    from qrlsuite import options, registry, specs
     from qrlsuite.engine import api
 
     devices.check(device)  # whether it is there is seen where the work is done
     given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
     built = api.create(engine, {"partition": partition, "time": time, **given})
-    return Place(built, built.workers(workers), device)
+    spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
+    return Place(built, built.workers(workers), device, spec.submits)
 
 
 def plan(runs: Path, entry: Entry, seeds: Sequence[int], epochs: int, where: Place) -> Plan:
@@ -143,7 +153,7 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
     from qrlsuite.store import EntryStore
 
     EntryStore.create(work.store.path.parent.parent, work.entry)
-    display.begin(work.busy)
+    display.begin(work.busy, where.submits)
     if not work.groups:
         return api.Outcome()
     try:

@@ -118,6 +118,36 @@ def create(name: str, given: Mapping[str, Any]) -> Engine:
     return cast(Engine, specs.resolve(spec.factory)(chosen))
 
 
+class Queues:
+    """The queues that seeds were handed to; one that does not answer is not asked again."""
+
+    def __init__(self) -> None:
+        self._engines: dict[str, Engine] = {}
+        self._silent: dict[str, QrlSuiteError] = {}
+
+    def waiting(self, store: EntryStore) -> set[int]:
+        """Return the seeds of an entry that were handed to a queue and are still there.
+
+        Raises
+        ------
+        QrlSuiteError
+            If a queue that was handed seeds cannot be asked on this machine.
+        """
+        seeds: set[int] = set()
+        for path in sorted(store.path.glob("*/submitted.json")):  # in a folder that has the engine's name
+            name = path.parent.name
+            if name in self._silent:
+                raise self._silent[name]
+            try:
+                if name not in self._engines:
+                    self._engines[name] = create(name, {})
+                seeds |= self._engines[name].queued(store)
+            except QrlSuiteError as error:
+                self._silent[name] = error
+                raise
+        return seeds
+
+
 def raise_failures(outcome: Outcome) -> None:
     """Turn failed groups into one error.
 

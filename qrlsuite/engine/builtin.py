@@ -25,5 +25,6 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             factory="qrlsuite.engine.slurm:SlurmEngine",
             options="qrlsuite.engine.slurm:Options",
             extras={"submitit": "pip install 'qrlsuite[slurm]'"},
+            submits=True,
         )
     )

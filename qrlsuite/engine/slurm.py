@@ -10,8 +10,6 @@ with which seeds. The results folder must be one that every node sees.
 
 from __future__ import annotations
 
-import getpass
-import os
 import re
 import signal
 import subprocess
@@ -36,6 +34,9 @@ TASKS = 10
 
 REQUEUES = 1000
 """How often a task may reach its time limit."""
+
+ASK_SECONDS = 5.0
+"""How long an answer of `squeue` is good for: a hundred entries are looked at by asking once."""
 
 _TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
 
@@ -130,6 +131,8 @@ class SlurmEngine:
 
     def __init__(self, options: Options) -> None:
         self.options = options
+        self._asked = 0.0
+        self._answer: set[str] | None = None
 
     def workers(self, asked: int | None) -> int:
         """Return the number of array tasks asked for, else `TASKS`."""
@@ -146,7 +149,9 @@ class SlurmEngine:
         tasks = submitted(store)
         if not tasks:
             return set()
-        waiting = _waiting()
+        if self._answer is None or time.monotonic() - self._asked > ASK_SECONDS:
+            self._answer, self._asked = _waiting(), time.monotonic()
+        waiting = self._answer
         return {seed for task in tasks if task["job"] in waiting for seed in task["seeds"]}
 
     def run(self, work: Work, show: Show) -> Outcome:
@@ -192,6 +197,7 @@ class SlurmEngine:
             raise QrlSuiteError(
                 f"there is no SLURM on this machine ({error}); --engine local needs none"
             ) from None
+        self._answer = None
         ids = [str(job.job_id) for job in jobs]
         _remember(work.store, ids, work.groups, work.epochs)
         array = ids[0].partition("_")[0]
@@ -232,15 +238,14 @@ def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[Group], ep
 
 
 def _waiting() -> set[str]:
-    """Return the ids of this user's jobs that wait or run, array tasks as `123_4`.
+    """Return the ids of all jobs that wait or run, array tasks as `123_4`; of all users, who may share a folder.
 
     Raises
     ------
     QrlSuiteError
         If `squeue` is missing or does not answer.
     """
-    user = os.environ.get("USER") or getpass.getuser()
-    command = ["squeue", "--noheader", "--array", "--user", user, "--format", "%i"]
+    command = ["squeue", "--noheader", "--array", "--format", "%i"]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     except FileNotFoundError:

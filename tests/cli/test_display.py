@@ -45,3 +45,14 @@ def test_an_estimate_outlives_the_first_epoch_s_validation() -> None:
     assert estimate.remaining({name: {**training, "done": 30}}, now=10.0) == pytest.approx(62.5 * 9.76)
     validating = {"phase": "validation", "epoch": 0, "done": 1, "total": 20}
     assert estimate.remaining({name: validating}, now=60.0) == pytest.approx(62.5 * 10)
+
+
+@pytest.mark.parametrize("submits", [False, True])
+def test_what_is_submitted_cannot_be_stopped_by_ctrl_c(entry, tmp_path, capsys, submits) -> None:
+    display = RunDisplay(entry, EntryStore(tmp_path), range(7), 3, PAIR, 2, quiet=False)
+    display.begin({5, 6}, submits)
+    display.close()
+    shown = " ".join(capsys.readouterr().err.split())
+    assert ("Ctrl-C saves" in shown) is not submits
+    assert ("5 seeds to epoch 3, 2 tasks" in shown) is submits
+    assert ("2 of the seeds wait in the queue" in shown) is submits

@@ -182,3 +182,53 @@ def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch
     assert (found["submitted"].seeds, found["submitted"].where) == ((5, 6), "job 9_3")
     assert found["stopped"].seeds == (1,)
     claim.release()
+
+
+def test_status_tells_what_waits_from_what_has_left_the_queue(
+    train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Task 9_1 was canceled before it began: only SLURM can know."""
+    pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
+    entry = train("runs", [0], 1)
+    tasks = [{"job": "9_0", "seeds": [5, 6], "epochs": 3}, {"job": "9_1", "seeds": [7], "epochs": 3}]
+    write_json(entry / "slurm" / "submitted.json", {"tasks": tasks})
+    squeue = tmp_path / "bin" / "squeue"
+    squeue.parent.mkdir()
+    squeue.write_text("#!/bin/sh\necho 9_0\n")
+    squeue.chmod(0o755)
+
+    def say(*words: str) -> str:
+        command = ["status", "--runs", str(entry.parent.parent), *words]
+        return CliRunner().invoke(build(), command, catch_exceptions=False).output
+
+    monkeypatch.setenv("PATH", str(squeue.parent))
+    (row,) = json.loads(say("--json"))
+    assert row["seeds"] == {"submitted": 2, "interrupted": 1, "finished": 1}
+    assert row["queue_problem"] is None
+    assert [(group["state"], group["seeds"]) for group in row["groups"]] == [
+        ("submitted", [5, 6]),
+        ("stopped", [7]),
+    ]
+    assert "job 9_1 has left the queue  continued by the same `qrlsuite run`" in say()
+    squeue.unlink()
+    (row,) = json.loads(say("--json"))
+    assert row["seeds"] == {"submitted": 3, "finished": 1}, "our own files are believed"
+    assert "squeue is not found" in row["queue_problem"]
+    assert "may have left the queue, which was not asked: there is no SLURM on this machine" in say()
+
+
+def test_squeue_is_asked_once_for_many_entries(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = EntryStore(train("runs", [0], 1))
+    write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "7_0", "seeds": [1]}]})
+    asked = []
+
+    def squeue(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        return subprocess.CompletedProcess([], 0, stdout="7_0\n", stderr="")
+
+    monkeypatch.setattr(subprocess, "run", squeue)
+    engine = SlurmEngine(Options())
+    assert [engine.queued(store) for _ in range(50)] == [{1}] * 50
+    assert len(asked) == 1
