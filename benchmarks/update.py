@@ -30,7 +30,8 @@ BATCH = 64
 
 def update(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> Call:
     """Return a call that makes one update of a population on the standard task."""
-    entry = resolve("beam6g", model, settings=[parse_setting(word) for word in settings])
+    words = [*settings, f"algorithm.batch={batch}"]
+    entry = resolve("beam6g", model, settings=[parse_setting(word) for word in words])
     streams = [Streams(entry.task.hash, seed) for seed in parse_seeds(f"0:{seeds}")]
     envs = build_envs(entry, 10 * seeds, lambda: None)
     envs.seed_lanes([s.numpy("environment", lane) for s in streams for lane in range(10)])
@@ -39,7 +40,8 @@ def update(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> C
         envs, build, entry.algorithm_options, streams, torch.device("cpu")
     )
     ddqn.start()
-    ddqn.train_epoch(7)
+    for _ in range(7):  # fills the replay buffer without learning, which takes Qiskit minutes
+        ddqn._interact(torch.zeros((seeds, 10), dtype=torch.int64))
     picked = torch.randint(70, (seeds, batch), generator=torch.Generator().manual_seed(0))
     return lambda: ddqn._learn(picked)
 

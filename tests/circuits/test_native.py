@@ -23,13 +23,15 @@ from qrlsuite.plugins.circuits.native.program import HADAMARD, PERMUTE, ROTATE, 
 from tests.conftest import golden
 
 GOLDEN = golden("vqc")
-PATHS = ["kernels", "torch"]
+PATHS = ["kernels", "torch", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 def run(backend: NativeBackend, path: str, inputs: Tensor, parameters: dict[str, Tensor]) -> Tensor:
-    """Run the compiled kernels, or the torch path that serves other devices, on the CPU."""
+    """Run the compiled kernels, or the torch path that serves other devices: on the CPU, and where there is a GPU."""
     if path == "kernels":
         return backend(inputs, parameters)
+    if path == "cuda":
+        return backend(inputs.cuda(), {name: value.cuda() for name, value in parameters.items()}).cpu()
     flat = torch.cat([parameters[name].reshape(len(inputs), -1) for name in backend.shapes], dim=1)
     return dense.expectations(backend.program, inputs, flat)
 
