@@ -123,6 +123,7 @@ def resolve(
         "model": specs.resolve(model.options),
         "algorithm": specs.resolve(algorithm.options),
     }
+    task.check_presets(algorithm.name, sides["algorithm"])
     values = options.assign(settings, sides)
     task = task.with_environment(values["environment"])
     chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)

@@ -12,7 +12,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
-from qrlsuite.errors import TaskError, nearest
+from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
 
 FORMAT_VERSION = 1
 
@@ -171,7 +171,10 @@ class Task:
         self.file = file
         self.source = source
         self.name = file.name
-        self.environment = registry.environment(file.environment.name)
+        try:
+            self.environment = registry.environment(file.environment.name)
+        except UnknownNameError as error:
+            raise TaskError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
         where = f"{source}: environment.options"
         self.environment_options = options.build(cls, file.environment.options, where)
@@ -202,6 +205,8 @@ class Task:
         if not values:
             return self
         merged = {**self.file.environment.options, **values}
+        where = f"environment '{self.environment.name}'"  # not the file: its own options are in order
+        options.build(specs.resolve(self.environment.options), merged, where)
         section = self.file.environment.model_copy(update={"options": merged})
         changed = Task(self.file.model_copy(update={"environment": section}), self.source)
         if changed.hash != self.hash:
@@ -225,6 +230,26 @@ class Task:
             )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
         return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+
+    def check_presets(self, algorithm: str, cls: type[Any]) -> None:
+        """Check every preset of an algorithm against its options class.
+
+        Raises
+        ------
+        TaskError
+            Listing every unknown name and every bad value with its path in the file.
+        """
+        problems = []
+        for preset in self.file.presets:
+            for family in ("classical", "quantum"):
+                try:
+                    options.build(
+                        cls, self.preset(preset, algorithm, family)[1], f"presets.{preset}.{algorithm}"
+                    )
+                except OptionError as error:
+                    problems.append(str(error))
+        if problems:
+            raise TaskError(f"{self.source}: " + "; ".join(dict.fromkeys(problems)))
 
 
 def digest(content: Any) -> str:
@@ -255,8 +280,26 @@ def parse(text: str, source: str) -> Task:
     try:
         file = TaskFile.model_validate(data)
     except pydantic.ValidationError as error:
-        raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, TaskFile))) from None
+        problems = [*options.file_problems(error, TaskFile), *_environment_problems(data.get("environment"))]
+        raise TaskError(f"{source}: " + "; ".join(problems)) from None
     return Task(file, source)
+
+
+def _environment_problems(section: Any) -> list[str]:
+    """Return what is wrong with the environment of a file that is not in order elsewhere."""
+    try:
+        given = EnvironmentSection.model_validate(section)
+    except pydantic.ValidationError:
+        return []  # named already
+    try:
+        cls = specs.resolve(registry.environment(given.name).options)
+    except UnknownNameError as error:
+        return [f"environment.name: {error}"]
+    try:
+        options.build(cls, given.options, "environment.options")
+    except OptionError as error:
+        return [str(error)]
+    return []
 
 
 def load(name: str) -> Task:
@@ -281,5 +324,6 @@ def load(name: str) -> Task:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise TaskError(f"task file {path} cannot be read: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise TaskError(f"task file {path} cannot be read: {reason}") from None
     return parse(text, path.name)

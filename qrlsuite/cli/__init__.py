@@ -13,10 +13,13 @@ from qrlsuite.errors import PluginError, QrlSuiteError
 
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
+    from typer import Abort, BadParameter
+
     from qrlsuite.cli.app import build
     from qrlsuite.cli.terminal import printable, printable_lines
     from qrlsuite.registry import STRICT, PluginWarning
 
+    UsageError: Any = BadParameter.__base__  # click's, or Typer's own copy of it
     options = itertools.takewhile(lambda word: word.startswith("-"), sys.argv[1:])
     if "--strict" in options:
         os.environ[STRICT] = "1"  # workers inherit it
@@ -32,7 +35,16 @@ def main() -> None:
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         try:
-            build()()
+            sys.exit(build()(prog_name="qrlsuite", standalone_mode=False))
+        except UsageError as error:
+            if error.ctx is None or type(error).__name__ == "NoArgsIsHelpError":
+                error.show()
+            else:
+                message = printable(error.format_message()).removesuffix(".")
+                print(f"qrlsuite: {message}; see `{error.ctx.command_path} --help`", file=sys.stderr)
+            sys.exit(2)
+        except Abort:
+            sys.exit("Aborted!")
         except QrlSuiteError as error:
             shown = printable if isinstance(error, PluginError) else printable_lines
             print(f"qrlsuite: {shown(error)}", file=sys.stderr)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qrlsuite import registry, task
-from qrlsuite.errors import QrlSuiteError, TaskError
+from qrlsuite import entry, registry, task
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from tests.conftest import TINY
 
 
@@ -37,7 +37,11 @@ def test_the_hash_covers_the_definition_and_nothing_else() -> None:
         ("interactions = 60", "", "missing key 'protocol.interactions'"),
         ("interactions = 60", "interactions = 61", "interactions = 61 is not a multiple of environments = 4"),
         ("seeds = 4", "seeds = 'four'", "protocol.seeds = 'four'"),
-        ('name = "beam6g"', 'name = "beam6h"', "unknown environment 'beam6h'; did you mean 'beam6g'"),
+        (
+            'name = "beam6g"',
+            'name = "beam6h"',
+            "t.toml: environment.name: unknown environment 'beam6h'; did you mean 'beam6g'",
+        ),
         ("degree = 3", "degre = 3", "no option 'degre'; did you mean 'degree'"),
         ("deltas = [0.5, 0.75]", "deltas = [0.5, 1.5]", "ranking.deltas.1 = 1.5"),
         ("epsilons = [0.6, 0.8]", "", "give either epsilons"),
@@ -62,11 +66,37 @@ def test_all_mistakes_are_named_at_once() -> None:
         TINY.replace("epochs = 3", "epoch = 3")
         .replace("seeds = 4", "seeds = 0")
         .replace("interactions = 60", "")
+        .replace("degree = 3", "degree = 1\nstep = 20")
     )
     with pytest.raises(TaskError) as caught:
         task.parse(text, "t.toml")
-    for part in ("'epoch'", "protocol.seeds = 0", "protocol.interactions"):
+    for part in ("'epoch'", "protocol.seeds = 0", "protocol.interactions", "environment.options: degree = 1"):
         assert part in str(caught.value)
+    assert "environment.options has no option 'step'; did you mean 'steps'" in str(caught.value)
+    with pytest.raises(
+        TaskError, match=r"protocol\.seeds = 0.*environment\.name: unknown environment 'beam6h'"
+    ):
+        task.parse(TINY.replace("seeds = 4", "seeds = 0").replace('name = "beam6g"', 'name = "beam6h"'), "t")
+
+
+def test_a_mistake_in_a_preset_is_named_with_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "t.toml"
+    path.write_text(
+        TINY
+        + "\n[presets.mine.ddqn.all]\ngama = 0.9\n[presets.other.ddqn.quantum]\nlr = -1\n[presets.other.ppo.all]\n"
+    )
+    with pytest.raises(TaskError) as caught:
+        entry.resolve(str(path), "mlp")  # although it takes neither
+    assert str(caught.value).startswith(
+        "t.toml: presets.mine.ddqn has no option 'gama'; did you mean 'gamma'?; "
+    )
+    assert "presets.other.ddqn: lr = -1" in str(caught.value)
+    assert str(caught.value).count("gama") == 1
+
+
+def test_a_bad_setting_is_not_blamed_on_the_file() -> None:
+    with pytest.raises(OptionError, match=r"^environment 'beam6g': degree = 1: at least 2"):
+        task.parse(TINY, "t.toml").with_environment({"degree": 1})
 
 
 def test_a_file_that_is_not_there() -> None:
