@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import importlib.util
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
@@ -16,39 +12,9 @@ from typing import Any
 from qrlsuite import options as option_values
 from qrlsuite import registry, specs
 from qrlsuite.testing.findings import Checklist, Finding, require
-
-HEAVY = ("torch", "pennylane", "qiskit", "numba", "gymnasium", "scipy", "matplotlib", "jax", "tensorflow")
-"""Packages that take long to import, and so must wait until a command needs them."""
+from qrlsuite.testing.fresh import HEAVY, fresh_process
 
 REFERENCES = ("options", "build", "factory", "population", "vector", "entry_point")
-
-_FRESH = """
-import importlib, json, sys
-from multiprocessing.reduction import ForkingPickler
-from qrlsuite import registry, specs
-modules, references, heavy = json.loads(sys.argv[1])
-result = {"heavy": [], "references": {}, "modules": {}}
-found = []
-for name in modules:
-    try:
-        plugin = importlib.import_module(name)
-        for kind in registry.KINDS:
-            hook = getattr(plugin, "register_" + kind, None)
-            if hook is not None:
-                hook(register=found.append)
-    except Exception as error:
-        result["modules"][name] = f"{type(error).__name__}: {error}"
-result["heavy"] = [name for name in heavy if name in sys.modules]
-for spec in found:
-    ForkingPickler.dumps(spec)
-for reference in references:
-    try:
-        specs.resolve(reference)
-        result["references"][reference] = None
-    except Exception as error:
-        result["references"][reference] = f"{type(error).__name__}: {error}"
-print(json.dumps(result))
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +41,13 @@ class Subject:
         return f"{registry.SINGULAR[self.kind].replace('_', ' ')} '{self.spec.name}'"
 
     def references(self) -> dict[str, str]:
-        """Return the references of the spec by field."""
+        """Return the references of the spec by field; those inside of a field have its name and a dot in front."""
         found = {field: getattr(self.spec, field, None) for field in REFERENCES}
+        if isinstance(self.spec, specs.EnvironmentSpec):
+            found |= {f"policies.{name}": reference for name, reference in self.spec.policies.items()}
+            for picture in self.spec.pictures:
+                for part in ("draw", "options"):
+                    found[f"pictures.{picture.name}.{part}"] = getattr(picture, part)
         return {field: reference for field, reference in found.items() if reference is not None}
 
     def options(self) -> Any:
@@ -142,37 +113,13 @@ def plugin_modules(distribution: str) -> tuple[str, ...]:
     return tuple(sorted(name.removeprefix(prefix) for name, _ in named if name.startswith(prefix)))
 
 
-@functools.cache
-def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict[str, Any]:
-    """Import plugin modules, call their hooks and resolve references in a new interpreter.
-
-    Returns
-    -------
-    dict
-        `modules`: errors by module; `heavy`: heavy packages that registering imported; `references`: error or
-        None by reference; `crash`: the last line of stderr, where the interpreter itself failed.
-    """
-    path = os.pathsep.join(entry for entry in sys.path if entry)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _FRESH, json.dumps([modules, references, HEAVY])],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    empty: dict[str, Any] = {"modules": {}, "heavy": [], "references": {}}
-    lines = done.stdout.strip().splitlines()
-    if done.returncode or not lines:
-        return {**empty, "crash": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    return {**empty, **json.loads(lines[-1])}
-
-
 def check_common(subject: Subject) -> tuple[list[Finding], bool]:
     """Check what every registered thing keeps to; returns the findings and whether the rest can be checked."""
     rules = Checklist()
     rules.run("name", "unique among what is installed", lambda: _name(subject))
     usable = rules.run("references", "every reference leads to code", lambda: _references(subject))
-    rules.run("lazy imports", f"registering imports none of {', '.join(HEAVY)}", lambda: _lazy(subject))
+    if subject.modules:
+        rules.run("lazy imports", f"registering imports none of {', '.join(HEAVY)}", lambda: _lazy(subject))
     rules.run(
         "spawn",
         "a fresh process finds the code; specs and options can be sent there",
@@ -181,7 +128,7 @@ def check_common(subject: Subject) -> tuple[list[Finding], bool]:
     if usable and "options" in subject.references():
         rules.run("options documented", "every option has a description", lambda: _documented(subject))
         usable = rules.run(
-            "options", "defaults are valid, strict, and survive being stored", lambda: _options(subject)
+            "options", "defaults are valid, frozen, and survive being stored", lambda: _options(subject)
         )
     return rules.findings, usable
 
@@ -213,11 +160,15 @@ def _references(subject: Subject) -> None:
         require(
             callable(found), f"{field} = {reference!r} is {type(found).__name__}, and it must be callable"
         )
-        if field == "options":
+        if _is_options(field):
             require(
                 isinstance(found, type) and dataclasses.is_dataclass(found),
-                f"options = {reference!r} is not a dataclass: write a class under @pydantic.dataclasses.dataclass",
+                f"{field} = {reference!r} is not a dataclass: write a class under @pydantic.dataclasses.dataclass",
             )
+
+
+def _is_options(field: str) -> bool:
+    return field.rpartition(".")[2] == "options"
 
 
 def _all_references(subject: Subject) -> tuple[str, ...]:
@@ -241,7 +192,10 @@ def _lazy(subject: Subject) -> None:
 
 def _spawn(subject: Subject) -> None:
     result = fresh_process(subject.modules, _all_references(subject))
-    require("crash" not in result, f"a fresh process fails: {result.get('crash')}")
+    require(
+        "crash" not in result,
+        f"a fresh process, as workers are, ends when it imports the plugin: {result.get('crash')}",
+    )
     for module, error in result["modules"].items():
         require(False, f"plugin module '{module}' fails in a fresh process: {error}")
     for reference in subject.references().values():
@@ -251,7 +205,12 @@ def _spawn(subject: Subject) -> None:
             f"{reference!r} cannot be resolved in a fresh process, as workers are: {error}; code must lie in an "
             "importable file, not in __main__, a notebook or a module made at run time",
         )
-    ForkingPickler.dumps(subject.spec)
+    try:
+        ForkingPickler.dumps(subject.spec)
+    except Exception as error:
+        require(
+            False, f"the spec cannot be pickled: {error}; specs hold text, references instead of functions"
+        )
     options = subject.references().get("options")
     if options is not None:
         cls = specs.resolve(options)
@@ -263,42 +222,80 @@ def _spawn(subject: Subject) -> None:
             ForkingPickler.dumps(made)
         except Exception as error:
             require(
-                False, f"options cannot be pickled: {error}; keep plain values in them, no functions or files"
+                False,
+                f"options cannot be pickled: {error}; keep plain values in them, no functions or files, and the class "
+                "at the top of its file",
             )
 
 
 def _documented(subject: Subject) -> None:
-    rows = option_values.describe(specs.resolve(subject.references()["options"]))
-    silent = [row["name"] for row in rows if not str(row["description"]).strip()]
-    require(
-        not silent,
-        f"no description: {', '.join(silent)}; write name: Annotated[int, Field(description='...')] = 3, "
-        "which `qrlsuite show` prints",
-    )
+    for field, reference in subject.references().items():
+        if not _is_options(field):
+            continue
+        rows = option_values.describe(specs.resolve(reference))
+        silent = [row["name"] for row in rows if not str(row["description"]).strip()]
+        require(
+            not silent,
+            f"{reference.partition(':')[2]} has no description of {', '.join(silent)}; write name: Annotated[int, "
+            "Field(description='...')] = 3, which `qrlsuite show` prints",
+        )
 
 
 def _options(subject: Subject) -> None:
     cls = specs.resolve(subject.references()["options"])
     try:
-        option_values.build(cls, {}, subject.title)
+        defaults = option_values.build(cls, {}, subject.title)
     except Exception as error:
         require(False, f"the defaults are not valid: {error}; every option needs a default that works")
-    made = subject.options()
-    try:
-        plain = json.loads(json.dumps(option_values.plain(made), allow_nan=False))
-    except ValueError as error:
-        require(False, f"options cannot be stored as JSON: {error}; nan and infinity have no JSON form")
-    again = option_values.build(cls, plain, subject.title)
-    require(
-        again == made,
-        f"options stored and read again differ: {made} became {again}; is a value changed when it is read?",
-    )
-    for field in option_values.field_names(cls):
+    for made in (defaults, subject.options()):
+        _stored(subject, cls, made)
+    for name in option_values.field_names(cls):
         try:
-            setattr(made, field, getattr(made, field))
+            setattr(defaults, name, getattr(defaults, name))
         except Exception:
             continue
         require(
             False,
-            f"option '{field}' can be assigned to: write @dataclass(frozen=True), for options are identity",
+            f"option '{name}' can be assigned to: write @dataclass(frozen=True), for options are identity",
         )
+
+
+def _stored(subject: Subject, cls: type[Any], made: Any) -> None:
+    """Require that options can be stored, and read again as what they were."""
+    for name in option_values.field_names(cls):
+        require(
+            not _has_set(getattr(made, name)),
+            f"option '{name}' holds a set, whose order is another one in every process, and so would be the name under "
+            "which results are kept: use a tuple",
+        )
+    try:
+        plain = json.loads(json.dumps(option_values.plain(made), allow_nan=False))
+    except ValueError as error:
+        require(
+            False,
+            f"options cannot be stored as JSON: {error}; keep plain values in them, for nan, infinity and objects "
+            "have no JSON form",
+        )
+    try:
+        again = option_values.build(cls, plain, subject.title)
+    except Exception as error:
+        require(
+            False,
+            f"options stored cannot be read again: {error}; defaults are not validated: is one outside its own bounds, "
+            "or of another type?",
+        )
+    require(
+        again == made,
+        f"options stored and read again differ: {made} became {again}; is a value changed when it is read?",
+    )
+
+
+def _has_set(value: Any) -> bool:
+    """Tell whether there is a set inside a value, at any depth."""
+    if dataclasses.is_dataclass(value):
+        value = [getattr(value, each.name) for each in dataclasses.fields(value)]
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return isinstance(value, set | frozenset) or (
+        isinstance(value, list | tuple) and any(_has_set(each) for each in value)
+    )

@@ -15,8 +15,9 @@ import pluggy
 
 from qrlsuite import hookspecs, specs
 from qrlsuite.events import EVENTS
-from qrlsuite.testing.common import HEAVY, Subject, fresh_process
+from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.fresh import HEAVY, fresh_process
 
 RUNS = "two runs at once, resumed, and a metric without a value"
 

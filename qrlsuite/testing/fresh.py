@@ -1,0 +1,77 @@
+"""Plugins in a process of their own, as a worker or a new command meets them: what is imported, and what is found."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+HEAVY = (
+    "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "plotly", "pandas", "sklearn",
+    "jax", "tensorflow",
+)  # fmt: skip
+"""Packages that take long to import, and so must wait until a command needs them."""
+
+_MARK = "qrlsuite.testing.fresh "
+"""Before the result, for imported modules may print."""
+
+
+@functools.cache
+def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict[str, Any]:
+    """Import plugin modules, call their hooks and resolve references in a new interpreter.
+
+    Returns
+    -------
+    dict
+        `modules`: errors by module; `heavy`: heavy packages that registering imported; `references`: error or
+        None by reference; `crash`: the last line of stderr, where the interpreter itself ended.
+    """
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([modules, references])],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    for line in done.stdout.splitlines():
+        if line.startswith(_MARK):
+            found: dict[str, Any] = json.loads(line.removeprefix(_MARK))
+            return found
+    said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
+    return {"modules": {}, "heavy": [], "references": {}, "crash": said[-1]}
+
+
+def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
+    """Do what `fresh_process` says, in this process."""
+    from qrlsuite import registry, specs
+
+    failed: dict[str, str] = {}
+    for name in modules:
+        try:
+            plugin = importlib.import_module(name)
+            for kind in registry.KINDS:
+                hook = getattr(plugin, f"register_{kind}", None)
+                if hook is not None:
+                    hook(register=lambda spec: None)
+        except (Exception, SystemExit) as error:
+            failed[name] = registry.words(error)
+    heavy = [name for name in HEAVY if name in sys.modules]
+    resolved: dict[str, str | None] = {}
+    for reference in references:
+        try:
+            specs.resolve(reference)
+            resolved[reference] = None
+        except (Exception, SystemExit) as error:
+            resolved[reference] = registry.words(error)
+    return {"modules": failed, "heavy": heavy, "references": resolved}
+
+
+if __name__ == "__main__":
+    _result = _look(*json.loads(sys.argv[1]))
+    print(f"\n{_MARK}{json.dumps(_result)}")
