@@ -178,6 +178,7 @@ class GroupRun:
         self.epoch = 0
         self.events = EventSink(registry.load(), asked())
         self.progress.warnings = self.events.problems
+        self.validation_steps = np.zeros(self.S, np.int64), 1
         self._saved_epoch = -1
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
 
@@ -276,8 +277,8 @@ class GroupRun:
 
     def _one_epoch(
         self,
-    ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], dict[str, int], dict[str, float]]:
-        """Train and validate one epoch; returns metrics, scores (S, V), circuit executions and seconds."""
+    ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], list[dict[str, int]], dict[str, float]]:
+        """Train and validate one epoch; returns metrics, scores (S, V), each seed's executions, and seconds."""
         before = self.models.executions()
         started, processor = time.perf_counter(), time.process_time()
         self._phase("training", self.entry.task.file.protocol.rounds)
@@ -285,10 +286,17 @@ class GroupRun:
             self.statistics.adopt()
         metrics = dict(self.algorithm.train_epoch(self.entry.task.file.protocol.rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
-        trained = time.perf_counter()
+        trained, between = time.perf_counter(), self.models.executions()
         scores = self.validate(self.epoch + 1)
-        finished = time.perf_counter()
-        executions = {name: count - before.get(name, 0) for name, count in self.models.executions().items()}
+        finished, after = time.perf_counter(), self.models.executions()
+        own_steps, played = self.validation_steps
+        executions = [
+            {
+                name: between[name] - before.get(name, 0) + (after[name] - between[name]) * steps // played
+                for name in between
+            }
+            for steps in own_steps.tolist()
+        ]
         self.progress.epoch_seconds = finished - started
         seconds = {"train": trained - started, "validate": finished - trained}
         if self.device == "cpu":
@@ -307,7 +315,12 @@ class GroupRun:
         return means[0], means[1]
 
     def validate(self, epoch: int) -> NDArray[np.float64]:
-        """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V)."""
+        """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V).
+
+        All lanes go on until the last episode of the group has ended. `validation_steps` then holds each seed's
+        steps within its episodes (S,), and the steps that each seed's lanes made in all: executions are counted by
+        the former, so that they do not depend on the company a seed is trained in.
+        """
         envs = self.validation
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
         envs.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
@@ -315,7 +328,9 @@ class GroupRun:
         observations, _ = envs.reset()
         scores = np.full(envs.num_envs, np.nan)
         open_lanes = np.ones(envs.num_envs, dtype=bool)
-        for _ in range(MAX_EPISODE_STEPS):
+        own_steps = np.zeros(self.S, np.int64)
+        for played in range(1, MAX_EPISODE_STEPS + 1):
+            own_steps += open_lanes.reshape(self.S, self.V).sum(1)
             stacked = np.ascontiguousarray(observations, np.float32).reshape(self.S, self.V, -1)
             actions = self.algorithm.act(stacked).reshape(-1)
             observations, _, terminated, truncated, _ = envs.step(actions)
@@ -325,6 +340,7 @@ class GroupRun:
                 scores[lanes[first]] = given[first]
                 open_lanes[lanes] = False
                 if not open_lanes.any():
+                    self.validation_steps = own_steps, played * self.V
                     return scores.reshape(self.S, self.V)
         raise EnvironmentFailure(
             f"environment '{self.entry.task.environment.name}': a validation episode did not end within "
@@ -335,7 +351,7 @@ class GroupRun:
         self,
         metrics: dict[str, NDArray[np.float64]],
         scores: NDArray[np.float64],
-        executions: dict[str, int],
+        executions: list[dict[str, int]],
         seconds: dict[str, float],
     ) -> None:
         """Append one line per seed, and tell the trackers."""
@@ -347,8 +363,8 @@ class GroupRun:
             for name, values in metrics.items():
                 value = float(values[s])
                 line[name] = value if math.isfinite(value) else None
-            if executions:
-                line["executions"] = executions
+            if executions[s]:
+                line["executions"] = executions[s]
             store.append(folder.lines, store.json_line(line))
             timing = {name: round(value / self.S, 6) for name, value in seconds.items()}
             store.append(

@@ -79,10 +79,9 @@ def train(entry: Callable[..., Entry], tmp_path: Path) -> Callable[..., Path]:
 
 
 def results(folder: Path, seed: int) -> tuple[list[dict[str, Any]], bytes]:
-    """What must depend on the seed alone: lines and agent. (Circuits run in validation until the last lane ends.)"""
+    """What must depend on the seed alone: lines, circuit executions among them, and the agent."""
     store = EntryStore(folder).seed(seed)
-    lines = [{k: v for k, v in line.items() if not k.startswith("executions")} for line in store.epochs()]
-    return lines, (store.path / "final.safetensors").read_bytes()
+    return store.epochs(), (store.path / "final.safetensors").read_bytes()
 
 
 def recorded(group: GroupRun) -> list[NDArray[np.float32]]:
