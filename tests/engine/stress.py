@@ -2,15 +2,19 @@
 
 The test beside this file does it a few times. By hand, at large, with figures:
 
-    python -m tests.engine.stress --kills 200 --epochs 150
+    python -m tests.engine.stress --kills 200 --forked --epochs 300 --pause 0.6
+    python -m tests.engine.stress --kills 20
 
-It prints the kills of supervisors and of workers, how many of the workers had begun to train, and how many epochs
-were trained again.
+A kill waits for a worker at work, and then for a random moment: on a busy machine nearly all others hit a process
+that is still importing. With `--forked`, supervisors and workers are forks of a process that has imported everything,
+and start at once; otherwise both are started as a user starts them. It prints the kills of supervisors and of workers,
+how many of the workers had begun to train, and how many epochs were trained again.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -20,7 +24,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from qrlsuite.claims import claims
 from qrlsuite.store import EntryStore, read_lines
@@ -34,7 +41,8 @@ def words(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> list
 
 
 def environment() -> dict[str, str]:
-    return {**os.environ, "QRLSUITE_CHECKPOINT_SECONDS": "0"}
+    """Return the environment of the commands: checkpoints so far apart that a kill finds lines newer than the last."""
+    return {**os.environ, "QRLSUITE_CHECKPOINT_SECONDS": "0.3"}
 
 
 def children(pid: int) -> list[int]:
@@ -61,6 +69,73 @@ def finished(runs: Path, seeds: int, epochs: int) -> Path | None:
     return None
 
 
+class Fork:
+    """A process that calls `program`, with the methods of `subprocess.Popen` that are used here."""
+
+    def __init__(self, program: Callable[[], int]) -> None:
+        self.code: int | None = None
+        self.pid = os.fork()
+        if self.pid == 0:
+            code = 1
+            try:
+                code = program()
+            except SystemExit as end:
+                code = end.code if isinstance(end.code, int) else int(end.code is not None)
+            finally:
+                os._exit(code)
+
+    def poll(self) -> int | None:
+        return self.wait(0.0)
+
+    def wait(self, timeout: float | None = None) -> int | None:
+        if self.code is None:
+            pid, status = os.waitpid(self.pid, 0 if timeout is None else os.WNOHANG)
+            self.code = os.waitstatus_to_exitcode(status) if pid else None
+        return self.code
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+
+def forked_worker(command: list[str], *, stdout: Any, preexec_fn: Callable[[], None], **rest: object) -> Fork:
+    """Stand in for the `subprocess.Popen` of `LocalEngine`."""
+
+    def program() -> int:
+        from qrlsuite.engine import worker
+
+        os.setsid()
+        preexec_fn()
+        os.dup2(stdout.fileno(), 1)
+        os.dup2(stdout.fileno(), 2)
+        return worker.main(command[command.index("qrlsuite.engine.worker") + 1 :])
+
+    return Fork(program)
+
+
+def start_forked(command: list[str]) -> Fork:
+    def program() -> int:
+        from qrlsuite import cli
+        from qrlsuite.engine import local
+
+        os.environ.update(environment())
+        sys.argv = command[2:]
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+            os.dup2(nowhere.fileno(), 2)
+        local.subprocess = SimpleNamespace(  # type: ignore[assignment]
+            Popen=forked_worker, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired
+        )
+        cli.main()
+        return 0
+
+    return Fork(program)
+
+
+def start(command: list[str]) -> subprocess.Popen[bytes]:
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, env=environment(), stdout=quiet, stderr=quiet)
+
+
 def disturbed(
     task: Path,
     runs: Path,
@@ -70,32 +145,32 @@ def disturbed(
     epochs: int,
     workers: int,
     pause: float,
+    start: Callable[[list[str]], Any] = start,
 ) -> tuple[Path, Counter[str]]:
     """Run the command until everything has finished, killing it or a worker up to `kills` times on the way."""
     killed: Counter[str] = Counter()
-    deadline = time.monotonic() + 60 + 20 * kills
+    deadline = time.monotonic() + 60 + 60 * kills
     while (entry := finished(runs, seeds, epochs)) is None:
         assert time.monotonic() < deadline, "no progress between the kills"
-        run = subprocess.Popen(
-            words(task, runs, seeds, epochs, workers),
-            env=environment(),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        run = start(words(task, runs, seeds, epochs, workers))
         killed["starts"] += 1
         while run.poll() is None:
             if killed["supervisor"] + killed["worker"] >= kills:
                 run.wait()
                 break
+            while run.poll() is None and not training(runs) & set(children(run.pid)):
+                time.sleep(0.01)
             time.sleep(dice.uniform(0, pause))
             victims = children(run.pid)
             if dice.random() < 0.2 or not victims:
                 victims = [run.pid]
             victim = dice.choice(victims)
             if run.poll() is None:
-                killed["at work"] += victim in training(runs)
-                os.kill(victim, signal.SIGKILL)
-                killed["supervisor" if victim == run.pid else "worker"] += 1
+                at_work = victim in training(runs)
+                with contextlib.suppress(ProcessLookupError):  # it has just finished
+                    os.kill(victim, signal.SIGKILL)
+                    killed["at work"] += at_work
+                    killed["supervisor" if victim == run.pid else "worker"] += 1
         run.wait()
     return entry, killed
 
@@ -114,7 +189,10 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=150)
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--pause", type=float, default=3.0, help="seconds between kills, at most")
+    parser.add_argument("--forked", action="store_true", help="start processes by forking")
     given = parser.parse_args()
+    if given.forked:
+        import qrlsuite.run  # noqa: F401 - what the forks are to have
     dice = random.Random(0)
     total: Counter[str] = Counter()
     began = time.monotonic()
@@ -136,6 +214,7 @@ def main() -> None:
                 given.epochs,
                 given.workers,
                 given.pause,
+                start_forked if given.forked else start,
             )
             compare(straight, entry, given.seeds, given.epochs)
             again = trained_again(entry, given.seeds, given.epochs)

@@ -20,5 +20,5 @@ def test_killed_again_and_again(tmp_path: Path) -> None:
     straight = finished(tmp_path / "straight", seeds, epochs)
     assert straight is not None
     entry, killed = disturbed(task, tmp_path / "killed", 4, random.Random(4), seeds, epochs, 3, pause=1.2)
-    assert killed["worker"] + killed["supervisor"] >= 2, "it finished before it was killed often enough"
+    assert killed["at work"] + killed["supervisor"] >= 2, "it finished before it was killed often enough"
     compare(straight, entry, seeds, epochs)
