@@ -154,8 +154,16 @@ def raise_failures(outcome: Outcome) -> None:
     Raises
     ------
     QrlSuiteError
-        Naming every group that failed and why.
+        Naming every group that failed and why; groups that failed alike are named together.
     """
     if outcome.failed:
-        lines = [f"group {name}: {message}" for name, message in sorted(outcome.failed.items())]
-        raise QrlSuiteError(f"{len(lines)} group(s) failed, finished epochs are kept: " + "; ".join(lines))
+        alike: dict[str, list[str]] = {}
+        for name, message in sorted(outcome.failed.items()):
+            alike.setdefault(message, []).append(name)
+        lines = [
+            f"{'group' if len(names) == 1 else 'groups'} {', '.join(names)}: {message}"
+            for message, names in alike.items()
+        ]
+        raise QrlSuiteError(
+            f"{len(outcome.failed)} group(s) failed, finished epochs are kept: " + "; ".join(lines)
+        )

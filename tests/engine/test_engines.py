@@ -232,3 +232,13 @@ def test_squeue_is_asked_once_for_many_entries(
     engine = SlurmEngine(Options())
     assert [engine.queued(store) for _ in range(50)] == [{1}] * 50
     assert len(asked) == 1
+
+
+def test_groups_that_failed_alike_are_named_together() -> None:
+    failed = {"b": "no such device", "a": "no such device", "c": "another reason"}
+    with pytest.raises(QrlSuiteError) as caught:
+        api.raise_failures(api.Outcome(failed=failed))
+    assert str(caught.value) == (
+        "3 group(s) failed, finished epochs are kept: groups a, b: no such device; group c: another reason"
+    )
+    api.raise_failures(api.Outcome())
