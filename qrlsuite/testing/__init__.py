@@ -33,6 +33,7 @@ __all__ = [
     "check_environment",
     "check_model",
     "check_significance_test",
+    "check_study",
     "check_task",
     "check_tracker",
 ]
@@ -46,9 +47,10 @@ _FILES = {
     "tasks": "task",
     "engines": "engine",
     "significance_tests": "significance",
+    "studies": "study",
     "trackers": "tracker",
 }
-"""Where the checks of each kind are; of other kinds, what all have in common is checked."""
+"""Where the checks of each kind are."""
 
 Settings = Mapping[str, Any] | None
 
@@ -82,7 +84,7 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
         return tracker.check_plugin(name_or_spec)
     subject = common.subject(wanted, name_or_spec, settings)
     findings, usable = common.check_common(subject)
-    if not usable or wanted not in _FILES:
+    if not usable:
         return findings
     file = importlib.import_module(f"qrlsuite.testing.{_FILES[wanted]}")
     own: list[Finding] = file.check(subject, **more)
@@ -152,6 +154,11 @@ def check_algorithm(name_or_spec: Any, settings: Settings = None) -> list[Findin
 def check_task(name_or_spec: Any) -> list[Finding]:
     """Check a task: its file, what it names, its ranking grid, its scores."""
     return check("task", name_or_spec)
+
+
+def check_study(name_or_spec: Any) -> list[Finding]:
+    """Check a study: its file, its entries, its pictures. It trains nothing."""
+    return check("study", name_or_spec)
 
 
 def check_engine(name_or_spec: Any, settings: Settings = None) -> list[Finding]:

@@ -21,6 +21,11 @@ _MARK = "qrlsuite.testing.fresh "
 """Before the result, for imported modules may print."""
 
 
+def environment() -> dict[str, str]:
+    """Return this process's environment, and the folders that it imports from."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
+
+
 @functools.cache
 def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict[str, Any]:
     """Import plugin modules, call their hooks and resolve references in a new interpreter.
@@ -31,13 +36,12 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
         `modules`: errors by module; `heavy`: heavy packages that registering imported; `references`: error or
         None by reference; `crash`: the last line of stderr, where the interpreter itself ended.
     """
-    path = os.pathsep.join(entry for entry in sys.path if entry)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([modules, references])],
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "PYTHONPATH": path},
+        env=environment(),
     )
     for line in done.stdout.splitlines():
         if line.startswith(_MARK):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.toml import check_names, check_path, in_its_words, read
 
 LONGEST = 20_000
 """Steps within which an episode must end."""
@@ -27,7 +27,7 @@ def check(subject: Subject) -> list[Finding]:
     assert isinstance(spec, specs.TaskSpec)
     rules = Checklist()
     made: list[Task] = []
-    if not rules.run("file", "an absolute path, to a file that is there", lambda: _file(spec)):
+    if not rules.run("file", "an absolute path, to a file that is there", lambda: check_path(spec)):
         return rules.findings
     cause = "values are hashed as JSON, which has neither nan nor infinity"
     if not rules.run(
@@ -35,7 +35,12 @@ def check(subject: Subject) -> list[Finding]:
     ):
         return rules.findings
     task = made[0]
-    rules.run("says what is registered", "name and summary are the file's", lambda: _names(spec, task))
+    elsewhere = "results would lie under another name than the command's"
+    rules.run(
+        "says what is registered",
+        "name and summary are the file's",
+        lambda: check_names(spec, task.file.name, task.file.summary, elsewhere),
+    )
     rules.run("identity", "the same hash every time", lambda: _identity(spec, task))
     rules.run("algorithms", "the default one and those with presets exist", lambda: _algorithms(task))
     rules.run("ranking", "horizons are whole epochs, within a complete run", lambda: _ranking(task))
@@ -43,46 +48,10 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _file(spec: specs.TaskSpec) -> None:
-    require(
-        Path(spec.path).is_absolute(),
-        f"path = {spec.path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
-    )
-    require(
-        Path(spec.path).is_file(),
-        f"{spec.path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
-    )
-
-
-@contextlib.contextmanager
-def _in_its_words() -> Iterator[None]:
-    """Let the suite's own errors say what is broken: they name the place and the remedy."""
-    try:
-        yield
-    except QrlSuiteError as error:
-        raise BrokenRuleError(str(error)) from error
-
-
 def _parse(spec: specs.TaskSpec) -> Task:
-    path = Path(spec.path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise BrokenRuleError(f"{path.name} is not text in UTF-8, as TOML is: {error}") from error
-    with _in_its_words():
-        return parse(text, path.name)
-
-
-def _names(spec: specs.TaskSpec, task: Task) -> None:
-    require(
-        task.file.name == spec.name,
-        f"registered as '{spec.name}', and the file says name = '{task.file.name}': results would lie under another "
-        "name than the command's",
-    )
-    require(
-        task.file.summary == spec.summary,
-        f"registered with the summary {spec.summary!r}, and the file says {task.file.summary!r}: read it from the file",
-    )
+    text = read(spec)
+    with in_its_words():
+        return parse(text, Path(spec.path).name)
 
 
 def _identity(spec: specs.TaskSpec, task: Task) -> None:
@@ -147,7 +116,7 @@ def _scores(task: Task) -> None:
     assert isinstance(model, specs.ModelSpec)
     choose = np.random.Generator(np.random.Philox(key=9))
     ended = 0
-    with _in_its_words():
+    with in_its_words():
         envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
         envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
         envs.reset()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from qrlsuite.specs import TaskSpec
 from tests.conftest import TINY
 from tests.core.test_hooks import install
 from tests.testing.broken import Broken, assert_breaks, own_rules
+from tests.testing.edits import Edit
 
 STRANGE = '''
 import itertools
@@ -62,16 +62,6 @@ def register_environments(register):
         register(EnvironmentSpec(name.lower(), "Strange", f"strange:{name}", "Strange-v0", None, "strange:Lanes"))
 '''
 BEAM = TINY[TINY.index('name = "beam6g"') : TINY.index("[protocol]")]
-
-
-@dataclass(frozen=True)
-class Edit:
-    """A task file that breaks a rule: `TINY` with `old` replaced by `new`, and what is said about it."""
-
-    rule: str
-    old: str
-    new: str
-    message: str
 
 
 def environment(name: str, score: str = 'source = "return"\nmax_return = 1', **options: str) -> str:
@@ -153,8 +143,7 @@ def spec(path: Path, text: str = TINY) -> TaskSpec:
 @pytest.mark.parametrize("name", BROKEN)
 def test_one_rule_is_broken(name: str, tmp_path: Path) -> None:
     edit = BROKEN[name]
-    assert edit.old in TINY
-    case = Broken(spec(tmp_path / "tiny.toml", TINY.replace(edit.old, edit.new, 1)), edit.message)
+    case = Broken(spec(tmp_path / "tiny.toml", edit.of(TINY)), edit.message)
     assert_breaks("tasks", edit.rule, case)
 
 

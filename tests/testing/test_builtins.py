@@ -36,7 +36,7 @@ RULES = {
     "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "ranking", "scores"],
     "significance_tests": ["builds", "signs", "repeatable", "antisymmetric", "equal entries", "direction"],
     "engines": ["builds", "methods", "workers", "queued"],
-    "studies": [],
+    "studies": ["file", "format", "says what is registered", "entries", "all shown", "pictures"],
     "trackers": ["builds", "target", "events"],
 }  # fmt: skip
 """Rules of each kind, after those that all have in common."""
@@ -45,6 +45,7 @@ WHERE_OFFERED = {
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
     ("significance_tests", "intervals"): ["against"],
+    **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},
 }
 """Rules about what a thing need not have."""
 

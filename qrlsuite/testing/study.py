@@ -1,0 +1,105 @@
+"""What a study keeps to: a file whose entries a run takes, and whose pictures can be drawn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from qrlsuite import specs, speed
+from qrlsuite.study import Study, parse
+from qrlsuite.testing.common import Subject
+from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
+from qrlsuite.testing.fresh import environment
+from qrlsuite.testing.toml import check_names, check_path, in_its_words, read
+
+
+def check(subject: Subject) -> list[Finding]:
+    """Check a study's file, its entries and its pictures; nothing is trained."""
+    spec = subject.spec
+    assert isinstance(spec, specs.StudySpec)
+    rules = Checklist()
+    made: list[Study] = []
+    if not rules.run("file", "an absolute path, to a file that is there", lambda: check_path(spec)):
+        return rules.findings
+    if not rules.run(
+        "format", "valid, and groups that pictures name exist", lambda: made.append(_parse(spec))
+    ):
+        return rules.findings
+    study = made[0]
+    elsewhere = "`qrlsuite study list` and the pictures' files would have different names"
+    rules.run(
+        "says what is registered",
+        "name and summary are the file's",
+        lambda: check_names(spec, study.name, study.file.summary, elsewhere),
+    )
+    usable = rules.run(
+        "entries", "tasks, models and options exist, as a run needs them", lambda: _entries(study)
+    )
+    rules.run("all shown", "every group of entries is in a picture", lambda: _all_shown(study))
+    if spec.speeds is not None:
+        rules.run("speeds", "reference speeds can be read", lambda: _speeds(spec))
+    if usable:
+        rules.run("pictures", "they exist and take the settings; `study show` shows it", lambda: _show(spec))
+    return rules.findings
+
+
+def _parse(spec: specs.StudySpec) -> Study:
+    text = read(spec)
+    with in_its_words():
+        return parse(text, Path(spec.path).name)
+
+
+def _entries(study: Study) -> None:
+    with in_its_words():
+        study.members()
+
+
+def _all_shown(study: Study) -> None:
+    if any(not picture.entries for picture in study.file.pictures):
+        return
+    shown = {group for picture in study.file.pictures for group in picture.entries}
+    hidden = [group.name for group in study.file.entries if group.name not in shown]
+    require(
+        not hidden,
+        f"{', '.join(hidden)}: trained, and in no picture. Name the group among a picture's entries, or remove it",
+    )
+
+
+def _speeds(spec: specs.StudySpec) -> None:
+    assert spec.speeds is not None
+    require(
+        Path(spec.speeds).is_absolute(),
+        f"speeds = {spec.speeds!r} is relative to the folder where a command runs: write "
+        "str(Path(__file__).parent / ...)",
+    )
+    with in_its_words():
+        speed.load(Path(spec.speeds))
+
+
+def _show(spec: specs.StudySpec) -> None:
+    """Have the command show the file: what pictures there are is known to the part that draws them."""
+    with tempfile.TemporaryDirectory() as runs:
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "qrlsuite",
+                "study",
+                "show",
+                spec.path,
+                "--json",
+                "--runs",
+                runs,
+            ],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment(),
+        )
+    if done.returncode != 0:
+        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
+        raise BrokenRuleError(" ".join(said).removeprefix("qrlsuite: "))
