@@ -12,7 +12,7 @@ from qrlsuite.study import Study, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import environment
-from qrlsuite.testing.toml import check_names, check_path, in_its_words, read
+from qrlsuite.testing.toml import check_format, check_names, in_its_words
 
 
 def check(subject: Subject) -> list[Finding]:
@@ -20,20 +20,11 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.StudySpec)
     rules = Checklist()
-    made: list[Study] = []
-    if not rules.run("file", "an absolute path, to a file that is there", lambda: check_path(spec)):
+    study = check_format(rules, spec, parse, "valid, and groups that pictures name exist")
+    if study is None:
         return rules.findings
-    if not rules.run(
-        "format", "valid, and groups that pictures name exist", lambda: made.append(_parse(spec))
-    ):
-        return rules.findings
-    study = made[0]
     elsewhere = "`qrlsuite study list` and the pictures' files would have different names"
-    rules.run(
-        "says what is registered",
-        "name and summary are the file's",
-        lambda: check_names(spec, study.name, study.file.summary, elsewhere),
-    )
+    check_names(rules, spec, study.name, study.file.summary, elsewhere)
     usable = rules.run(
         "entries", "tasks, models and options exist, as a run needs them", lambda: _entries(study)
     )
@@ -43,12 +34,6 @@ def check(subject: Subject) -> list[Finding]:
     if usable:
         rules.run("pictures", "they exist and take the settings; `study show` shows it", lambda: _show(spec))
     return rules.findings
-
-
-def _parse(spec: specs.StudySpec) -> Study:
-    text = read(spec)
-    with in_its_words():
-        return parse(text, Path(spec.path).name)
 
 
 def _entries(study: Study) -> None:

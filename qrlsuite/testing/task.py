@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
-from qrlsuite.testing.toml import check_names, check_path, in_its_words, read
+from qrlsuite.testing.toml import check_format, check_names, in_its_words, parsed
 
 LONGEST = 20_000
 """Steps within which an episode must end."""
@@ -26,21 +25,12 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.TaskSpec)
     rules = Checklist()
-    made: list[Task] = []
-    if not rules.run("file", "an absolute path, to a file that is there", lambda: check_path(spec)):
-        return rules.findings
     cause = "values are hashed as JSON, which has neither nan nor infinity"
-    if not rules.run(
-        "format", "valid, with an environment that exists", lambda: made.append(_parse(spec)), cause
-    ):
+    task = check_format(rules, spec, parse, "valid, with an environment that exists", cause)
+    if task is None:
         return rules.findings
-    task = made[0]
     elsewhere = "results would lie under another name than the command's"
-    rules.run(
-        "says what is registered",
-        "name and summary are the file's",
-        lambda: check_names(spec, task.file.name, task.file.summary, elsewhere),
-    )
+    check_names(rules, spec, task.file.name, task.file.summary, elsewhere)
     rules.run("identity", "the same hash every time", lambda: _identity(spec, task))
     rules.run("algorithms", "the default one and those with presets exist", lambda: _algorithms(task))
     rules.run("ranking", "horizons are whole epochs, within a complete run", lambda: _ranking(task))
@@ -48,15 +38,9 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _parse(spec: specs.TaskSpec) -> Task:
-    text = read(spec)
-    with in_its_words():
-        return parse(text, Path(spec.path).name)
-
-
 def _identity(spec: specs.TaskSpec, task: Task) -> None:
     require(
-        _parse(spec).hash == task.hash,
+        parsed(spec, parse).hash == task.hash,
         "read twice, the task has two hashes, under which results are kept: does an option of its environment take its "
         "default from a clock, a counter or a random number?",
     )

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from qrlsuite import specs
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.testing.findings import BrokenRuleError, require
+from qrlsuite.testing.findings import BrokenRuleError, Checklist, require
 
-
-def check_path(spec: specs.TaskSpec | specs.StudySpec) -> None:
-    """Require that the path leads to a file, from whatever folder a command runs in."""
-    require(
-        Path(spec.path).is_absolute(),
-        f"path = {spec.path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
-    )
-    require(
-        Path(spec.path).is_file(),
-        f"{spec.path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
-    )
+T = TypeVar("T")
+FileSpec = specs.TaskSpec | specs.StudySpec
 
 
 @contextlib.contextmanager
@@ -32,17 +24,43 @@ def in_its_words() -> Iterator[None]:
         raise BrokenRuleError(str(error)) from error
 
 
-def read(spec: specs.TaskSpec | specs.StudySpec) -> str:
-    """Return the file's text."""
+def parsed(spec: FileSpec, parse: Callable[[str, str], T]) -> T:
+    """Return the parsed file; `parse` takes its text and its name."""
     path = Path(spec.path)
     try:
-        return path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise BrokenRuleError(f"{path.name} is not text in UTF-8, as TOML is: {error}") from error
+    with in_its_words():
+        return parse(text, path.name)
 
 
-def check_names(spec: specs.TaskSpec | specs.StudySpec, name: str, summary: str, otherwise: str) -> None:
-    """Require that name and summary are the file's.
+def check_format(
+    rules: Checklist, spec: FileSpec, parse: Callable[[str, str], T], valid: str, cause: str = ""
+) -> T | None:
+    """Check that the file is there and valid.
+
+    Parameters
+    ----------
+    valid:
+        What holds for a file that is.
+    cause:
+        Of errors that are not the suite's own.
+
+    Returns
+    -------
+    object or None
+        The parsed file; None where there is none.
+    """
+    if not rules.run("file", "an absolute path, to a file that is there", lambda: _check_path(spec)):
+        return None
+    made: list[T] = []
+    rules.run("format", valid, lambda: made.append(parsed(spec, parse)), cause)
+    return made[0] if made else None
+
+
+def check_names(rules: Checklist, spec: FileSpec, name: str, summary: str, otherwise: str) -> None:
+    """Check that name and summary are the file's.
 
     Parameters
     ----------
@@ -51,6 +69,25 @@ def check_names(spec: specs.TaskSpec | specs.StudySpec, name: str, summary: str,
     otherwise:
         What another name would lead to.
     """
+    rules.run(
+        "says what is registered",
+        "name and summary are the file's",
+        lambda: _check_names(spec, name, summary, otherwise),
+    )
+
+
+def _check_path(spec: FileSpec) -> None:
+    require(
+        Path(spec.path).is_absolute(),
+        f"path = {spec.path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
+    )
+    require(
+        Path(spec.path).is_file(),
+        f"{spec.path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
+    )
+
+
+def _check_names(spec: FileSpec, name: str, summary: str, otherwise: str) -> None:
     require(name == spec.name, f"registered as '{spec.name}', and the file says name = '{name}': {otherwise}")
     require(
         summary == spec.summary,
