@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, get_args, get_origin
 
 import pydantic
@@ -152,11 +152,23 @@ def plain(options: Any) -> Values:
 
 @dataclass(frozen=True)
 class Setting:
-    """One word of `--set`: `side.name=value`, or `name=value` where the side is to be found."""
+    """One word of `--set`: `side.name=value`, or `name=value` where the side is to be found.
+
+    Attributes
+    ----------
+    prefix:
+        What stands before it where it was written, for messages.
+    """
 
     side: str | None
     name: str
     value: Any
+    prefix: str = field(default="--set ", compare=False)
+
+    @property
+    def written(self) -> str:
+        """Name the place where it was written: `--set model.width`."""
+        return f"{self.prefix}{self.side}.{self.name}" if self.side else f"{self.prefix}{self.name}"
 
 
 def parse_setting(word: str) -> Setting:
@@ -199,13 +211,13 @@ def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[
         owners = [side for side, cls in sides.items() if setting.name in field_names(cls)]
         if setting.side is not None:
             if setting.side not in sides:
-                raise OptionError(f"--set {setting.side}.{setting.name}: sides are {', '.join(sides)}")
+                raise OptionError(f"{setting.written}: sides are {', '.join(sides)}")
             owners = [setting.side]
         if not owners:
             bare = {name.partition(".")[2] for name in every}
-            raise OptionError(f"--set {setting.name}: no option of that name{nearest(setting.name, bare)}")
+            raise OptionError(f"{setting.written}: no option of that name{nearest(setting.name, bare)}")
         if len(owners) > 1:
-            choices = " or ".join(f"--set {side}.{setting.name}=..." for side in owners)
-            raise OptionError(f"--set {setting.name}: several have that option; write {choices}")
+            choices = " or ".join(f"{setting.prefix}{side}.{setting.name}=..." for side in owners)
+            raise OptionError(f"{setting.written}: several have that option; write {choices}")
         result[owners[0]][setting.name] = setting.value
     return result

@@ -180,7 +180,7 @@ class Study:
         for setting in settings:
             if (setting.side, setting.name) not in used:
                 raise OptionError(
-                    f"--set {setting.name}: no entry of study '{self.name}' has an option of that name"
+                    f"{setting.written}: no entry of study '{self.name}' has an option of that name"
                 )
         every = [member for members_ in found.values() for member in members_]
         if len(every) > LARGEST:
@@ -201,16 +201,16 @@ def _listed(words: str | list[str]) -> list[str]:
     return [words] if isinstance(words, str) else words
 
 
-def _setting(word: str, value: Any) -> Setting:
+def _setting(key: str, word: str, value: Any) -> Setting:
     side, dot, name = word.rpartition(".")
-    return Setting(side if dot else None, name, value)
+    return Setting(side if dot else None, name, value, f"{key}.")
 
 
 def _drafts(group: EntriesSection) -> Iterator[_Draft]:
-    fixed = [_setting(word, value) for word, value in group.options.items()]
+    fixed = [_setting("options", word, value) for word, value in group.options.items()]
     for task, model in itertools.product(_listed(group.task), _listed(group.model)):
         for values in itertools.product(*group.grid.values()):
-            varied = [_setting(word, value) for word, value in zip(group.grid, values)]
+            varied = [_setting("grid", word, value) for word, value in zip(group.grid, values)]
             yield _Draft(task, model, (*fixed, *varied))
 
 
@@ -250,7 +250,7 @@ def _has(task: str, model: str, algorithm: str | None, setting: Setting) -> bool
         "algorithm": registry.algorithm(algorithm or loaded.file.default_algorithm).options,
     }
     if setting.side is not None and setting.side not in sides:
-        raise OptionError(f"--set {setting.side}.{setting.name}: sides are {', '.join(sides)}")
+        raise OptionError(f"{setting.written}: sides are {', '.join(sides)}")
     chosen = [sides[setting.side]] if setting.side is not None else list(sides.values())
     return any(setting.name in options.field_names(specs.resolve(reference)) for reference in chosen)
 

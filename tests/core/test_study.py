@@ -230,7 +230,7 @@ def test_unknown_names() -> None:
         study.load("no/such.toml")
     with pytest.raises(UnknownNameError, match="unknown model 'mpl'"):
         study.parse(SMALL.replace('model = "mlp"', 'model = "mpl"'), "small.toml").members()
-    with pytest.raises(OptionError, match=r"small\.toml, group 'vqc': --set qubit: .* did you mean 'qubits'"):
+    with pytest.raises(OptionError, match=r"small\.toml, group 'vqc': grid\.qubit: .* did you mean 'qubits'"):
         study.parse(SMALL.replace("qubits = [", "qubit = ["), "small.toml").members()
 
 

@@ -53,7 +53,7 @@ BROKEN = {
     "summary": Edit("says what is registered", "Two sizes", "Sizes", r"with the summary .* read it from the file"),
     "task": Edit("entries", '"beam6g"', '"beam5g"', r"group 'mlp': unknown task 'beam5g'; did you mean 'beam6g"),
     "model": Edit("entries", '"mlp"\ngrid', '"mpl"\ngrid', r"group 'mlp': unknown model 'mpl'; did you mean 'mlp'"),
-    "option": Edit("entries", "width =", "widht =", r"group 'mlp': .*widht: no option of that name; did you mean"),
+    "option": Edit("entries", "width =", "widht =", r"group 'mlp': grid.widht: no option of that name; did you mean"),
     "value": Edit("entries", "[8, 16]", "[8, 0]", r"group 'mlp': .*width"),
     "hidden": Edit("all shown", '["mlp", "deep"]', '["mlp"]', r"^deep: trained, and in no picture"),
     "kind": Edit("pictures", '"bars"', '"bar"', r"pictures.0.kind: unknown picture 'bar'; did you mean 'bars'"),
