@@ -162,14 +162,14 @@ def space(
     for algorithm in ("all", entry.algorithm.name):
         for family in ("all", entry.model.family):
             for word, values in tables.get(algorithm, {}).get(family, {}).items():
-                found[_full_name(word, sides)] = values
+                found[_full_name(word, sides, "search: ")] = values
     for setting in varied:
-        name = _full_name(_word(setting), sides)
+        name = _full_name(_word(setting), sides, "--vary ")
         _forget(found, name)
         found[name] = _values(name, setting.value)
     for setting in fixed:
         if setting.side != "environment" and (setting.side or _owned(setting.name, sides)):
-            _forget(found, _full_name(_word(setting), sides))
+            _forget(found, _full_name(_word(setting), sides, setting.prefix))
     if not found:
         raise OptionError(
             f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: give --grid NAME, --grid FILE.toml "
@@ -190,12 +190,18 @@ def _owned(name: str, sides: Mapping[str, type[Any]]) -> bool:
     return any(name in options.field_names(cls) for cls in sides.values())
 
 
-def _full_name(word: str, sides: Mapping[str, type[Any]]) -> str:
-    """Return option names with their sides: `lr` as `algorithm.lr`, `a+b` as `model.a+model.b`."""
+def _full_name(word: str, sides: Mapping[str, type[Any]], prefix: str) -> str:
+    """Return option names with their sides: `lr` as `algorithm.lr`, `a+b` as `model.a+model.b`.
+
+    Parameters
+    ----------
+    prefix:
+        What stands before it where it was written, for messages.
+    """
     parts = []
     for part in word.split("+"):
         side, dot, name = part.strip().partition(".")
-        setting = Setting(side, name, None) if dot else Setting(None, side, None)
+        setting = Setting(side, name, None, prefix) if dot else Setting(None, side, None, prefix)
         for owner, values in options.assign([setting], sides).items():
             parts += [f"{owner}.{option}" for option in values]
     return "+".join(parts)

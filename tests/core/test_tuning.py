@@ -181,6 +181,12 @@ def test_set_takes_an_option_out_of_the_grid(tiny_task: str) -> None:
     assert "algorithm.lr" not in names
 
 
+def test_an_unknown_option_is_named_as_it_was_typed(tiny_task: str) -> None:
+    entry = resolve(tiny_task, "mlp")
+    with pytest.raises(OptionError, match=r"^--vary widht: no option of that name; did you mean 'width'"):
+        space.space(entry, None, [space.parse_varied("widht=8,16")])
+
+
 def test_one_at_a_time_starts_at_what_is_untuned(tiny_task: str) -> None:
     what = search.Search(request(tiny_task, sampler="one-at-a-time"), Path("nowhere"))
     points = [tuple(what.sampler.ask().values()) for _ in range(what.planned)]
