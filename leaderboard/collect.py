@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError, nearest
+from qrlsuite import naming
+from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import origin
 from qrlsuite.preset import TUNING_SEEDS
 from qrlsuite.store import EntryStore, SeedCurve, entries
@@ -124,37 +125,19 @@ def collect(
 
 
 def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
-    """Read the one entry whose name, label or hash begins with `name`, or whose folder it is.
+    """Read the entry that has a name (see `qrlsuite.naming`), or whose folder it is.
 
     Raises
     ------
     UnknownNameError
-        If none or several match; the message lists them.
+        If none or several match; the message says what to type.
     """
     if (Path(name) / "entry.json").exists():
-        found = [read(EntryStore(Path(name)))]
-    else:
-        everything, _ = collect(runs, shipped=shipped)
-        exact = [e for e in everything if name in _names(e)]
-        found = list(exact or [e for e in everything if _matches(e, name)])
-        if not found:
-            known = [e.name for e in everything]
-            raise UnknownNameError(f"no entry '{name}' in {runs}{nearest(name, known)}")
-    if len(found) > 1:
-        names = ", ".join(e.name for e in found if e)
-        raise UnknownNameError(f"'{name}' may be any of {names}: write more of the name")
-    if found[0] is None:
-        raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
-    return found[0]
-
-
-def _matches(entry: EntryCurves, name: str) -> bool:
-    return any(known.startswith(name) for known in _names(entry))
-
-
-def _names(entry: EntryCurves) -> tuple[str, ...]:
-    """Return what an entry answers to: name, label, label without the algorithm, hash."""
-    return entry.name, entry.label, entry.label.partition(" ")[2], entry.name.rpartition("-")[2]
+        found = read(EntryStore(Path(name)))
+        if found is None:
+            raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
+        return found
+    return naming.choose(collect(runs, shipped=shipped)[0], name, runs)
 
 
 def read(store: EntryStore) -> EntryCurves | None:

@@ -7,7 +7,7 @@ exit code 2. Anything else that escapes is a bug and keeps its traceback.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class QrlSuiteError(Exception):
@@ -42,6 +42,12 @@ class EnvironmentFailure(QrlSuiteError):
     """An environment raised while it was being stepped; the message carries the environment's own."""
 
 
+def listed(words: Sequence[str], most: int = 20) -> str:
+    """Join words with commas; the first `most` of them, and how many more there are."""
+    more = len(words) - most
+    return ", ".join(words[:most]) + (f" and {more} more" if more > 0 else "")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return `"; did you mean 'x'?"` for the closest known name, else the list of what there is.
 
@@ -52,8 +58,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     known:
         Every name that would have been accepted.
     """
-    names = sorted(known)
+    names = sorted(set(known))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if close:
         return f"; did you mean '{close[0]}'?"
-    return f"; known: {', '.join(names)}" if names else "; none is registered"
+    return f"; known: {listed(names)}" if names else "; none is registered"

@@ -24,7 +24,10 @@ SYMBOLS = {
 
 
 def compare(
-    first: Annotated[str, typer.Argument(metavar="ENTRY", help="An entry's name, or the beginning of it.")],
+    first: Annotated[
+        str,
+        typer.Argument(metavar="ENTRY", help="An entry: name or label, [TASK/] before it, or the beginning."),
+    ],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
     rule: RuleOption = rules.DEFAULT,
     published: PublishedOption = False,

@@ -21,7 +21,8 @@ def evaluate(
     entries: Annotated[
         list[str],
         typer.Argument(
-            metavar="ENTRY...", help="Entries of one task: name, label, the beginning of either, or folder."
+            metavar="ENTRY...",
+            help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder.",
         ),
     ],
     best: Annotated[

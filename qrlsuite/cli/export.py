@@ -12,7 +12,8 @@ from qrlsuite.cli.app import RunsOption
 
 def export(
     entries: Annotated[
-        list[str] | None, typer.Argument(metavar="[ENTRY]...", help="Names, or the beginnings of them.")
+        list[str] | None,
+        typer.Argument(metavar="[ENTRY]...", help="Names or labels, [TASK/] before them, or the beginnings."),
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/TASK/ENTRY/.")] = Path(

@@ -37,7 +37,8 @@ def plot(
     entry: Annotated[
         list[str] | None,
         typer.Option(
-            "--entry", help="Only these entries (name or label, or the beginning of it), in this order."
+            "--entry",
+            help="Only these entries (name or label, [TASK/] before it, or the beginning), in this order.",
         ),
     ] = None,
     settings: Annotated[

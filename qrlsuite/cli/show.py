@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,10 @@ from qrlsuite.cli.terminal import printable_lines
 
 def show(
     name: Annotated[
-        str, typer.Argument(help="A task, model, algorithm, environment, ansatz, or an entry's folder.")
+        str,
+        typer.Argument(
+            help="A task, model, algorithm, environment, ansatz, or an entry: name, label or folder."
+        ),
     ],
     second: Annotated[
         str | None, typer.Argument(metavar="[NAME]", help="With a kind first: `show ansatz iqp`.")
@@ -96,16 +100,40 @@ def _kind(first: str, second: str | None) -> tuple[str | None, str]:
     return singulars[first], second
 
 
+@dataclass(frozen=True)
+class _Stored:
+    """An entry in a results folder, and what it is called by."""
+
+    path: Path
+    name: str
+    label: str
+    task: str
+
+
 def _entry_folder(runs: Path, name: str) -> Path | None:
-    """Find an entry's folder by path, or by (the beginning of) its name below the results folder."""
+    """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits."""
+    from qrlsuite import naming
+    from qrlsuite.errors import StoreError, UnknownNameError
     from qrlsuite.store import entries
 
     if (Path(name) / "entry.json").exists():
         return Path(name)
     if not runs.is_dir():
         return None
-    matches = [store.path for store in entries(runs) if store.path.name.startswith(name)]
-    return matches[0] if len(matches) == 1 else None
+    stored = []
+    for store in entries(runs):
+        try:
+            record = store.record()
+            label = record["label"]
+        except StoreError:  # said where it is the one that was asked for
+            label = ""
+        stored.append(_Stored(store.path, store.path.name, label, store.path.parent.name))
+    try:
+        return naming.choose(stored, name, runs).path
+    except UnknownNameError:
+        if any(name in f"{entry.task}/{entry.label}" for entry in stored):
+            raise
+        return None
 
 
 def _entry(folder: Path) -> dict[str, Any]:

@@ -37,6 +37,8 @@ REQUEUES = 1000
 
 ASK_SECONDS = 5.0
 """How long an answer of `squeue` is good for: a hundred entries are looked at by asking once."""
+ANSWER_SECONDS = 30
+"""How long an answer of `squeue` is waited for; a controller that is down is noticed by it after some ten."""
 
 _TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
 
@@ -247,14 +249,16 @@ def _waiting() -> set[str]:
     """
     command = ["squeue", "--noheader", "--array", "--format", "%i"]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_SECONDS, check=True)
     except FileNotFoundError:
         raise QrlSuiteError(
             "there is no SLURM on this machine (squeue is not found); --engine local needs none"
         ) from None
     except subprocess.CalledProcessError as error:
         raise QrlSuiteError(f"squeue does not answer: {_last_line(error.stderr)}") from None
-    except (OSError, subprocess.SubprocessError) as error:
+    except subprocess.TimeoutExpired:
+        raise QrlSuiteError(f"squeue does not answer within {ANSWER_SECONDS} s") from None
+    except OSError as error:
         raise QrlSuiteError(f"squeue does not answer: {error}") from None
     return set(result.stdout.split())
 

@@ -86,6 +86,10 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
     store = EntryStore(Path(json.loads(used.stdout)["folder"]))
     assert store.record()["tuning"]["seeds"] == "1000000:1000001"
     shown = json.loads(qrlsuite("show", str(store.path), "--json").stdout)
+    for name in (store.path.name, f"{store.path.parent.name}/{shown['label']}"):
+        assert (
+            json.loads(qrlsuite("show", name, "--runs", str(store.path.parents[1]), "--json").stdout) == shown
+        )
     assert shown["tuning"]["trials"] == 2
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,14 @@ values = st.recursive(
     ),
     max_leaves=5,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_queue(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Where a SLURM is installed, a thousand commands would ask it, and wait long if it does not run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path_factory.mktemp("empty")))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,81 @@
+"""How an entry is called on the command line: by name, label or hash, or the beginning of one of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
+
+from qrlsuite.errors import UnknownNameError, listed, nearest
+
+
+class Named(Protocol):
+    """What has a name (`ddqn-mlp-90e7f8d4`), a label (`ddqn mlp width=64`) and a task."""
+
+    @property
+    def name(self) -> str:
+        """Algorithm, model and hash."""
+
+    @property
+    def label(self) -> str:
+        """Algorithm, model and the options that are not defaults."""
+
+    @property
+    def task(self) -> str:
+        """The task's name."""
+
+
+N = TypeVar("N", bound=Named)
+
+
+def choose(among: Sequence[N], name: str, where: object) -> N:
+    """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
+
+    Where several tasks have such an entry, `TASK/NAME` is one of them. A whole name goes before a beginning.
+
+    Parameters
+    ----------
+    where:
+        For the message: the folder that was looked into.
+
+    Raises
+    ------
+    UnknownNameError
+        If none or several match; the message says what to type.
+    """
+    fitting = [e for e in among if name in _names(e)]
+    fitting = fitting or [e for e in among if any(known.startswith(name) for known in _names(e))]
+    if not fitting:
+        alike = [e for e in among if name in f"{e.task}/{e.label}"]
+        if not alike:
+            labels = {_short(e) for e in among}
+            raise UnknownNameError(f"no entry '{name}' in {where}{nearest(name, labels)}")
+        raise UnknownNameError(f"no entry begins with '{name}'; did you mean {_choices(alike, among)}?")
+    if len(fitting) > 1:
+        raise UnknownNameError(f"'{name}' may be any of {_choices(fitting, among)}: write one of these")
+    return fitting[0]
+
+
+def _short(entry: Named) -> str:
+    """Return the label without the algorithm."""
+    return entry.label.partition(" ")[2]
+
+
+def _names(entry: Named) -> tuple[str, ...]:
+    """Return what an entry answers to."""
+    plain = (entry.name, entry.label, _short(entry), entry.name.rpartition("-")[2])
+    return (*plain, *(f"{entry.task}/{name}" for name in plain))
+
+
+def _choices(entries: Sequence[Named], among: Sequence[Named]) -> str:
+    """List what to type for some entries: the label, with task or hash where several among all have that label."""
+    labels = Counter(e.label for e in among)
+    places = Counter((e.task, e.label) for e in among)
+    words = []
+    for entry in entries:
+        if labels[entry.label] == 1:
+            words.append(entry.label)
+        else:
+            unique = places[entry.task, entry.label] == 1
+            words.append(f"{entry.task}/{entry.label if unique else entry.name}")
+    return listed([f"'{word}'" for word in sorted(words)])

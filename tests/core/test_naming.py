@@ -1,0 +1,82 @@
+"""What an entry answers to on the command line, and what is said where a name fits none or several."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from qrlsuite import naming
+from qrlsuite.errors import UnknownNameError
+from tests.leaderboard.boards import entry
+
+SEVERAL = [
+    dataclasses.replace(entry(label, task=task), name=name)
+    for label, task, name in (
+        ("ddqn mlp width=16", "beam6g", "ddqn-mlp-11111111"),
+        ("ddqn mlp width=16", "beam6g-degree4", "ddqn-mlp-22222222"),
+        ("ppo mlp width=16", "beam6g", "ppo-mlp-33333333"),
+        ("ddqn mlp width=8", "beam6g", "ddqn-mlp-66666666"),
+        ("ddqn mlp width=8", "beam6g", "ddqn-mlp-77777777"),
+        ("ddqn mlp width=64", "beam6g", "ddqn-mlp-44444444"),
+        ("ddqn mlp width=64 depth=3", "beam6g", "ddqn-mlp-55555555"),
+    )
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("ddqn mlp width=64", 5),
+        ("mlp width=64", 5),
+        ("mlp width=64 d", 6),
+        ("44444444", 5),
+        ("ddqn-mlp-5", 6),
+        ("beam6g-degree4/mlp width=16", 1),
+        ("beam6g/ddqn mlp width=16", 0),
+        ("beam6g-degree4/", 1),
+    ],
+)
+def test_an_entry_answers_to(name: str, found: int) -> None:
+    assert naming.choose(SEVERAL, name, "runs") is SEVERAL[found]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "ddqn mlp width=16",
+            "'ddqn mlp width=16' may be any of 'beam6g-degree4/ddqn mlp width=16', 'beam6g/ddqn mlp width=16': write",
+        ),
+        (
+            "beam6g/mlp width=16",
+            "'beam6g/mlp width=16' may be any of 'beam6g/ddqn mlp width=16', 'ppo mlp width=16': write one of these",
+        ),
+        (
+            "width=64",
+            "no entry begins with 'width=64'; did you mean 'ddqn mlp width=64', 'ddqn mlp width=64 depth=3'?",
+        ),
+        ("mpl width=64", "no entry 'mpl width=64' in runs; did you mean 'mlp width=64'?"),
+        ("x", "no entry 'x' in runs; known: mlp width=16, mlp width=64, mlp width=64 depth=3, mlp width=8"),
+    ],
+)
+def test_a_name_that_fits_none_or_several(name: str, message: str) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        naming.choose(SEVERAL, name, "runs")
+    assert str(caught.value).startswith(message)
+
+
+def test_what_is_offered_is_found() -> None:
+    """Labels are told apart by the task; where one task has two entries of a label, by the name."""
+    with pytest.raises(UnknownNameError) as caught:
+        naming.choose(SEVERAL, "ddqn", "runs")
+    offered = str(caught.value).split("'")[3::2]
+    found = {naming.choose(SEVERAL, word, "runs").name for word in offered}
+    assert found == {e.name for e in SEVERAL if e.label.startswith("ddqn")}
+
+
+def test_long_lists_are_cut() -> None:
+    many = [entry(f"ddqn mlp width={width}") for width in range(100, 160)]
+    for name in ("mlp", "q"):
+        with pytest.raises(UnknownNameError, match=r"mlp width=119'? and 40 more"):
+            naming.choose(many, name, "runs")
