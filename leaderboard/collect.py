@@ -100,13 +100,9 @@ def collect(
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    from qrlsuite.leaderboard import published
-
-    stores = [] if shipped and not runs.is_dir() else entries(runs, task)
-    stores += entries(published.SHIPPED, task) if shipped else []
     good: dict[tuple[str, str, str], EntryCurves] = {}
     refused = []
-    for store in stores:
+    for store in _folders(runs, shipped, task):
         try:
             entry = read(store)
         except QrlSuiteError as error:
@@ -133,11 +129,24 @@ def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
         If none or several match; the message says what to type.
     """
     if (Path(name) / "entry.json").exists():
-        found = read(EntryStore(Path(name)))
-        if found is None:
-            raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
-        return found
-    return naming.choose(collect(runs, shipped=shipped)[0], name, runs)
+        folders = [EntryStore(Path(name))]
+    else:
+        everything = naming.stored(_folders(runs, shipped))
+        unique = list({entry.key: entry for entry in everything}.values())
+        key = naming.choose(unique, name, runs).key
+        folders = [entry.store for entry in everything if entry.key == key]
+    found = [entry for entry in map(read, folders) if entry is not None]
+    if not found:
+        raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
+    return max(found, key=lambda entry: len(entry.seeds))
+
+
+def _folders(runs: Path, shipped: bool, task: str | None = None) -> list[EntryStore]:
+    """Return the entries' folders: those in the results folder, and with `shipped` the published ones."""
+    from qrlsuite.leaderboard import published
+
+    stores = [] if shipped and not runs.is_dir() else entries(runs, task)
+    return stores + (entries(published.SHIPPED, task) if shipped else [])
 
 
 def read(store: EntryStore) -> EntryCurves | None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from qrlsuite.errors import UnknownNameError, listed, nearest
+from qrlsuite.errors import StoreError, UnknownNameError, listed, nearest
+from qrlsuite.store import EntryStore
 
 
 class Named(Protocol):
@@ -26,6 +28,38 @@ class Named(Protocol):
 
 
 N = TypeVar("N", bound=Named)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An entry's folder, and what it is called by; its curves are not read.
+
+    Attributes
+    ----------
+    key:
+        Equal for folders of the same entry.
+    """
+
+    store: EntryStore
+    name: str
+    label: str
+    task: str
+    key: tuple[str, str, str]
+
+
+def stored(stores: Iterable[EntryStore]) -> list[Stored]:
+    """Return what the entries in some folders are called by; a damaged one has its folder's name and no label."""
+    found = []
+    for store in stores:
+        name, task = store.path.name, store.path.parent.name
+        try:
+            record = store.record()
+        except StoreError:  # is said where it is the one that was asked for
+            found.append(Stored(store, name, "", task, (task, "", str(store.path))))
+        else:
+            key = (record["task_name"], record["task_hash"], record["name"])
+            found.append(Stored(store, record["name"], record["label"], record["task_name"], key))
+    return found
 
 
 def choose(among: Sequence[N], name: str, where: object) -> N:

@@ -206,15 +206,21 @@ class SeedStore:
         """Replace `run.json`."""
         write_json(self.path / "run.json", content)
 
-    def epochs(self) -> list[dict[str, Any]]:
+    def epochs(self, decimals: bool = True) -> list[dict[str, Any]]:
         """Return every epoch's record in order: the table, then newer lines.
+
+        Parameters
+        ----------
+        decimals:
+            Whether scores are the shortest decimals, as in the lines; else they are float32 as they are, which is
+            three times faster.
 
         Raises
         ------
         StoreError
             If a file is damaged or an epoch is missing.
         """
-        rows = read_table(self.table) if self.table.exists() else []
+        rows = read_table(self.table, decimals) if self.table.exists() else []
         last = _epoch(rows[-1], self.table) if rows else 0
         rows += [line for line in read_lines(self.lines) if _epoch(line, self.lines) > last]
         for expected, row in enumerate(rows, start=1):
@@ -275,7 +281,7 @@ class SeedStore:
         StoreError
             If scores are missing, not finite, or differ in number between epochs.
         """
-        rows = self.epochs()
+        rows = self.epochs(decimals=False)
         try:
             with np.errstate(over="ignore"):
                 scores = np.array([row["scores"] for row in rows], dtype=np.float32)
@@ -330,8 +336,13 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def read_table(path: Path) -> list[dict[str, Any]]:
+def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     """Read what `table_bytes` encoded.
+
+    Parameters
+    ----------
+    decimals:
+        See `SeedStore.epochs`.
 
     Raises
     ------
@@ -346,7 +357,7 @@ def read_table(path: Path) -> list[dict[str, Any]]:
     except (OSError, pyarrow.ArrowException) as error:
         raise StoreError(f"{path} is not a readable parquet file: {error}") from None
     try:
-        rows = [_nest(flat) for flat in table.to_pylist()]
+        rows = [_nest(flat, decimals) for flat in table.to_pylist()]
     except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
         raise StoreError(
             f"{path} does not hold epochs; restore the file or delete the seed's folder"
@@ -360,7 +371,7 @@ def _first_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
 
 
-def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+def _nest(flat: Mapping[str, Any], decimals: bool) -> dict[str, Any]:
     """Undo `_flatten`."""
     row: dict[str, Any] = {}
     for name, value in flat.items():
@@ -368,7 +379,8 @@ def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
         if dot:
             row.setdefault(outer, {})[inner] = value
         else:
-            row[name] = shortest(np.array(value)) if name == "scores" and value is not None else value
+            exact = decimals and name == "scores" and value is not None
+            row[name] = shortest(np.array(value)) if exact else value
     return row
 
 

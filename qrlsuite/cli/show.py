@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -100,36 +99,19 @@ def _kind(first: str, second: str | None) -> tuple[str | None, str]:
     return singulars[first], second
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """An entry in a results folder, and what it is called by."""
-
-    path: Path
-    name: str
-    label: str
-    task: str
-
-
 def _entry_folder(runs: Path, name: str) -> Path | None:
     """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits."""
     from qrlsuite import naming
-    from qrlsuite.errors import StoreError, UnknownNameError
+    from qrlsuite.errors import UnknownNameError
     from qrlsuite.store import entries
 
     if (Path(name) / "entry.json").exists():
         return Path(name)
     if not runs.is_dir():
         return None
-    stored = []
-    for store in entries(runs):
-        try:
-            record = store.record()
-            label = record["label"]
-        except StoreError:  # said where it is the one that was asked for
-            label = ""
-        stored.append(_Stored(store.path, store.path.name, label, store.path.parent.name))
+    stored = naming.stored(entries(runs))
     try:
-        return naming.choose(stored, name, runs).path
+        return naming.choose(stored, name, runs).store.path
     except UnknownNameError:
         if any(name in f"{entry.task}/{entry.label}" for entry in stored):
             raise
