@@ -48,14 +48,14 @@ class Stored:
 
 
 def stored(stores: Iterable[EntryStore]) -> list[Stored]:
-    """Return what the entries in some folders are called by; a damaged one has its folder's name and no label."""
+    """Return what the entries in some folders are called by; a damaged one is called by its folder."""
     found = []
     for store in stores:
         name, task = store.path.name, store.path.parent.name
         try:
             record = store.record()
         except StoreError:  # is said where it is the one that was asked for
-            found.append(Stored(store, name, "", task, (task, "", str(store.path))))
+            found.append(Stored(store, name, name, task, (task, "", str(store.path))))
         else:
             key = (record["task_name"], record["task_hash"], record["name"])
             found.append(Stored(store, record["name"], record["label"], record["task_name"], key))
@@ -92,7 +92,7 @@ def choose(among: Sequence[N], name: str, where: object) -> N:
 
 def _short(entry: Named) -> str:
     """Return the label without the algorithm."""
-    return entry.label.partition(" ")[2]
+    return entry.label.partition(" ")[2] or entry.label
 
 
 def _names(entry: Named) -> tuple[str, ...]:

@@ -212,8 +212,8 @@ class SeedStore:
         Parameters
         ----------
         decimals:
-            Whether scores are the shortest decimals, as in the lines; else they are float32 as they are, which is
-            three times faster.
+            Whether scores are the shortest decimals, as in the lines; else those of the table are the float32 as they
+            are, which saves most of the time.
 
         Raises
         ------

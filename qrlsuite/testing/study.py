@@ -12,7 +12,7 @@ from qrlsuite.study import Study, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import environment
-from qrlsuite.testing.toml import check_format, check_names, in_its_words
+from qrlsuite.testing.toml import check_format, check_names, check_path, in_its_words
 
 
 def check(subject: Subject) -> list[Finding]:
@@ -54,36 +54,17 @@ def _all_shown(study: Study) -> None:
 
 def _speeds(spec: specs.StudySpec) -> None:
     assert spec.speeds is not None
-    require(
-        Path(spec.speeds).is_absolute(),
-        f"speeds = {spec.speeds!r} is relative to the folder where a command runs: write "
-        "str(Path(__file__).parent / ...)",
-    )
+    check_path("speeds", spec.speeds)
     with in_its_words():
         speed.load(Path(spec.speeds))
 
 
 def _show(spec: specs.StudySpec) -> None:
     """Have the command show the file: what pictures there are is known to the part that draws them."""
+    command = [sys.executable, "-W", "ignore", "-m", "qrlsuite", "study", "show", spec.path, "--json"]
     with tempfile.TemporaryDirectory() as runs:
         done = subprocess.run(
-            [
-                sys.executable,
-                "-W",
-                "ignore",
-                "-m",
-                "qrlsuite",
-                "study",
-                "show",
-                spec.path,
-                "--json",
-                "--runs",
-                runs,
-            ],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment(),
+            [*command, "--runs", runs], capture_output=True, text=True, check=False, env=environment()
         )
     if done.returncode != 0:
         said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]

@@ -52,7 +52,9 @@ def check_format(
     object or None
         The parsed file; None where there is none.
     """
-    if not rules.run("file", "an absolute path, to a file that is there", lambda: _check_path(spec)):
+    if not rules.run(
+        "file", "an absolute path, to a file that is there", lambda: check_path("path", spec.path)
+    ):
         return None
     made: list[T] = []
     rules.run("format", valid, lambda: made.append(parsed(spec, parse)), cause)
@@ -76,14 +78,15 @@ def check_names(rules: Checklist, spec: FileSpec, name: str, summary: str, other
     )
 
 
-def _check_path(spec: FileSpec) -> None:
+def check_path(field: str, path: str) -> None:
+    """Require that a field of a spec leads to a file, from whatever folder a command runs in."""
     require(
-        Path(spec.path).is_absolute(),
-        f"path = {spec.path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
+        Path(path).is_absolute(),
+        f"{field} = {path!r} is relative to the folder where a command runs: write str(Path(__file__).parent / ...)",
     )
     require(
-        Path(spec.path).is_file(),
-        f"{spec.path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
+        Path(path).is_file(),
+        f"{path} is not there: is the TOML file among the package data, [tool.setuptools.package-data]?",
     )
 
 

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from qrlsuite import naming
 from qrlsuite.errors import UnknownNameError
-from tests.leaderboard.boards import entry
+from qrlsuite.store import entries
+
+
+class Entry(NamedTuple):
+    label: str
+    task: str
+    name: str
+
 
 SEVERAL = [
-    dataclasses.replace(entry(label, task=task), name=name)
-    for label, task, name in (
-        ("ddqn mlp width=16", "beam6g", "ddqn-mlp-11111111"),
-        ("ddqn mlp width=16", "beam6g-degree4", "ddqn-mlp-22222222"),
-        ("ppo mlp width=16", "beam6g", "ppo-mlp-33333333"),
-        ("ddqn mlp width=8", "beam6g", "ddqn-mlp-66666666"),
-        ("ddqn mlp width=8", "beam6g", "ddqn-mlp-77777777"),
-        ("ddqn mlp width=64", "beam6g", "ddqn-mlp-44444444"),
-        ("ddqn mlp width=64 depth=3", "beam6g", "ddqn-mlp-55555555"),
-    )
+    Entry("ddqn mlp width=16", "beam6g", "ddqn-mlp-11111111"),
+    Entry("ddqn mlp width=16", "beam6g-degree4", "ddqn-mlp-22222222"),
+    Entry("ppo mlp width=16", "beam6g", "ppo-mlp-33333333"),
+    Entry("ddqn mlp width=8", "beam6g", "ddqn-mlp-66666666"),
+    Entry("ddqn mlp width=8", "beam6g", "ddqn-mlp-77777777"),
+    Entry("ddqn mlp width=64", "beam6g", "ddqn-mlp-44444444"),
+    Entry("ddqn mlp width=64 depth=3", "beam6g", "ddqn-mlp-55555555"),
 ]
 
 
@@ -76,7 +81,17 @@ def test_what_is_offered_is_found() -> None:
 
 
 def test_long_lists_are_cut() -> None:
-    many = [entry(f"ddqn mlp width={width}") for width in range(100, 160)]
+    many = [Entry(f"ddqn mlp width={width}", "beam6g", f"ddqn-mlp-{width}") for width in range(100, 160)]
     for name in ("mlp", "q"):
         with pytest.raises(UnknownNameError, match=r"mlp width=119'? and 40 more"):
             naming.choose(many, name, "runs")
+
+
+def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "beam6g" / "ddqn-mlp-88888888"
+    folder.mkdir(parents=True)
+    (folder / "entry.json").write_text("{")
+    (found,) = naming.stored(entries(tmp_path))
+    assert naming.choose([found], "ddqn-mlp-8", tmp_path).store.path == folder
+    with pytest.raises(UnknownNameError, match="known: ddqn-mlp-88888888"):
+        naming.choose([found], "x", tmp_path)
