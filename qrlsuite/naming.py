@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, TypeVar
 
+from qrlsuite import registry
 from qrlsuite.errors import StoreError, UnknownNameError, listed, nearest
 from qrlsuite.store import EntryStore
 
@@ -62,6 +64,23 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     return found
 
 
+def check_tasks(runs: Path, tasks: Iterable[str]) -> None:
+    """Refuse the name of a task that is neither registered nor has a folder of results.
+
+    Raises
+    ------
+    UnknownNameError
+        With the nearest name, or what there is.
+    """
+    held = {path.name for path in runs.iterdir() if path.is_dir()} if runs.is_dir() else set()
+    for name in tasks:
+        if name in held:
+            continue
+        known = registry.load().entries["tasks"]
+        if name not in known:
+            raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
+
+
 def choose(among: Sequence[N], name: str, where: object) -> N:
     """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
 
@@ -80,7 +99,7 @@ def choose(among: Sequence[N], name: str, where: object) -> N:
     fitting = [e for e in among if name in _names(e)]
     fitting = fitting or [e for e in among if any(known.startswith(name) for known in _names(e))]
     if not fitting:
-        alike = [e for e in among if name in f"{e.task}/{e.label}"]
+        alike = [e for e in among if mentions(e, name)]
         if not alike:
             labels = {_short(e) for e in among}
             raise UnknownNameError(f"no entry '{name}' in {where}{nearest(name, labels)}")
@@ -88,6 +107,11 @@ def choose(among: Sequence[N], name: str, where: object) -> N:
     if len(fitting) > 1:
         raise UnknownNameError(f"'{name}' may be any of {_choices(fitting, among)}: write one of these")
     return fitting[0]
+
+
+def mentions(entry: Named, word: str) -> bool:
+    """Return whether a word occurs in an entry's task or label; hexadecimal hashes hold too many words."""
+    return word in f"{entry.task}/{entry.label}"
 
 
 def _short(entry: Named) -> str:

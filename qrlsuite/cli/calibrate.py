@@ -114,9 +114,11 @@ def calibrate(
 
 def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None) -> list[EntryCurves]:
     """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long."""
+    from qrlsuite import naming
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
+    naming.check_tasks(runs, [task] if task else [])
     if names:
         found = [collect.find(runs, name, published) for name in dict.fromkeys(names)]
     else:

@@ -58,12 +58,14 @@ def leaderboard(
         return
     import json
 
+    from qrlsuite import naming
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import board as boards
     from qrlsuite.leaderboard import collect
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
+    naming.check_tasks(runs, [task] if task else [])
     found, refused = collect.collect(runs, task, published)
     board = boards.build(found, refused, rules.load(rule))
     if format_ is Format.json:

@@ -200,9 +200,11 @@ def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _entries(runs: Path, shipped: bool, tasks: list[str], names: list[str]) -> list[EntryCurves]:
     """Return the entries to draw: those named, in that order, else all of the task, the smallest model first."""
+    from qrlsuite import naming
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
+    naming.check_tasks(runs, tasks)
     if names:
         found = [collect.find(runs, name, shipped) for name in dict.fromkeys(names)]
         found = [e for e in found if not tasks or e.task in tasks]

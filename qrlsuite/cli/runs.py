@@ -29,8 +29,10 @@ def runs(
 
     Example: qrlsuite runs --task beam6g
     """
+    from qrlsuite import naming
     from qrlsuite.errors import OptionError, nearest
 
+    naming.check_tasks(runs, [task] if task else [])
     if action == "gc":
         _collect_garbage(runs, task, yes, json_output)
         return

@@ -113,7 +113,7 @@ def _entry_folder(runs: Path, name: str) -> Path | None:
     try:
         return naming.choose(stored, name, runs).store.path
     except UnknownNameError:
-        if any(name in f"{entry.task}/{entry.label}" for entry in stored):
+        if any(naming.mentions(entry, name) for entry in stored):
             raise
         return None
 

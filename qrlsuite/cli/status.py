@@ -28,11 +28,13 @@ def status(
     """
     import json
 
+    from qrlsuite import naming
     from qrlsuite.engine.api import Queues
     from qrlsuite.errors import QrlSuiteError
     from qrlsuite.store import entries
     from qrlsuite.survey import groups, look
 
+    naming.check_tasks(runs, [task] if task else [])
     shown: list[dict[str, Any]] = []
     queues = Queues()
     for store in entries(runs, task):

@@ -56,7 +56,7 @@ OnlyOption = Annotated[
     typer.Option(
         "--only",
         metavar="WORD",
-        help="Only entries whose group, label, name or task has the word, or one of several.",
+        help="Only entries whose group, label or task has the word, or one of several; or one entry by name.",
     ),
 ]
 OutOption = Annotated[
@@ -273,7 +273,7 @@ def _check_pictures(study: Study) -> None:
 
 def _mentions(member: Member, word: str) -> bool:
     entry = member.entry
-    return any(word in text for text in (member.group, entry.label, entry.name, entry.task.name))
+    return word == entry.name or any(word in text for text in (member.group, entry.label, entry.task.name))
 
 
 def _survey(

@@ -154,6 +154,18 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
         (["list", "modles"], "did you mean 'models'"),
         (["show", "mpl"], "did you mean 'mlp'"),
         (["leaderboard", "--runs", "nowhere"], "there is no results folder nowhere"),
+        *[
+            ([*words, "--task", "beam6h", "--runs", "."], "unknown task 'beam6h'; did you mean 'beam6g'")
+            for words in (
+                ["leaderboard"],
+                ["status"],
+                ["runs"],
+                ["runs", "gc"],
+                ["calibrate"],
+                ["plot", "curves"],
+            )
+        ],
+        (["status", "--task", "/etc"], "unknown task '/etc'"),
         (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),
     ],
 )

@@ -248,6 +248,18 @@ def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: 
     assert (tmp_path / "runs" / "study-widths-scaling.svg").read_text().startswith("<?xml")
 
 
+def test_only_keeps_words_of_labels_but_no_part_of_a_hash(widths: str) -> None:
+    steps = answer("run", widths, "--dry-run")["steps"]
+    first = steps[0]["entry"]
+    part = next(
+        first[-8:][i : i + 3] for i in range(6) if first[-8:][i : i + 3] not in str(steps[0]["label"])
+    )
+    assert [step["entry"] for step in answer("run", widths, "--dry-run", "--only", first)["steps"]] == [first]
+    assert len(answer("run", widths, "--dry-run", "--only", "mlp")["steps"]) == 2
+    with pytest.raises(OptionError, match="has no such entry"):
+        say("run", widths, "--dry-run", "--only", part)
+
+
 def test_a_picture_that_cannot_be_drawn_yet_says_why(widths: str, tmp_path: Path) -> None:
     text = Path(widths).read_text().replace('kind = "scaling"', 'kind = "few-runs"')
     Path(widths).write_text(text.replace('settings = { by = "width" }', ""))

@@ -87,6 +87,14 @@ def test_long_lists_are_cut() -> None:
             naming.choose(many, name, "runs")
 
 
+def test_a_task_is_known_by_registration_or_by_its_results(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    naming.check_tasks(tmp_path, ["mine", "beam6g"])
+    naming.check_tasks(tmp_path / "nowhere", ["beam6g"])
+    with pytest.raises(UnknownNameError, match="unknown task 'mime'; did you mean 'mine'"):
+        naming.check_tasks(tmp_path, ["mine", "mime"])
+
+
 def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "beam6g" / "ddqn-mlp-88888888"
     folder.mkdir(parents=True)
