@@ -18,7 +18,7 @@ test: install-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
 	cd $(VENV) && MYPYPATH=wheel bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=15
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15
 
 # Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
 docs: install-dev

@@ -14,6 +14,26 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored,
 # and so would every command that a test interrupts
 
+LONGEST = (
+    "third_party/test_stranger.py",
+    "cli/test_cli.py",
+    "testing/test_builtins.py",
+    "cli/test_study.py",
+    "engine/test_trouble.py",
+    "cli/test_tune.py",
+    "cli/test_new.py",
+    "circuits/test_native.py",
+    "engine/test_kills.py",
+)
+"""Begun first, for a file is one process's: the last one would be waited for by an idle core."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    ranks = {Path(__file__).parent / name: rank for rank, name in enumerate(LONGEST)}
+    assert all(path.exists() for path in ranks), "LONGEST names a file that is no longer there"
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+
+
 TINY = """
 format_version = 1
 name = "tiny"
