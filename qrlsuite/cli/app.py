@@ -1,52 +1,34 @@
-"""The Typer application and the options that several commands share."""
+"""The Typer application: every command, its own file."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-RunsOption = Annotated[
-    Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")
-]
-RuleOption = Annotated[
-    str,
-    typer.Option(
-        "--rule",
-        metavar="NAME",
-        help="What counts as significant: qrlsuite list significance-tests; qrlsuite show NAME.",
-    ),
-]
-PublishedOption = Annotated[
-    bool,
-    typer.Option("--published", help="With the published entries that come with the suite."),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+from qrlsuite.cli import (
+    calibrate,
+    check,
+    compare,
+    doctor,
+    evaluate,
+    export,
+    import_,
+    leaderboard,
+    listing,
+    new,
+    plot,
+    run,
+    runs,
+    show,
+    status,
+    study,
+    tune,
+)
 
 
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
-    from qrlsuite.cli import (
-        calibrate,
-        check,
-        compare,
-        doctor,
-        evaluate,
-        export,
-        import_,
-        leaderboard,
-        listing,
-        new,
-        plot,
-        run,
-        runs,
-        show,
-        status,
-        study,
-        tune,
-    )
-
     app = typer.Typer(
         name="qrlsuite",
         help=(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from qrlsuite import rules
-from qrlsuite.cli.app import JsonOption, PublishedOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qrlsuite import rules
-from qrlsuite.cli.app import JsonOption, PublishedOption, RuleOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RuleOption, RunsOption
 
 if TYPE_CHECKING:
     from qrlsuite.statistics import Comparison

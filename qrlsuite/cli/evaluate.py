@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

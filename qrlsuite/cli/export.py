@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.app import RunsOption
+from qrlsuite.cli.arguments import RunsOption
 
 
 def export(

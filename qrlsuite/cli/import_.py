@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption
 
 
 def import_results(

@@ -11,7 +11,7 @@ import typer
 
 from qrlsuite import rules
 from qrlsuite.cli import verify
-from qrlsuite.cli.app import PublishedOption, RuleOption, RunsOption
+from qrlsuite.cli.arguments import PublishedOption, RuleOption, RunsOption, TaskOption
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
@@ -34,7 +34,7 @@ app.command("verify")(verify.verify)
 @app.callback()
 def leaderboard(
     context: typer.Context,
-    task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
+    task: TaskOption = None,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
     output: Annotated[
         Path | None,

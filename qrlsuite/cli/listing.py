@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption
+from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:

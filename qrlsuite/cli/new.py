@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption
+from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.scaffold import Kind
 
 app = typer.Typer(

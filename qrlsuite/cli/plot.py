@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from qrlsuite.cli.app import JsonOption, PublishedOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

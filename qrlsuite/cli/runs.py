@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
 from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def runs(
     action: Annotated[
         str | None, typer.Argument(metavar="[gc]", help="gc: remove the checkpoints of finished groups.")
     ] = None,
-    task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
+    task: TaskOption = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="With gc: do it; without, it says what it would do.")
     ] = False,

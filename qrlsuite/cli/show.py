@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.terminal import printable_lines
 
 

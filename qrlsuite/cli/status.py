@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from qrlsuite.cli.app import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
 from qrlsuite.cli.terminal import printable
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def status(
-    task: Annotated[str | None, typer.Option("--task", help="Only this task.")] = None,
+    task: TaskOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:

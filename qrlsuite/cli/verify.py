@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.app import JsonOption
+from qrlsuite.cli.arguments import JsonOption
 
 
 def verify(
