@@ -154,13 +154,14 @@ def build(
 
 def _by_horizon(entries: Sequence[EntryCurves]) -> list[tuple[int, bool, list[EntryCurves]]]:
     """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
-    horizons = sorted(entries[0].task_file.ranking.horizons)
+    horizons = sorted(ranking_of(entries).horizons)
     groups = []
     for horizon in horizons:
-        members = [entry for entry in entries if _length(entry) >= horizon]
+        reached = [entry.reaching(horizon // entry.steps_per_epoch) for entry in entries]
+        members = [entry for entry in reached if entry is not None]
         if members:
             groups.append((horizon, False, members))
-    short = [entry for entry in entries if _length(entry) < horizons[0]]
+    short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
     lengths = sorted({_length(entry) for entry in short}, reverse=True)
     return groups + [
         (steps, True, [entry for entry in short if _length(entry) == steps]) for steps in lengths
@@ -171,10 +172,16 @@ def _length(entry: EntryCurves) -> int:
     return int(entry.curves.shape[1]) * entry.steps_per_epoch
 
 
+def ranking_of(entries: Sequence[EntryCurves]) -> RankingSection:
+    """Return the cells and horizons that most entries of a task have; they are equal where it is registered."""
+    ranked = [entry.task_file.ranking for entry in entries]
+    return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
+
+
 def _section(
     task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves], rule: SignificanceRule
 ) -> Section:
-    ranking = entries[0].task_file.ranking
+    ranking = ranking_of(entries)
     if getattr(rule, "paired", False):
         _require_equal_seeds(entries, rule.name)
     board = outperformance(
@@ -271,9 +278,13 @@ def compare_entries(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
+    epochs = min(first.curves.shape[1], second.curves.shape[1])
+    first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
-    return compare(learning_curves(first), learning_curves(second), grid_of(first.task_file.ranking), rule)
+    return compare(
+        learning_curves(first), learning_curves(second), grid_of(ranking_of([first, second])), rule
+    )
 
 
 def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import naming
+from qrlsuite import naming, registry
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import origin
 from qrlsuite.preset import TUNING_SEEDS
 from qrlsuite.store import EntryStore, SeedCurve, entries
-from qrlsuite.task import TaskFile
+from qrlsuite.task import Task, TaskFile
+from qrlsuite.task import load as load_task
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,15 @@ class EntryCurves:
     Attributes
     ----------
     curves:
-        (N, T) float64: mean validation score per run and epoch.
+        (N, T) float64: mean validation score per run and epoch. T is what half of the finished runs or more have.
     seeds:
         The N seeds.
     left_out:
         Seeds whose runs have fewer than T epochs yet.
+    runs:
+        Every run's own curve by seed, shorter ones and longer ones; empty where all have T epochs.
     hours:
-        Core-hours spent on the N runs.
+        Core-hours spent on the runs, those that were left out too.
     identity:
         What the entry's hash covers: task, algorithm, model and their resolved options.
     options:
@@ -43,7 +46,7 @@ class EntryCurves:
     commits, processors:
         Every code revision and processor that occurs among the seeds.
     executions:
-        Circuit executions of the N runs in all.
+        Circuit executions of these runs in all.
     tuning:
         How the settings were found, where a preset file says so.
     source:
@@ -72,6 +75,22 @@ class EntryCurves:
     executions: int = 0
     tuning: Mapping[str, Any] | None = None
     source: Literal["runs", "published"] = "runs"
+    runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+
+    def reaching(self, epochs: int) -> EntryCurves | None:
+        """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
+        if not self.runs:
+            return self if self.curves.shape[1] >= epochs else None
+        kept = {seed: curve[:epochs] for seed, curve in self.runs.items() if len(curve) >= epochs}
+        if not kept:
+            return None
+        out = tuple(sorted(set(self.runs) - set(kept)))
+        return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
+
+    @property
+    def longest(self) -> int:
+        """The epochs of the longest run."""
+        return max((len(curve) for curve in self.runs.values()), default=int(self.curves.shape[1]))
 
     @property
     def mixed_versions(self) -> tuple[str, ...]:
@@ -93,7 +112,8 @@ def collect(
     ----------
     shipped:
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
-        both is shown once, the one with more seeds: equal seeds are the same runs, not further evidence.
+        both is shown once, the one with more seeds at the task's shortest horizon, or more epochs up to it: equal
+        seeds are the same runs, not further evidence.
 
     Returns
     -------
@@ -112,8 +132,9 @@ def collect(
             continue
         key = (entry.task, entry.task_hash, entry.name)
         if shipped and key in good:
-            one, other = sorted((good[key], entry), key=lambda e: len(e.seeds), reverse=True)
-            refused.append(f"{other.folder}: {len(other.seeds)} seeds; shown once, from {one.folder}")
+            one, other = sorted((good[key], entry), key=_weight, reverse=True)
+            size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
+            refused.append(f"{other.folder}: {size}; shown once, from {one.folder}")
             good[key] = one
         else:
             good[key] = entry
@@ -138,7 +159,14 @@ def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
     found = [entry for entry in map(read, folders) if entry is not None]
     if not found:
         raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
-    return max(found, key=lambda entry: len(entry.seeds))
+    return max(found, key=_weight)
+
+
+def _weight(entry: EntryCurves) -> tuple[int, int, int]:
+    """Return what makes one of two copies of an entry the better one: epochs, seeds, epochs beyond the horizon."""
+    epochs = int(entry.curves.shape[1])
+    enough = min(entry.task_file.ranking.horizons) // entry.steps_per_epoch
+    return min(epochs, enough), len(entry.seeds), epochs
 
 
 def _folders(runs: Path, shipped: bool, task: str | None = None) -> list[EntryStore]:
@@ -180,16 +208,19 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         return None
     length = _common_length(curves)
     kept = [curve for curve in curves if len(curve.scores) >= length]
-    stores = [store.seed(curve.seed) for curve in kept]
+    stores = [store.seed(curve.seed) for curve in curves]
     records = [seed.record() or {} for seed in stores]
     provenance = [made for run in records for made in run.get("provenance", [])]
     first = records[0]
     parameters = first.get("parameters", {})
     identity = record["identity"]
-    task_file = TaskFile.model_validate(record["task_file"])
+    task_file = current(
+        TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
+    )
     preset = record["preset"]
-    values = np.stack([curve.curve[:length] for curve in kept])
-    require_scores(values, task_file, store.path)
+    own = {curve.seed: curve.curve for curve in curves}
+    require_scores(np.concatenate(list(own.values())), task_file, store.path)
+    values = np.stack([own[curve.seed][:length] for curve in kept])
     return EntryCurves(
         name=record["name"],
         label=record["label"],
@@ -216,7 +247,26 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         processors=origin.texts(provenance, "processor"),
         tuning=record["tuning"],
         executions=sum(origin.executions(seed) for seed in stores),
+        runs=own if any(len(curve) != length for curve in own.values()) else {},
     )
+
+
+def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
+    """Return a task's file as it is registered now, where its runs were made under the same definition of it.
+
+    Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
+    """
+    registered = _registered(name)
+    return registered.file if registered is not None and registered.hash == hash_ else stored
+
+
+def _registered(name: str) -> Task | None:
+    if name not in registry.load().entries["tasks"]:
+        return None
+    try:
+        return load_task(name)
+    except QrlSuiteError:
+        return None  # its environment is not installed
 
 
 def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:
@@ -242,6 +292,6 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def _common_length(curves: Iterable[SeedCurve]) -> int:
-    """Return the epochs that finished runs have; before any finished, the fewest that any run has."""
-    lengths = [len(curve.scores) for curve in curves if curve.finished]
-    return max(lengths) if lengths else min(len(curve.scores) for curve in curves)
+    """Return the epochs that half of the finished runs or more have; before any finished, the fewest of any run."""
+    lengths = sorted((len(curve.scores) for curve in curves if curve.finished), reverse=True)
+    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(curve.scores) for curve in curves)

@@ -29,6 +29,8 @@ def texts(provenance: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]
 def executions(store: SeedStore) -> int:
     """Return the circuit executions of one seed's run so far: training, gradients and validation together.
 
+    A circuit that is sampled with many shots is executed once.
+
     Raises
     ------
     StoreError
@@ -48,7 +50,7 @@ def executions(store: SeedStore) -> int:
 
 
 def _counts(value: Any) -> list[Any]:
-    return list(value.values()) if isinstance(value, Mapping) else []
+    return [value[name] for name in value if name != "shots"] if isinstance(value, Mapping) else []
 
 
 def _table(store: SeedStore) -> tuple[int, list[Any]]:
@@ -58,7 +60,11 @@ def _table(store: SeedStore) -> tuple[int, list[Any]]:
 
     try:
         file = pyarrow.parquet.ParquetFile(store.table)
-        names = [name for name in file.schema_arrow.names if name.startswith("executions.")]
+        names = [
+            name
+            for name in file.schema_arrow.names
+            if name.startswith("executions.") and name != "executions.shots"
+        ]
         columns = file.read(columns=["epoch", *names]).to_pydict()
         last = max(columns["epoch"])
     except (OSError, KeyError, TypeError, ValueError, pyarrow.ArrowException) as error:

@@ -24,10 +24,11 @@ from qrlsuite.entry import from_record
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.fingerprint import Fingerprint
 from qrlsuite.leaderboard import origin
-from qrlsuite.leaderboard.collect import EntryCurves, require_scores
+from qrlsuite.leaderboard.collect import EntryCurves, current, require_scores
+from qrlsuite.preset import TUNING_SEEDS
 from qrlsuite.registry import load as registered
 from qrlsuite.specs import NAME
-from qrlsuite.store import EntryStore
+from qrlsuite.store import EntryStore, settled
 from qrlsuite.task import TaskFile, digest
 
 SHIPPED = Path(__file__).parent / "entries"
@@ -83,7 +84,7 @@ class Published:
             label=record["label"],
             task=record["task_name"],
             task_hash=record["task_hash"],
-            task_file=self.task_file,
+            task_file=current(self.task_file, record["task_name"], record["task_hash"]),
             algorithm=identity["algorithm"],
             model=identity["model"],
             parameters=(count["classical"], count["quantum"]),
@@ -197,6 +198,7 @@ def _require(holds: bool, folder: Path, problem: str) -> None:
 def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
     """Compute hashes, name and label again from what they stand for."""
     identity, task = record["identity"], record["identity"]["task"]
+    _require(isinstance(task, dict), folder, "the task is not a table")
     expected = f"{identity['algorithm']}-{identity['model']}-{record['hash'][:8]}"
     _require(digest(task) == record["task_hash"], folder, "the task's definition does not have its hash")
     _require(digest(identity) == record["hash"], folder, "the options do not have the entry's hash")
@@ -263,6 +265,7 @@ def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray
     seeds, counts = np.unique(numbers, return_counts=True)
     _require(len(seeds) > 0, folder, "it holds no run")
     _require(int(seeds[0]) >= 0, folder, f"seed {seeds[0]} is negative")
+    _require(int(seeds[-1]) < TUNING_SEEDS, folder, f"seed {seeds[-1]} is one of those kept for tuning")
     length = int(epochs.max())
     order = np.lexsort((epochs, numbers))
     for seed, count in zip(seeds, counts):
@@ -277,7 +280,7 @@ def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray
             f"seed {seed} has {count} of {length} epochs: some are missing",
         )
     require_scores(scores, task_file, folder)
-    return tuple(int(seed) for seed in seeds), scores[order].reshape(len(seeds), length)
+    return tuple(int(seed) for seed in seeds), settled(scores[order].reshape(len(seeds), length))
 
 
 def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:

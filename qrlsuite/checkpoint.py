@@ -113,10 +113,12 @@ def headers(store: EntryStore) -> list[Header]:
 
 
 def latest(store: EntryStore) -> dict[int, Header]:
-    """Return the newest checkpoint of every seed that has one."""
+    """Return the newest checkpoint of every seed that has one; a seed without a folder starts again."""
+    found = headers(store)
+    begun = set(store.seeds()) if found else set()
     newest: dict[int, Header] = {}
-    for header in headers(store):
-        for seed in header.seeds:
+    for header in found:
+        for seed in begun.intersection(header.seeds):
             if seed not in newest or newest[seed].epoch < header.epoch:
                 newest[seed] = header
     return newest

@@ -65,7 +65,15 @@ class MeteredEnv(LaneEnv):
     def _scores(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the scores of the episodes that have just ended in the lanes `ended`."""
         if self.score.source == "return":
-            return self.returns[ended] / (self.score.max_return if self.score.max_return is not None else 1.0)
+            scores = self.returns[ended] / (
+                self.score.max_return if self.score.max_return is not None else 1.0
+            )
+            if not np.isfinite(scores).all():
+                raise EnvironmentFailure(
+                    f"environment '{self.environment_name}' gave an episode the return "
+                    f"{self.returns[ended][~np.isfinite(scores)][0]}: are there rewards that are nan or infinite?"
+                )
+            return scores
         given = infos.get("final_info", {}).get("score")
         if given is None:
             raise EnvironmentFailure(

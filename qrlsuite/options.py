@@ -5,6 +5,7 @@ Every error names where the value came from, what is wrong with it, and what to 
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -88,6 +89,11 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
         result = pydantic.TypeAdapter(cls).validate_python({k: v for k, v in values.items() if k in known})
     except pydantic.ValidationError as error:
         problems += [f"{where}: {line}" for line in validation_lines(error)]
+    problems += [
+        f"{where}: {name} = {value}: infinite numbers cannot be written to JSON, and so not be part of an identity"
+        for name, value in values.items()
+        if isinstance(value, float) and math.isinf(value)
+    ]
     if problems:
         raise OptionError("; ".join(problems))
     return result

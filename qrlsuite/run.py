@@ -232,6 +232,11 @@ class GroupRun:
                     "extended; choose another folder with --runs DIR, or delete the seed's folder to start again"
                 )
             folder.cut(epoch)
+            if (held := len(folder.epochs(decimals=False))) < epoch:
+                raise StoreError(
+                    f"{folder.path} holds {held} epochs, its checkpoint {epoch}: restore the file, or delete the "
+                    "seed's folder to start again"
+                )
         if epoch:
             self._restore(epoch, arrays)
         else:
@@ -319,8 +324,20 @@ class GroupRun:
 
         All lanes go on until the last episode of the group has ended. `validation_steps` then holds each seed's
         steps within its episodes (S,), and the steps that each seed's lanes made in all: executions are counted by
-        the former, so that they do not depend on the company a seed is trained in.
+        the former, so that they do not depend on the company a seed is trained in. Nor does what follows: the models'
+        buffers, such as how many passes with shots there were, are left as they were.
         """
+        buffers = [buffer for model in self.models.built for buffer in model.buffers()]
+        before = [buffer.clone() for buffer in buffers]
+        try:
+            return self._play(epoch)
+        finally:
+            with torch.no_grad():
+                for buffer, value in zip(buffers, before):
+                    buffer.copy_(value)
+
+    def _play(self, epoch: int) -> NDArray[np.float64]:
+        """Do what `validate` says, but for the models' buffers."""
         envs = self.validation
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
         envs.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
@@ -341,11 +358,21 @@ class GroupRun:
                 open_lanes[lanes] = False
                 if not open_lanes.any():
                     self.validation_steps = own_steps, played * self.V
+                    self._require_scores(scores)
                     return scores.reshape(self.S, self.V)
         raise EnvironmentFailure(
             f"environment '{self.entry.task.environment.name}': a validation episode did not end within "
             f"{MAX_EPISODE_STEPS} steps; give it a time limit"
         )
+
+    def _require_scores(self, scores: NDArray[np.float64]) -> None:
+        """Refuse scores that no leaderboard would rank now, not after hours."""
+        outside = scores[(scores < 0) | (scores > 1 + 1e-9)]
+        if self.entry.task.file.ranking.thresholds is None and outside.size:
+            raise EnvironmentFailure(
+                f"environment '{self.entry.task.environment.name}': a validation episode has the score {outside[0]:g}, "
+                "outside [0, 1]: is score.max_return in the task file the best possible return, and none negative?"
+            )
 
     def _record(
         self,

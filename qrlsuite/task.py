@@ -187,6 +187,13 @@ class Task:
             "score": file.score.model_dump(mode="json"),
         }
         self.hash = digest(self.definition)
+        epoch = file.protocol.interactions
+        for horizon in file.ranking.horizons:
+            if horizon % epoch:
+                raise TaskError(
+                    f"{source}: ranking.horizons: {horizon} steps are not a whole number of epochs of {epoch} steps "
+                    "(protocol.interactions)"
+                )
         if (
             file.score.source == "return"
             and file.score.max_return is None

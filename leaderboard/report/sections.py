@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.absent import absent
-from qrlsuite.leaderboard.board import Row, Section, undecided_reason
+from qrlsuite.leaderboard.board import Row, Section, ranking_of, undecided_reason
 from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
@@ -85,7 +85,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
         The one that judged the board.
     """
     judgement = judge([row.entry for row in section.rows], section.horizon, rule)
-    ranking = section.rows[0].entry.task_file.ranking
+    ranking = ranking_of([row.entry for row in section.rows])
     rows = tuple(
         _row(place, row, entries[id(row.entry)], judgement) for place, row in enumerate(section.rows)
     )

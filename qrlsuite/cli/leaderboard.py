@@ -158,6 +158,12 @@ def _notes(section: Section) -> list[str]:
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
+    mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
+    if mixed:
+        notes.append(
+            "made with several versions, see `qrlsuite show ENTRY`: "
+            + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
+        )
     notes.append(
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
     )

@@ -124,15 +124,18 @@ def _entry(folder: Path) -> dict[str, Any]:
     store = EntryStore(folder)
     record = store.record()
     seeds = store.seeds()
-    first = store.seed(seeds[0]).record() if seeds else None
+    records = [store.seed(seed).record() or {} for seed in seeds]
+    made_with: list[Any] = []
+    for run in records:
+        made_with += [made for made in run.get("provenance", []) if made not in made_with]
     return {
         **{
             key: record[key]
             for key in ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
         },
         "seeds": len(seeds),
-        "provenance": (first or {}).get("provenance", []),
-        "parameters": (first or {}).get("parameters", {}),
+        "provenance": made_with,
+        "parameters": (records[0] if records else {}).get("parameters", {}),
     }
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from qrlsuite.run import Progress  # torch, which a supervisor can do without
 
 LARGEST_GROUP = 100
+MOST_SEEDS = 100_000
 
 
 @dataclass(frozen=True)
@@ -41,18 +42,16 @@ def parse_seeds(text: str) -> list[int]:
     OptionError
         If the text is none of these, or names no seed, or one twice.
     """
-    if text.isdecimal():
-        seeds = list(range(int(text)))
-    else:
-        seeds = []
-        for piece in text.split(","):
-            first, colon, last = piece.strip().partition(":")
-            if not first.isdecimal() or (colon and not last.isdecimal()):
-                raise OptionError(
-                    f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)"
-                )
-            seeds += range(int(first), int(last)) if colon else [int(first)]
-    if not seeds or len(set(seeds)) != len(seeds) or len(seeds) > 100_000:
+    seeds: list[int] = []
+    for piece in (f"0:{text}" if text.isdecimal() else text).split(","):
+        first, colon, last = (part[:19] for part in piece.strip().partition(":"))  # larger than any seed
+        if not first.isdecimal() or (colon and not last.isdecimal()):
+            raise OptionError(f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)")
+        more = range(int(first), int(last) if colon else int(first) + 1)
+        if len(seeds) + max(0, more.stop - more.start) > MOST_SEEDS:
+            raise OptionError(f"seeds '{text}': {MOST_SEEDS} seeds are the most that an entry takes at once")
+        seeds += more
+    if not seeds or len(set(seeds)) != len(seeds):
         raise OptionError(f"seeds '{text}': at least one seed, none twice, is needed")
     return sorted(seeds)
 

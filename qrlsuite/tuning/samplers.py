@@ -101,12 +101,13 @@ def one_at_a_time(space: Space, base: Point) -> Iterator[Point]:
 
 
 def random_points(space: Space, trials: int, seed: int) -> Iterator[Point]:
-    """Return distinct points drawn independently; at most as many as there are."""
+    """Return distinct points drawn independently; fewer where a thousand draws in a row found no new one."""
     generator = np.random.Generator(np.random.Philox(key=seed))
-    finite = all(dimension.range is None for dimension in space)
     seen: dict[str, Point] = {}
-    while len(seen) < (min(trials, size(space)) if finite else trials):
+    known = 0
+    while len(seen) < trials and known < 1000:
         point = {dimension.name: _draw(dimension, generator) for dimension in space}
+        known = known + 1 if repr(point) in seen else 0
         seen.setdefault(repr(point), point)
     yield from seen.values()
 

@@ -146,6 +146,11 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
             "unknown ansatz 'ipq'; did you mean 'iqp'",
         ),
         (["show", "ansatz", "iqp", "--qubits", "21"], "qubits = 21: a circuit has 1 to 20 qubits"),
+        (
+            ["run", "--task", "beam6g", "--model", "mlp", "--set", "lr=inf"],
+            "lr = inf: infinite numbers cannot",
+        ),
+        (["run", "--task", "beam6g", "--model", "mlp", "--seeds", "9" * 12], "100000 seeds are the most"),
         (["run", "--task", "beam6g", "--model", "mlp", "--sedes", "3"], "--seeds"),
         (["run", "--task", "beam6g"], "see `qrlsuite run --help`"),
         (["run", "--task", "beam6g", "--model", "mlp", "--epochs", "0"], "--epochs"),

@@ -33,6 +33,41 @@ def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Cal
         assert results(together, seed) == results(shuffled, seed)
 
 
+POLE = """
+format_version = 1
+name = "pole"
+summary = "Episodes that end at different times"
+[environment]
+name = "cartpole"
+options = { steps = 30 }
+[protocol]
+environments = 2
+interactions = 20
+validation_episodes = 3
+[score]
+source = "return"
+max_return = 30
+[ranking]
+epsilons = [0.5]
+deltas = [0.5]
+reference = { epsilon = 0.5, delta = 0.5 }
+horizons = [60]
+"""
+
+
+def test_shots_do_not_depend_on_when_others_end_their_episodes(
+    tiny_task: str, train: Callable[..., Path]
+) -> None:
+    """The group validates until its last episode has ended; the passes of those that wait must not count."""
+    Path(tiny_task).write_text(POLE)
+    circuit = {"model": "vqc-pennylane", "settings": ("qubits=2", "layers=1", "shots=20")}
+    together = train("together", range(4), **circuit)
+    lengths = [EntryStore(together).seed(seed).epochs()[0]["scores"] for seed in range(4)]
+    assert len({max(scores) for scores in lengths}) > 1, "or nobody waits, and the test proves nothing"
+    for seed in (0, 3):
+        assert results(together, seed) == results(train(f"alone-{seed}", [seed], **circuit), seed)
+
+
 def test_different_seeds_differ(train: Callable[..., Path]) -> None:
     folder = train("runs", [0, 1])
     assert results(folder, 0) != results(folder, 1)

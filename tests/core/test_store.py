@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from qrlsuite import checkpoint, store
 from qrlsuite.claims import SeedsClaimedError, acquire, living
 from qrlsuite.engine.groups import format_seeds, parse_seeds, plan
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from tests.conftest import results
 
 
 def test_a_torn_last_line_is_dropped_and_a_broken_one_named(tmp_path: Path) -> None:
@@ -124,7 +126,9 @@ def test_seeds_are_parsed(text: str, seeds: list[int]) -> None:
     assert parse_seeds(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["", "x", "-1", "3:1", "1,1", "1:", "0", "2.5"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "-1", "3:1", "1,1", "1:", "0", "2.5", "9" * 11, "9" * 400, f"5:{'9' * 11}"]
+)
 def test_seeds_that_are_none(text: str) -> None:
     with pytest.raises(OptionError, match="seed"):
         parse_seeds(text)
@@ -152,6 +156,46 @@ def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
 def test_no_results_folder(tmp_path: Path) -> None:
     with pytest.raises(QrlSuiteError, match="there is no results folder"):
         store.entries(tmp_path / "none")
+
+
+def test_a_torn_line_of_timings_costs_nothing(train: Callable[..., Path]) -> None:
+    path = train("runs", [0, 1], 1)
+    seed = store.EntryStore(path).seed(0)
+    with seed.timings.open("ab") as file:
+        file.write(b'{"epoch": 2, "tr')
+    train("runs", [0, 1], 2)
+    assert [line["epoch"] for line in store.read_lines(seed.timings)] == [1, 2]
+    assert seed.seconds() > 0
+
+
+def test_a_deleted_folder_of_a_seed_starts_again(train: Callable[..., Path]) -> None:
+    """As messages advise, although the group's checkpoint holds its agent."""
+    path = train("runs", [0, 1], 2)
+    kept = store.EntryStore(path)
+    before = results(path, 1)
+    shutil.rmtree(kept.seed(1).path)
+    assert [(group.seeds, group.epoch) for group in plan(kept, [0, 1], 2, 1)] == [((1,), 0)]
+    train("runs", [0, 1], 2)
+    assert results(path, 1) == before
+
+
+def test_a_finished_seed_without_its_epochs_is_no_curve(train: Callable[..., Path]) -> None:
+    seed = store.EntryStore(train("runs", [0], 2)).seed(0)
+    seed.table.unlink()
+    with pytest.raises(StoreError, match="finished 2 epochs and holds 0: restore the file or delete"):
+        seed.curve()
+
+
+def test_a_checkpoint_does_not_stand_for_epochs_that_are_gone(train: Callable[..., Path]) -> None:
+    seed = store.EntryStore(train("runs", [0], 2)).seed(0)
+    seed.table.unlink()
+    with pytest.raises(StoreError, match="holds 0 epochs, its checkpoint 2: restore the file, or delete"):
+        train("runs", [0], 3)
+
+
+def test_means_of_float32_scores_reach_what_the_scores_reach() -> None:
+    curve = store.SeedCurve(0, np.full((1, 100), 0.95, np.float32), True).curve
+    assert np.asarray(curve).tolist() == [0.95]
 
 
 def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[..., Path]) -> None:

@@ -221,6 +221,12 @@ def test_random_combinations_are_distinct_and_no_more_than_there_are(tiny_task: 
     assert sorted(made.ask()["algorithm.lr"] for _ in range(made.total)) == [0.1, 0.2, 0.3]
 
 
+def test_small_ranges_are_drawn_until_nothing_new_comes(tiny_task: str) -> None:
+    dimensions = space.space(resolve(tiny_task, "mlp"), None, varied("batch={low = 1, high = 4}"))
+    made = samplers.create("random", dimensions, 10, 0, {})
+    assert sorted(made.ask()["algorithm.batch"] for _ in range(made.total)) == [1, 2, 3, 4]
+
+
 def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> None:
     def elsewhere(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
         return EntryStore.create(tmp_path, entry)

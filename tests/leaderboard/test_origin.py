@@ -12,7 +12,10 @@ from qrlsuite.store import SeedStore, json_line, table_bytes
 
 
 def test_executions_are_summed_over_table_and_newer_lines(tmp_path: Path) -> None:
-    rows = [{"epoch": e, "scores": [0.5], "executions": {"forward": 10, "shift": e}} for e in (1, 2, 3)]
+    rows = [
+        {"epoch": e, "scores": [0.5], "executions": {"forward": 10, "shift": e, "shots": 999}}
+        for e in (1, 2, 3)
+    ]
     seed = SeedStore(tmp_path, 0)
     seed.lines.write_bytes(b"".join(json_line(row) for row in rows))
     assert origin.executions(seed) == 36

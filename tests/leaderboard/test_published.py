@@ -164,10 +164,17 @@ def other_task_rehashed(record: dict[str, Any]) -> None:
     rehash(record)
 
 
+def task_of_text(record: dict[str, Any]) -> None:
+    record["identity"]["task"] = "beam6g"
+    record["task_hash"] = digest("beam6g")
+    rehash(record)
+
+
 RECORDS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "steps": (other_steps, "interactions"),
     "task": (other_task, "definition does not have its hash"),
     "task rehashed": (other_task_rehashed, "should be|hash"),
+    "no task": (task_of_text, "the task is not a table"),
     "options": (lambda r: r["identity"]["model_options"].update(width=17), "entry's hash"),
     "label": (lambda r: r.update(label="ddqn vqc-native qubits=14"), "its label is"),
     "hostile label": (lambda r: r.update(label="<script>alert(1)</script>"), "its label is"),
@@ -326,7 +333,12 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     train("mine", range(2), EPOCHS)
     entries, refused = collect.collect(tmp_path / "mine", shipped=True)
     assert [len(entry.seeds) for entry in entries] == [8]
-    assert "2 seeds; shown once" in refused[0]
+    assert "2 seeds of 3 epochs; shown once" in refused[0]
+    train("short", range(9), 1)
+    entries, refused = collect.collect(tmp_path / "short", shipped=True)
+    assert [entry.curves.shape for entry in entries] == [(8, 3)], (
+        "many seeds of few epochs take no one's place"
+    )
     assert len(collect.collect(tmp_path / "nothing", shipped=True)[0]) == 1
 
 

@@ -97,8 +97,8 @@ BROKEN = {
         "[presets.fast.ddqn.quantum]\nlrr = 1\n[ranking]",
         r"^\[presets.fast.ddqn\]: algorithm 'ddqn' has no option 'lrr'; did you mean 'lr'",
     ),
-    "short": Edit("ranking", "[180]", "[180, 50]", r"horizon 50 is shorter than an epoch of 60 interactions"),
-    "part": Edit("ranking", "[180]", "[100]", r"100 is not a whole number of epochs of 60 .* take 60"),
+    "short": Edit("format", "[180]", "[180, 50]", r"horizons: 50 steps are not a whole number of epochs of 60"),
+    "part": Edit("format", "[180]", "[100]", r"horizons: 100 steps are not a whole number .* epochs of 60 steps"),
     "long": Edit("ranking", "[180]", "[240]", r"240 lies beyond a complete run, 180 interactions: no entry .* raise"),
     "maximum": Edit(
         "scores",
@@ -110,7 +110,7 @@ BROKEN = {
         "scores", BEAM, environment("plain", reward="-0.1"), r"return -0.5 and the score -0.5, outside \[0, 1\]"
     ),
     "infinite": Edit(
-        "scores", BEAM, environment("plain", reward="1"), r"the return nan and .* rewards that are nan or infinite"
+        "scores", BEAM, environment("plain", reward="1"), r"gave an episode the return nan: .* rewards that are nan"
     ),
     "unscored": Edit(
         "scores", BEAM, environment("plain", 'source = "info"'), r"^environment 'plain' gave no info\['score'\]"
