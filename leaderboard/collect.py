@@ -173,7 +173,12 @@ def _folders(runs: Path, shipped: bool, task: str | None = None) -> list[EntrySt
     """Return the entries' folders: those in the results folder, and with `shipped` the published ones."""
     from qrlsuite.leaderboard import published
 
-    stores = [] if shipped and not runs.is_dir() else entries(runs, task)
+    if not runs.is_dir() and not shipped:
+        raise StoreError(
+            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another, and `qrlsuite "
+            "leaderboard --published` shows what comes with the suite"
+        )
+    stores = entries(runs, task) if runs.is_dir() else []
     return stores + (entries(published.SHIPPED, task) if shipped else [])
 
 

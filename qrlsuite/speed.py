@@ -148,7 +148,10 @@ def load(path: Path) -> list[Speed]:
 
 
 def measure(store: EntryStore) -> Speed | None:
-    """Return the median speed of an entry's epochs, None where none was timed (imported entries, for example).
+    """Return the median speed of an entry's epochs, None where too little was timed (imported entries, for example).
+
+    A seed's first epoch does not count: it holds the start of its process. Nor do small groups where there were larger
+    ones, for a seed alone takes many times its share of a group.
 
     Raises
     ------
@@ -157,12 +160,14 @@ def measure(store: EntryStore) -> Speed | None:
     """
     record = store.record()
     identity = record["identity"]
-    seconds = []
+    by_group: dict[int, list[float]] = {}
     for seed in store.seeds()[-SAMPLED_SEEDS:]:
-        for line in read_lines(store.seed(seed).timings):
+        for line in read_lines(store.seed(seed).timings)[1:]:
             values = [line.get(name) for name in ("train", "validate")]
-            if all(isinstance(value, int | float) and 0 <= value < 1e9 for value in values):
-                seconds.append(sum(values))  # type: ignore[arg-type]
+            group = line.get("group", 1)
+            if isinstance(group, int) and all(isinstance(v, int | float) and 0 <= v < 1e9 for v in values):
+                by_group.setdefault(group, []).append(sum(values))  # type: ignore[arg-type]
+    seconds = by_group[max(by_group)] if by_group else []
     if not seconds or not statistics.median(seconds) > 0:
         return None
     task = record["task_file"]

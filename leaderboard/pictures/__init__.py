@@ -98,5 +98,5 @@ def encode(figure: Figure, format_: str) -> bytes:
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")  # a box stands for it
-        figure.savefig(buffer, format=format_, dpi=160)
+        figure.savefig(buffer, format=format_, dpi=160, bbox_inches="tight", pad_inches=0.08)
     return buffer.getvalue()

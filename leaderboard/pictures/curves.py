@@ -14,6 +14,9 @@ from qrlsuite import options
 from qrlsuite.leaderboard.collect import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 
+MANY = 5
+"""Of more entries the percentiles would hide each other, and the legend the curves."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -34,7 +37,10 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     """
     chosen: Options = options.build(Options, settings, "picture 'curves'")
     cells.one_task(entries, "curves")
-    figure = Figure(figsize=(7.2, 4.3), layout="constrained")
+    many = len(entries) > MANY
+    beside = 0.7 + 0.07 * max(len(style.label(entry)) for entry in entries)
+    size = (7.2 + beside, max(4.3, 0.6 + 0.19 * len(entries))) if many else (7.2, 4.3)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
     single = few if chosen.runs is None else chosen.runs
@@ -44,7 +50,8 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         low, middle, high = np.percentile(entry.curves, (5, 50, 95), axis=0)
         if single:
             axes.plot(steps, entry.curves.T, color=look.color, linewidth=0.5, alpha=0.25)
-        axes.fill_between(steps, low, high, color=look.color, alpha=0.15 if single else 0.1, linewidth=0)
+        if not many:
+            axes.fill_between(steps, low, high, color=look.color, alpha=0.15 if single else 0.1, linewidth=0)
         axes.plot(steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry))
     relative = style.relative(entries)
     axes.set_xlabel("environment steps")
@@ -54,8 +61,11 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     if relative:
         axes.set_ylim(0, 1)
     style.tidy(axes)
-    axes.legend(loc="lower right", frameon=False, title=style.note(entries) or None, title_fontsize="small")
-    axes.set_title(
-        f"{entries[0].task}: median of the runs, 5th to 95th percentile", fontsize="medium", loc="left"
-    )
+    title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
+    axes.set_title(title, fontsize="medium", loc="left")
+    words = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
+    if many:
+        figure.legend(loc="outside right upper", fontsize=8, alignment="left", **words)
+    else:
+        axes.legend(loc="lower right", **words)
     return figure

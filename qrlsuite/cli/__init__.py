@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import sys
@@ -19,6 +20,9 @@ def main() -> None:
     from qrlsuite.cli.terminal import printable, printable_lines
     from qrlsuite.registry import STRICT, PluginWarning
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that cannot show a character shows another
     UsageError: Any = BadParameter.__base__  # click's, or Typer's own copy of it
     options = itertools.takewhile(lambda word: word.startswith("-"), sys.argv[1:])
     if "--strict" in options:
@@ -40,7 +44,7 @@ def main() -> None:
             if error.ctx is None or type(error).__name__ == "NoArgsIsHelpError":
                 error.show()
             else:
-                message = printable(error.format_message()).removesuffix(".")
+                message = printable(error.format_message()).removesuffix(".").replace("Value error, ", "")
                 print(f"qrlsuite: {message}; see `{error.ctx.command_path} --help`", file=sys.stderr)
             sys.exit(2)
         except Abort:

@@ -22,6 +22,11 @@ PLAIN_SECONDS = 20.0
 FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
 
 
+def hours_text(hours: float) -> str:
+    """Write core-hours to two digits, large ones as whole numbers."""
+    return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
+
+
 def duration(seconds: float) -> str:
     """Write a duration as people say it."""
     if seconds < 90:

@@ -170,13 +170,21 @@ def _table(played: Sequence[Played], task: str, episodes: int) -> None:
     )
     names = ["policy", "agents", "return: mean", "median", "5%", "95%"]
     names += ["score: mean", "median", "5%", "95%"] * relative
-    for name in names:
-        table.add_column(Text(name), justify="left" if name == "policy" else "right", overflow="fold")
+    console = Console()
+    width = console.width if console.is_terminal else max(console.width, 130)
+    shown = range(len(names)) if width >= 100 else [0, 1, *range(2, len(names), 4)]  # the means alone
+    for name in (names[i] for i in shown):
+        table.add_column(
+            Text(name),
+            justify="left" if name == "policy" else "right",
+            overflow="fold",
+            no_wrap=name != "policy",
+        )
     for each in played:
         row = [each.name, str(len(each.seeds) or "-"), *_row(each, "return"), *_row(each, "score") * relative]
-        table.add_row(*(Text(cell) for cell in row))
-    console = Console()
-    Console(width=None if console.is_terminal else max(console.width, 130)).print(table)
+        row += [""] * (len(names) - len(row))
+        table.add_row(*(Text(row[i]) for i in shown))
+    Console(width=width).print(table)
 
 
 def _notes(played: Sequence[Played]) -> list[str]:

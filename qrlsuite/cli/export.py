@@ -54,6 +54,9 @@ def export(
             failed += 1
             continue
         size = sum(path.stat().st_size for path in folder.iterdir())
-        typer.echo(f"wrote {folder} ({len(entry.seeds)} seeds, {size / 1000:.0f} kB)")
-    if len(found) > failed:
-        typer.echo(f"next: qrlsuite leaderboard verify {out} --rerun 2")
+        typer.echo(
+            f"wrote {folder} ({len(entry.seeds)} seed{'s' * (len(entry.seeds) != 1)}, {size / 1000:.0f} kB)"
+        )
+    if len(found) == failed:
+        raise QrlSuiteError(f"{runs} holds no complete entry: qrlsuite runs --runs {runs} says what is there")
+    typer.echo(f"next: qrlsuite leaderboard verify {out} --rerun 2")

@@ -114,6 +114,12 @@ COLUMNS = (
 )
 
 
+WIDE = 150
+"""Columns of a terminal, or a file, in which the whole table can be read."""
+LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells +/-", "hours")))
+"""What a narrower one leaves out: the first where it has so many columns, else the second too."""
+
+
 def _cells(section: Section, row: Row) -> tuple[str, ...]:
     from qrlsuite.leaderboard import board as boards
 
@@ -127,9 +133,13 @@ def _cells(section: Section, row: Row) -> tuple[str, ...]:
         boards.complexity_text(row.reference),
         f"{row.median_score:.3f}",
         f"{row.wins}/{row.losses}",
-        _names(row.outperforms, [r for r in section.rows if (r.tier or 0) > (row.tier or 0)], "all below"),
         _names(
-            row.outperformed_by, [r for r in section.rows if 0 < (r.tier or 0) < (row.tier or 0)], "all above"
+            row.outperforms, [r for r in section.rows if (r.tier or 0) > (row.tier or 0)], "all lower tiers"
+        ),
+        _names(
+            row.outperformed_by,
+            [r for r in section.rows if 0 < (r.tier or 0) < (row.tier or 0)],
+            "all higher tiers",
         ),
         f"{entry.hours:.2f}",
     )
@@ -177,28 +187,49 @@ def _title(section: Section) -> str:
     return f"{section.task}, {steps_text(section.horizon)} steps{note}, S_hat at {section.cell}"
 
 
+def _left_out(width: int) -> list[str]:
+    """Return the columns for which a table of some width has no room."""
+    left_out: list[str] = []
+    for enough, names in LEFT_OUT if width < WIDE else ():
+        left_out += names
+        if width >= enough:
+            break
+    return left_out
+
+
 def _table(section: Section) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    console = Console()
+    width = console.width if console.is_terminal else max(console.width, WIDE)
+    notes, left_out = _notes(section), _left_out(width)
+    shown = [name for name in COLUMNS if name not in left_out]
+    if left_out:
+        notes.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
     table = Table(
         title=Text(_title(section)),
         title_justify="left",
         header_style="bold",
         box=box.SIMPLE_HEAD,
-        caption=Text("\n".join(_notes(section))),
+        caption=Text("\n".join(notes)),
         caption_justify="left",
         pad_edge=False,
     )
     numeric = {"parameters", "seeds", "score", "cells +/-", "hours"}
-    for name in COLUMNS:
-        table.add_column(Text(name), justify="right" if name in numeric else "left", overflow="fold")
+    for name in shown:
+        table.add_column(
+            Text(name),
+            justify="right" if name in numeric else "left",
+            overflow="fold",
+            no_wrap=name in numeric or name.startswith("S_hat"),
+        )
     for row in section.rows:
-        table.add_row(*(Text(cell) for cell in _cells(section, row)))
-    console = Console()
-    Console(width=None if console.is_terminal else max(console.width, 130)).print(table)
+        cells = dict(zip(COLUMNS, _cells(section, row)))
+        table.add_row(*(Text(cells[name]) for name in shown))
+    Console(width=width).print(table)
 
 
 def _markdown(board: Leaderboard) -> str:

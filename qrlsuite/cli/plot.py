@@ -38,7 +38,8 @@ def plot(
         list[str] | None,
         typer.Option(
             "--entry",
-            help="Only these entries (name or label, [TASK/] before it, or the beginning), in this order.",
+            metavar="ENTRY",
+            help="Only this entry (name or label, [TASK/] before it, or the beginning); for several, repeat --entry.",
         ),
     ] = None,
     settings: Annotated[
@@ -49,7 +50,10 @@ def plot(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--out", help="png, pdf or svg; default: TASK-KIND.png in the results folder."),
+        typer.Option(
+            "--out",
+            help="png, pdf or svg; default: TASK-KIND.png, in the results folder where it shows results.",
+        ),
     ] = None,
     list_settings: Annotated[
         bool, typer.Option("--settings", help="List the settings of this kind, and draw nothing.")
@@ -94,6 +98,10 @@ def plot(
         of = pictures.KINDS[kind].of
         if of == "episodes":
             raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
+        if of == "nothing" and (task or entry):
+            raise OptionError(
+                f"picture '{kind}' shows no results: leave {'--task' if task else '--entry'} out"
+            )
         if of == "entries":
             found = _entries(runs, published, task or [], entry or [])
         figure = pictures.draw(kind, found, **own)
@@ -217,7 +225,9 @@ def _entries(runs: Path, shipped: bool, tasks: list[str], names: list[str]) -> l
     held = sorted({e.task for e in found})
     if not found:
         wanted = f" of task {' or '.join(tasks)}" if tasks else ""
-        raise UnknownNameError(f"{runs} holds no results{wanted} yet: qrlsuite run")
+        raise UnknownNameError(
+            f"{runs} holds no results{wanted} yet: qrlsuite run; --published draws those that come with the suite"
+        )
     if len(held) > 1 and not tasks and not names:
         raise OptionError(f"{runs} holds several tasks; choose with --task {' or --task '.join(held)}")
     return found

@@ -22,8 +22,12 @@ def show(
     second: Annotated[
         str | None, typer.Argument(metavar="[NAME]", help="With a kind first: `show ansatz iqp`.")
     ] = None,
-    qubits: Annotated[int, typer.Option("--qubits", help="For an ansatz: the number of qubits to draw.")] = 4,
-    layers: Annotated[int, typer.Option("--layers", help="For an ansatz: the number of layers to draw.")] = 2,
+    qubits: Annotated[
+        int | None, typer.Option("--qubits", help="For an ansatz: the number of qubits to draw; default: 4.")
+    ] = None,
+    layers: Annotated[
+        int | None, typer.Option("--layers", help="For an ansatz: the number of layers to draw; default: 2.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="For an ansatz: an option of its own."),
@@ -41,7 +45,7 @@ def show(
     import json
 
     from qrlsuite import registry
-    from qrlsuite.errors import UnknownNameError, nearest
+    from qrlsuite.errors import OptionError, UnknownNameError, nearest
 
     manual = _hook(name, second)
     if manual is not None:
@@ -63,8 +67,14 @@ def show(
         singulars = " or ".join(f"`show {registry.SINGULAR[k]} {wanted}`" for k in found)
         raise UnknownNameError(f"'{wanted}' is several things; write {singulars}")
     content = _content(found[0], wanted)
+    if found[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
+        raise OptionError(
+            f"{registry.SINGULAR[found[0]]} '{wanted}': --qubits, --layers, --set and --figure draw an ansatz; options "
+            "are changed where they are used, as in `qrlsuite run --set NAME=VALUE`"
+        )
     if found[0] == "ansatzes":
-        content["drawing"] = _draw(wanted, qubits, layers, settings or [], figure, content)
+        size = (4 if qubits is None else qubits, 2 if layers is None else layers)
+        content["drawing"] = _draw(wanted, *size, settings or [], figure, content)
     typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
 
 

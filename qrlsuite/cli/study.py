@@ -318,7 +318,7 @@ def _show(study: Study, items: Sequence[Item], where: Place) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from qrlsuite.cli.display import duration
+    from qrlsuite.cli.display import duration, hours_text
     from qrlsuite.cli.studying import BASES
 
     file = study.file
@@ -362,7 +362,7 @@ def _show(study: Study, items: Sequence[Item], where: Place) -> None:
         more = f", and {unknown} entries of unknown cost" if unknown else ""
         console.print(
             f"left: about {duration(known / where.workers)} with {where.workers} "
-            f"worker{'s' * (where.workers != 1)} ({known / 3600:.1f} core-hours{more})"
+            f"worker{'s' * (where.workers != 1)} ({hours_text(known / 3600)} core-hours{more})"
         )
         for basis in dict.fromkeys(item.estimate.basis for item in lacking):
             console.print(f"  {basis}: {BASES[basis]}")

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from qrlsuite.cli.display import duration, hours_text
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -71,11 +73,9 @@ class TuneDisplay:
         if total is None:
             self.console.print("what it costs will be known after the first trial")
         else:
-            from qrlsuite.cli.display import duration
-
             self.console.print(
-                f"about {total:.2g} core-hours, {duration(total * 3600 / cores)} with {cores} processes, by what such "
-                "runs have taken here; finished trials cost nothing again"
+                f"about {hours_text(total)} core-hours, {duration(total * 3600 / cores)} with {cores} processes, by "
+                "what such runs have taken here; finished trials cost nothing again"
             )
 
     def _hours(self, search: Search) -> float | None:
@@ -121,8 +121,6 @@ class TuneDisplay:
         words += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
         left = self._left()
         if left is not None:
-            from qrlsuite.cli.display import duration
-
             words.append(f"{duration(left)} left")
         self.live.update(self.bar, completed=asked - 1 + part, status="  ".join(words))
 
@@ -189,7 +187,8 @@ def report(searches: Sequence[Search], written: Mapping[int, Path], runs: Path, 
             wide.print(f"wrote {written[i]}", markup=False, soft_wrap=True)
     if len(searches) > 1:
         counts = " and ".join(
-            f"{len(search.trials)} ({search.core_seconds / 3600:.2g} core-hours)" for search in searches
+            f"{len(search.trials)} ({hours_text(search.core_seconds / 3600)} core-hours)"
+            for search in searches
         )
         wide.print(
             f"trials of {' and '.join(search.base.model.name for search in searches)}: {counts}", markup=False
@@ -225,7 +224,7 @@ def _table(search: Search) -> Any:
     table = Table(
         title=Text(
             f"{search.base.label} on {search.base.task.name}: the best of {len(search.trials)} trials, "
-            f"{seeds} seeds x {search.epochs} epochs, {search.core_seconds / 3600:.2g} core-hours"
+            f"{seeds} seeds x {search.epochs} epochs, {hours_text(search.core_seconds / 3600)} core-hours"
         ),
         title_justify="left",
         header_style="bold",
@@ -247,7 +246,7 @@ def _table(search: Search) -> Any:
             f"{'>= ' * merit.unsettled}{steps_text(merit.cell)}",
             steps_text(merit.area),
             f"{merit.score:.4f}",
-            f"{trial.core_seconds / 3600:.2g}",
+            hours_text(trial.core_seconds / 3600),
         ]
         table.add_row(*(Text(cell) for cell in row))
     return table

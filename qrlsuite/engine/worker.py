@@ -41,7 +41,8 @@ class Heart(threading.Thread):
         """Beat until stopped."""
         while not self.stopped.wait(HEARTBEAT):
             orphaned = self.parent is not None and os.getppid() != self.parent
-            if orphaned or not self.claim.refresh():
+            lost = orphaned or not self.claim.refresh()
+            if lost and not self.stopped.is_set():  # it may have been released while it was being refreshed
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
 

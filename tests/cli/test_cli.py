@@ -171,6 +171,13 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
             )
         ],
         (["status", "--task", "/etc"], "unknown task '/etc'"),
+        (["plot", "estimator", "--task", "beam6g"], "picture 'estimator' shows no results: leave --task out"),
+        (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),
+        (
+            ["show", "mlp", "--set", "width=4"],
+            "model 'mlp': --qubits, --layers, --set and --figure draw an ansatz",
+        ),
+        (["leaderboard", "--format", "markdwn"], "'markdwn' is not one of"),
         (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),
     ],
 )

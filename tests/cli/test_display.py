@@ -6,8 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from qrlsuite.cli.app import build
 from qrlsuite.cli.display import CostEstimate, RunDisplay
+from qrlsuite.cli.leaderboard import COLUMNS
 from qrlsuite.cli.run import summarize
 from qrlsuite.engine.groups import Group, ProgressFile
 from qrlsuite.entry import Entry, resolve
@@ -20,6 +23,17 @@ PAIR = [Group((0, 1, 2), 0), Group((3, 4), 0)]
 @pytest.fixture
 def entry(tiny_task: str) -> Entry:
     return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+
+
+@pytest.mark.parametrize(("columns", "left_out"), [(80, 5), (105, 2), (150, 0)])
+def test_a_narrow_terminal_shows_fewer_columns_and_says_which(columns: int, left_out: int) -> None:
+    words = ["leaderboard", "--task", "beam6g", "--published"]
+    done = CliRunner().invoke(build(), words, env={"FORCE_COLOR": "1", "COLUMNS": str(columns)})
+    lines = [re.sub("\x1b\\[[0-9;]*m", "", line).rstrip() for line in done.output.splitlines()]
+    assert max(map(len, lines)) <= columns
+    assert any("60k (56k to 66k)" in line for line in lines), "no number is broken over lines"
+    told = " ".join(lines).partition("or --format markdown, shows ")[2]
+    assert len([name for name in COLUMNS if name in told]) == left_out
 
 
 def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, monkeypatch) -> None:

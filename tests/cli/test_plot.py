@@ -46,6 +46,14 @@ def test_help_lists_every_kind_of_the_suite_and_of_environments() -> None:
         assert f"  {name} " in output
 
 
+def test_many_curves_have_their_legend_beside_them() -> None:
+    figure = pictures.draw("curves", [noisy(f"ddqn mlp width={width}") for width in range(6)])
+    assert len(figure.legends) == 1
+    assert len(figure.axes[0].collections) == 0, "percentiles would hide each other"
+    few = pictures.draw("curves", [noisy(f"ddqn mlp width={width}") for width in range(5)])
+    assert (len(few.legends), len(few.axes[0].collections)) == (0, 5)
+
+
 @pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers"])
 def test_pictures_of_entries(kind: str, entries: list[EntryCurves], tmp_path: Path) -> None:
     out = tmp_path / "p.svg"

@@ -52,16 +52,30 @@ def test_the_median_of_an_entrys_epochs_is_measured(train: Callable[..., Path], 
         lines = [{"epoch": e, "train": e, "validate": 0.5} for e in (1, 2, 3)]
         store.seed(seed).timings.write_text("".join(json.dumps(line) + "\n" for line in lines))
     found = speed.gather(tmp_path / "runs")
-    assert [each.seconds for each in found.measured] == [2.5]
-    assert found.estimate(store.entry()) == speed.Estimate(2.5, "measured")
+    assert [each.seconds for each in found.measured] == [3.0], (
+        "the first epoch holds the start of the process"
+    )
+    assert found.estimate(store.entry()) == speed.Estimate(3.0, "measured")
     assert found.measured[0].options["antennas"] == 3, "a list counts by its length"
 
     store.seed(1).timings.write_text(
         '{"train": "x"}\n{"train": NaN, "validate": 1}\n{"train": -1, "validate": 1}\n'
     )
     found.note(store)
-    assert [each.seconds for each in found.measured] == [2.5], "what is no time is passed over"
+    assert [each.seconds for each in found.measured] == [3.0], "what is no time is passed over"
     assert all(math.isfinite(each.seconds) for each in found.measured)
+    alone = [
+        {"epoch": e, "train": 1.0, "validate": 0.5, "group": g} for e, g in ((1, 1), (2, 1), (3, 1), (4, 50))
+    ]
+    store.seed(1).timings.write_text(
+        "".join(json.dumps(line) + "\n" for line in [*alone, {**alone[3], "train": 0.1}])
+    )
+    store.seed(0).timings.write_text(json.dumps(alone[0]) + "\n")
+    measured = speed.measure(store)
+    assert measured is not None
+    assert measured.seconds == pytest.approx(1.05), "a group of fifty tells more than a seed alone"
+    store.seed(1).timings.unlink()
+    assert speed.measure(store) is None, "one epoch tells nothing"
     (store.path / "entry.json").write_text("{")
     assert speed.gather(tmp_path / "runs").measured == [], "a damaged entry tells nothing and stops nobody"
     assert speed.gather(tmp_path / "nowhere").measured == []

@@ -326,6 +326,14 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
         CliRunner().invoke(build(), ["export", "--runs", str(tmp_path / "runs")], catch_exceptions=False)
 
 
+def test_nothing_complete_is_nothing_to_export(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(QrlSuiteError, match="holds no complete entry: qrlsuite runs --runs"):
+        CliRunner().invoke(
+            build(), ["export", "--all", "--runs", str(tmp_path / "runs")], catch_exceptions=False
+        )
+
+
 def test_own_runs_of_a_published_entry_are_shown_once(
     folder: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,43 @@
+"""The heart of a worker: it ends its process when the claim is lost, and only then."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from qrlsuite import claims
+from qrlsuite.engine import worker
+from qrlsuite.store import EntryStore
+
+
+@pytest.fixture
+def killed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The signals that this process sends itself."""
+    sent: list[int] = []
+    monkeypatch.setattr(os, "kill", lambda pid, number: sent.append(number))
+    monkeypatch.setattr(worker, "HEARTBEAT", 0.01)
+    return sent
+
+
+@pytest.mark.parametrize("released", [True, False])
+def test_a_claim_that_was_given_back_is_not_lost(
+    released: bool, killed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claim = claims.acquire(EntryStore(tmp_path), [0])
+    heart = worker.Heart(claim, None)
+
+    def refresh(self: claims.Claim) -> bool:
+        """The training ends between two lines of a refresh; or another worker takes over."""
+        if released:
+            heart.stopped.set()
+        claim.path.unlink()
+        return False
+
+    monkeypatch.setattr(claims.Claim, "refresh", refresh)
+    heart.start()
+    heart.join(10)
+    assert not heart.is_alive()
+    assert killed == ([] if released else [signal.SIGTERM])
