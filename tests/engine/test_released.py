@@ -22,7 +22,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.importing import import_files
 from qrlsuite.leaderboard.collect import collect
-from qrlsuite.store import EntryStore, entries
+from qrlsuite.store import EntryStore, entries, settled
 from qrlsuite.task import load
 
 ROOT = Path(__file__).parents[2]
@@ -187,7 +187,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     assert refused == []
     assert found.label == "ddqn hybrid (imported)"
     assert found.parameters == (16, 15)
-    expected = np.float32(content(1)["val_returns"][1:]).astype(np.float64).mean(axis=1)
+    expected = settled(np.float32(content(1)["val_returns"][1:]).astype(np.float64).mean(axis=1))
     assert (found.curves[1] == expected).all()
     (store,) = entries(tmp_path / "runs")
     record = store.seed(1).record() or {}
