@@ -105,6 +105,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         "bars: 5th to 95th percentile",
         "faded: the 95th percentile is at the cap" if any(m.at_cap.any() for m in measured.values()) else "",
         "lines: mean over instances" if repeated else "",
+        _not_shown(entries, panels),
         cells.cut_note(entries, horizon),
         style.note(entries),
     )
@@ -194,6 +195,14 @@ def _seeds(panel: _Panel) -> str:
     return f"{counts[0]} to {counts[-1]} seeds{star}" if len(counts) > 1 else style.seeds_text(entries[0])
 
 
+def _not_shown(entries: Sequence[EntryCurves], panels: Sequence[_Panel]) -> str:
+    """Name the entries that are on no line, for lack of others of their kind."""
+    shown = {id(entry) for panel in panels for line in panel.lines for _, entry in line.members}
+    missing = [style.plain(entry.label) for entry in entries if id(entry) not in shown]
+    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    return f"not shown, too few of a kind for a line: {', '.join(missing[:3])}{more}" if missing else ""
+
+
 def _sizes(panels: Sequence[_Panel]) -> str:
     names = list(dict.fromkeys(panel.by.removeprefix("environment.") for panel in panels))
     return names[0] if len(names) == 1 else "size"
@@ -223,7 +232,8 @@ def _panels(entries: Sequence[EntryCurves], by: Sequence[str] | None) -> list[_P
         longest = max(len(line.sizes) for line in made)
         if longest < 2 and by is None:
             continue
-        kept = [line for line in made if len(line.sizes) >= min(3, longest)]
+        fewest = min(3 if by is None else 2, longest)
+        kept = [line for line in made if len(line.sizes) >= fewest]
         labels = _line_labels([line.members[0][1] for line in kept], name)
         panels.append(_Panel(name, tuple(_Line(text, line.members) for text, line in zip(labels, kept))))
     if not panels:

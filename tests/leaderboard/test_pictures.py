@@ -185,6 +185,18 @@ def test_scaling_over_tasks_averages_instances() -> None:
         pictures.draw("scaling", entries, by="environment.antenas")
 
 
+def test_scaling_draws_lines_that_are_not_complete_yet_and_names_what_it_leaves_out() -> None:
+    entries = [
+        learner(f"ddqn {model} {n}", 10, task=f"a{n}", environment_options={"antennas": [[0]] * n})
+        for model, sizes in (("mlp", (2, 3, 4)), ("vqc", (2, 3)), ("odd", (2,)))
+        for n in sizes
+    ]
+    figure = pictures.draw("scaling", entries, by="environment.antennas")
+    lines = [line for line in figure.axes[0].get_lines() if not str(line.get_label()).startswith("_")]
+    assert [(line.get_label(), len(line.get_xdata())) for line in lines] == [("mlp", 3), ("vqc", 2)]
+    assert "not shown, too few of a kind for a line: ddqn odd 2" in texts(figure).replace("\n", " ")
+
+
 def test_tiers_say_in_how_many_cells() -> None:
     few = learner("ddqn mlp width=8", 10, seeds=10)
     figure = pictures.draw("tiers", [*ENTRIES, few])
