@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
@@ -167,14 +168,19 @@ def _draw_panel(
                 axes.annotate(
                     note,
                     (size * shift, float(point)),
-                    xytext=(7, 5),
+                    xytext=(7, -5 if k % 2 else 5),  # above one line and below the next
+                    va="top" if k % 2 else "bottom",
                     textcoords="offset points",
                     fontsize=7,
                     color=look.color,
                 )
     if doubling:
         axes.set_xscale("log")
-    axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
+    apart = [b / a if doubling else (b - a) / (sizes[-1] - sizes[0]) for a, b in itertools.pairwise(sizes)]
+    if min(apart, default=1.0) >= (
+        1.2 if doubling else 0.08
+    ):  # else their numbers would lie over one another
+        axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
     axes.minorticks_off()
     axes.margins(x=0.12)
     axes.set_xlabel(panel.by.removeprefix("environment."))
