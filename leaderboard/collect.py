@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -112,8 +113,8 @@ def collect(
     ----------
     shipped:
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
-        both is shown once, the one with more seeds at the task's shortest horizon, or more epochs up to it: equal
-        seeds are the same runs, not further evidence.
+        both is shown once, the one that gets further towards the task's shortest horizon, else the one with more
+        seeds: equal seeds are the same runs, not further evidence.
 
     Returns
     -------
@@ -261,12 +262,14 @@ def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
 
     Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
     """
-    registered = _registered(name)
+    registered = _registered(registry.load(), name)
     return registered.file if registered is not None and registered.hash == hash_ else stored
 
 
-def _registered(name: str) -> Task | None:
-    if name not in registry.load().entries["tasks"]:
+@functools.lru_cache(maxsize=256)
+def _registered(known: registry.Registry, name: str) -> Task | None:
+    """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
+    if name not in known.entries["tasks"]:
         return None
     try:
         return load_task(name)

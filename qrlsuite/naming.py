@@ -64,8 +64,8 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     return found
 
 
-def check_tasks(runs: Path, tasks: Iterable[str]) -> None:
-    """Refuse the name of a task that is neither registered nor has a folder of results.
+def check_tasks(runs: Path, *tasks: str | None) -> None:
+    """Refuse the name of a task that is neither registered nor has a folder of results; None names no task.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def check_tasks(runs: Path, tasks: Iterable[str]) -> None:
     """
     held = {path.name for path in runs.iterdir() if path.is_dir()} if runs.is_dir() else set()
     for name in tasks:
-        if name in held:
+        if name is None or name in held:
             continue
         known = registry.load().entries["tasks"]
         if name not in known:

@@ -92,11 +92,20 @@ def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:
     problems += [
         f"{where}: {name} = {value}: infinite numbers cannot be written to JSON, and so not be part of an identity"
         for name, value in values.items()
-        if isinstance(value, float) and math.isinf(value)
+        if _infinite(value)
     ]
     if problems:
         raise OptionError("; ".join(problems))
     return result
+
+
+def _infinite(value: Any) -> bool:
+    """Return whether a value is an infinite number, or holds one."""
+    if isinstance(value, list | tuple):
+        return any(map(_infinite, value))
+    if isinstance(value, Mapping):
+        return any(map(_infinite, value.values()))
+    return isinstance(value, float) and math.isinf(value)
 
 
 def validation_lines(error: pydantic.ValidationError) -> list[str]:

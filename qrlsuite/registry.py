@@ -83,7 +83,7 @@ class Plugin:
     problem: str = ""
 
 
-@dataclass
+@dataclass(eq=False)
 class Registry:
     """All registered specs by kind and name, every plugin, and what went wrong on the way."""
 

@@ -231,8 +231,7 @@ class GroupRun:
                     f"{folder.path} finished {old['epochs']} epochs and its checkpoint is gone: it cannot be "
                     "extended; choose another folder with --runs DIR, or delete the seed's folder to start again"
                 )
-            folder.cut(epoch)
-            if (held := len(folder.epochs(decimals=False))) < epoch:
+            if (held := folder.cut(epoch)) < epoch:
                 raise StoreError(
                     f"{folder.path} holds {held} epochs, its checkpoint {epoch}: restore the file, or delete the "
                     "seed's folder to start again"

@@ -241,17 +241,23 @@ class SeedStore:
                 raise StoreError(f"{self.path}: epoch {expected} is missing (found {row.get('epoch')!r})")
         return rows
 
-    def cut(self, epoch: int) -> None:
-        """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again."""
+    def cut(self, epoch: int) -> int:
+        """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again.
+
+        Returns
+        -------
+        int
+            The number of epochs that are left: fewer than `epoch` where some are gone.
+        """
         _drop_torn_line(self.timings)
         rows = [row for row in self.epochs() if row["epoch"] <= epoch]
-        if self.table.exists() and int(read_table(self.table)[-1]["epoch"]) > epoch:
+        last = int(read_table(self.table, decimals=False)[-1]["epoch"]) if self.table.exists() else 0
+        if last > epoch:
             write_atomically(self.lines, b"".join(json_line(row) for row in rows))
             self.table.unlink()
-            return
-        last = int(read_table(self.table)[-1]["epoch"]) if self.table.exists() else 0
-        if self.lines.exists():
+        elif self.lines.exists():
             write_atomically(self.lines, b"".join(json_line(row) for row in rows if row["epoch"] > last))
+        return len(rows)
 
     def sync(self) -> None:
         """Force appended lines to the disk: called before a checkpoint that supersedes them is written."""

@@ -62,6 +62,30 @@ horizons = [180]
 """
 
 
+POLE = """
+format_version = 1
+name = "pole"
+summary = "CartPole of 30 steps"
+[environment]
+name = "cartpole"
+[environment.options]
+steps = 30
+[protocol]
+environments = 4
+interactions = 60
+validation_episodes = 5
+[score]
+source = "return"
+max_return = 30
+[ranking]
+epsilons = [0.5]
+deltas = [0.5]
+reference = { epsilon = 0.5, delta = 0.5 }
+horizons = [180]
+"""
+"""Episodes that end at different times."""
+
+
 @pytest.fixture
 def tiny_task(tmp_path: Path) -> str:
     """The path of a task file whose episodes (20 steps) do not end with its epochs (15 steps per environment)."""

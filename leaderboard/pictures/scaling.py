@@ -177,9 +177,8 @@ def _draw_panel(
     if doubling:
         axes.set_xscale("log")
     apart = [b / a if doubling else (b - a) / (sizes[-1] - sizes[0]) for a, b in itertools.pairwise(sizes)]
-    if min(apart, default=1.0) >= (
-        1.2 if doubling else 0.08
-    ):  # else their numbers would lie over one another
+    enough = 1.2 if doubling else 0.08  # of closer ones the numbers would lie over one another
+    if min(apart, default=enough) >= enough:
         axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
     axes.minorticks_off()
     axes.margins(x=0.12)

@@ -66,7 +66,7 @@ def calibrate(
     import json
 
     from qrlsuite.leaderboard import calibration
-    from qrlsuite.leaderboard.board import grid_of, learning_curves
+    from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
     from qrlsuite.leaderboard.pictures.cells import choose_horizon
 
     chosen = _entries(runs, published, entries or [], task)
@@ -79,7 +79,7 @@ def calibrate(
         type(learned)(learned.values, learned.steps_per_epoch, name)
         for learned, name in zip((learning_curves(entry).cut(horizon) for entry in chosen), names)
     ]
-    grid = grid_of(chosen[0].task_file.ranking)
+    grid = grid_of(ranking_of(chosen))
     jobs = calibration.plan(
         curves,
         grid,
@@ -118,7 +118,7 @@ def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
-    naming.check_tasks(runs, [task] if task else [])
+    naming.check_tasks(runs, task)
     if names:
         found = [collect.find(runs, name, published) for name in dict.fromkeys(names)]
     else:

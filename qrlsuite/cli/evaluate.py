@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.terminal import table_console
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -152,27 +153,31 @@ def _row(played: Played, what: str) -> list[str]:
     return [f"{content[name]:.{digits}f}" for name in ("mean", "p50", "p5", "p95")]
 
 
+WIDE = 100
+"""Columns of a terminal in which the whole table can be read."""
+
+
 def _table(played: Sequence[Played], task: str, episodes: int) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     relative = any(each.scores is not None for each in played)
+    console, notes = table_console(), _notes(played)
+    if console.width < WIDE:
+        notes.append(f"a terminal of {WIDE} columns shows medians and percentiles too")
     table = Table(
         title=Text(f"{task}: {episodes} fresh episodes of each policy, the same for all"),
         title_justify="left",
         header_style="bold",
         box=box.SIMPLE_HEAD,
-        caption=Text("\n".join(_notes(played))),
+        caption=Text("\n".join(notes)),
         caption_justify="left",
         pad_edge=False,
     )
     names = ["policy", "agents", "return: mean", "median", "5%", "95%"]
     names += ["score: mean", "median", "5%", "95%"] * relative
-    console = Console()
-    width = console.width if console.is_terminal else max(console.width, 130)
-    shown = range(len(names)) if width >= 100 else [0, 1, *range(2, len(names), 4)]  # the means alone
+    shown = [i for i, name in enumerate(names) if console.width >= WIDE or i < 2 or name.endswith("mean")]
     for name in (names[i] for i in shown):
         table.add_column(
             Text(name),
@@ -184,7 +189,7 @@ def _table(played: Sequence[Played], task: str, episodes: int) -> None:
         row = [each.name, str(len(each.seeds) or "-"), *_row(each, "return"), *_row(each, "score") * relative]
         row += [""] * (len(names) - len(row))
         table.add_row(*(Text(row[i]) for i in shown))
-    Console(width=width).print(table)
+    console.print(table)
 
 
 def _notes(played: Sequence[Played]) -> list[str]:

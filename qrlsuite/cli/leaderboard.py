@@ -12,6 +12,7 @@ import typer
 from qrlsuite import rules
 from qrlsuite.cli import verify
 from qrlsuite.cli.arguments import PublishedOption, RuleOption, RunsOption, TaskOption
+from qrlsuite.cli.terminal import table_console
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
@@ -65,7 +66,7 @@ def leaderboard(
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
-    naming.check_tasks(runs, [task] if task else [])
+    naming.check_tasks(runs, task)
     found, refused = collect.collect(runs, task, published)
     board = boards.build(found, refused, rules.load(rule))
     if format_ is Format.json:
@@ -112,8 +113,6 @@ COLUMNS = (
     "outperformed by",
     "hours",
 )
-
-
 WIDE = 150
 """Columns of a terminal, or a file, in which the whole table can be read."""
 LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells +/-", "hours")))
@@ -199,13 +198,11 @@ def _left_out(width: int) -> list[str]:
 
 def _table(section: Section) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console()
-    width = console.width if console.is_terminal else max(console.width, WIDE)
-    notes, left_out = _notes(section), _left_out(width)
+    console = table_console(WIDE)
+    notes, left_out = _notes(section), _left_out(console.width)
     shown = [name for name in COLUMNS if name not in left_out]
     if left_out:
         notes.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
@@ -229,7 +226,7 @@ def _table(section: Section) -> None:
     for row in section.rows:
         cells = dict(zip(COLUMNS, _cells(section, row)))
         table.add_row(*(Text(cells[name]) for name in shown))
-    Console(width=width).print(table)
+    console.print(table)
 
 
 def _markdown(board: Leaderboard) -> str:

@@ -212,7 +212,7 @@ def _entries(runs: Path, shipped: bool, tasks: list[str], names: list[str]) -> l
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
 
-    naming.check_tasks(runs, tasks)
+    naming.check_tasks(runs, *tasks)
     if names:
         found = [collect.find(runs, name, shipped) for name in dict.fromkeys(names)]
         found = [e for e in found if not tasks or e.task in tasks]

@@ -32,7 +32,7 @@ def runs(
     from qrlsuite import naming
     from qrlsuite.errors import OptionError, nearest
 
-    naming.check_tasks(runs, [task] if task else [])
+    naming.check_tasks(runs, task)
     if action == "gc":
         _collect_garbage(runs, task, yes, json_output)
         return

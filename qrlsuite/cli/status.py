@@ -34,7 +34,7 @@ def status(
     from qrlsuite.store import entries
     from qrlsuite.survey import groups, look
 
-    naming.check_tasks(runs, [task] if task else [])
+    naming.check_tasks(runs, task)
     shown: list[dict[str, Any]] = []
     queues = Queues()
     for store in entries(runs, task):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.terminal import table_console
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -350,7 +351,7 @@ def _show(study: Study, items: Sequence[Item], where: Place) -> None:
             )
         )
     if items:
-        Console(width=None if console.is_terminal else max(console.width, 130)).print(table)
+        table_console().print(table)
     else:
         console.print("nothing to train")
     lacking = [item for item in items if item.plan.groups]

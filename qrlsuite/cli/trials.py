@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from qrlsuite.cli.display import duration, hours_text
+from qrlsuite.cli.terminal import table_console
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -178,8 +179,7 @@ def _short(values: Any) -> str:
 
 def report(searches: Sequence[Search], written: Mapping[int, Path], runs: Path, complete: bool) -> None:
     """Print the best settings of each search, its preset file, and what to type next."""
-    console = Console(highlight=False)
-    wide = Console(width=None if console.is_terminal else max(console.width, 130), highlight=False)
+    wide = table_console()
     for i, search in enumerate(searches):
         if search.trials:
             wide.print(_table(search))

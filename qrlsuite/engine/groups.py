@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 LARGEST_GROUP = 100
 MOST_SEEDS = 100_000
+LONGEST_RANGE = 36
+"""Digits of a seed or of both ends of a range: more are a slip of the hand, and may be too many for a number."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ def parse_seeds(text: str) -> list[int]:
     """
     seeds: list[int] = []
     for piece in (f"0:{text}" if text.isdecimal() else text).split(","):
-        first, colon, last = (part[:19] for part in piece.strip().partition(":"))  # larger than any seed
-        if not first.isdecimal() or (colon and not last.isdecimal()):
+        first, colon, last = piece.strip().partition(":")
+        if not first.isdecimal() or (colon and not last.isdecimal()) or len(first + last) > LONGEST_RANGE:
             raise OptionError(f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)")
         more = range(int(first), int(last) if colon else int(first) + 1)
         if len(seeds) + max(0, more.stop - more.start) > MOST_SEEDS:

@@ -89,10 +89,10 @@ def test_long_lists_are_cut() -> None:
 
 def test_a_task_is_known_by_registration_or_by_its_results(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    naming.check_tasks(tmp_path, ["mine", "beam6g"])
-    naming.check_tasks(tmp_path / "nowhere", ["beam6g"])
+    naming.check_tasks(tmp_path, "mine", "beam6g", None)
+    naming.check_tasks(tmp_path / "nowhere", "beam6g")
     with pytest.raises(UnknownNameError, match="unknown task 'mime'; did you mean 'mine'"):
-        naming.check_tasks(tmp_path, ["mine", "mime"])
+        naming.check_tasks(tmp_path, "mine", "mime")
 
 
 def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:

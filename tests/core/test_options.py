@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -21,6 +22,11 @@ class Left:
 class Right:
     gamma: float = 0.5
     antennas: list[int] | None = None
+
+
+@dataclass(frozen=True)
+class Anything:
+    y: Any = None
 
 
 SIDES = {"model": Left, "algorithm": Right}
@@ -79,3 +85,11 @@ def test_build_lists_every_problem() -> None:
 
 def test_plain_writes_every_default_out() -> None:
     assert options.plain(Left()) == {"width": 1, "gamma": 0.5}
+
+
+def test_infinite_numbers_are_named_wherever_they_stand() -> None:
+    """JSON has none, and an identity is written in it."""
+    for value in (math.inf, [1.0, -math.inf], {"a": [math.inf]}):
+        with pytest.raises(OptionError, match=r"model 'x': y = .*infinite numbers cannot be written to JSON"):
+            options.build(Anything, {"y": value}, "model 'x'")
+    assert options.build(Anything, {"y": [1.0, {}]}, "model 'x'").y == [1.0, {}]

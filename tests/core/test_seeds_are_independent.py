@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.store import EntryStore
-from tests.conftest import results
+from tests.conftest import POLE, results
 
 MODELS = {
     "mlp": ("width=16",),
@@ -31,28 +31,6 @@ def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Cal
     assert results(together, 2) == results(alone, 2)
     for seed in (0, 2, 3):
         assert results(together, seed) == results(shuffled, seed)
-
-
-POLE = """
-format_version = 1
-name = "pole"
-summary = "Episodes that end at different times"
-[environment]
-name = "cartpole"
-options = { steps = 30 }
-[protocol]
-environments = 2
-interactions = 20
-validation_episodes = 3
-[score]
-source = "return"
-max_return = 30
-[ranking]
-epsilons = [0.5]
-deltas = [0.5]
-reference = { epsilon = 0.5, delta = 0.5 }
-horizons = [60]
-"""
 
 
 def test_shots_do_not_depend_on_when_others_end_their_episodes(

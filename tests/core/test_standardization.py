@@ -22,29 +22,9 @@ from qrlsuite.run import GroupRun, build_envs
 from qrlsuite.seeding import Streams
 from qrlsuite.standardization import PREFIX, RunningStatistics
 from qrlsuite.store import EntryStore
+from tests.conftest import POLE
 
-POLE = """
-format_version = 1
-name = "pole"
-summary = "CartPole of 30 steps"
-[environment]
-name = "cartpole"
-[environment.options]
-steps = 30
-normalization = "running"
-[protocol]
-environments = 4
-interactions = 60
-validation_episodes = 5
-[score]
-source = "return"
-max_return = 30
-[ranking]
-epsilons = [0.5]
-deltas = [0.5]
-reference = { epsilon = 0.5, delta = 0.5 }
-horizons = [180]
-"""
+STANDARDIZED = POLE.replace("steps = 30", 'steps = 30\nnormalization = "running"')
 AGENTS = [
     ("ddqn", "mlp", ("width=16",)),
     ("ppo", "mlp", ("width=16",)),
@@ -58,7 +38,7 @@ agents = pytest.mark.parametrize(("algorithm", "model", "settings"), AGENTS)
 def entry(tmp_path: Path) -> Callable[..., Entry]:
     """Resolve an entry of the task above."""
     path = tmp_path / "pole.toml"
-    path.write_text(POLE)
+    path.write_text(STANDARDIZED)
 
     def make(algorithm: str, model: str = "mlp", settings: Sequence[str] = ("width=16",)) -> Entry:
         return resolve(str(path), model, algorithm, [parse_setting(word) for word in settings])

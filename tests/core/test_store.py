@@ -127,7 +127,22 @@ def test_seeds_are_parsed(text: str, seeds: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "x", "-1", "3:1", "1,1", "1:", "0", "2.5", "9" * 11, "9" * 400, f"5:{'9' * 11}"]
+    "text",
+    [
+        "",
+        "x",
+        "-1",
+        "3:1",
+        "1,1",
+        "1:",
+        "0",
+        "2.5",
+        "9" * 11,
+        "9" * 400,
+        "9" * 5000,
+        "1" * 40,
+        f"5:{'9' * 11}",
+    ],
 )
 def test_seeds_that_are_none(text: str) -> None:
     with pytest.raises(OptionError, match="seed"):

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from qrlsuite import task as tasks
+from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.leaderboard import board, collect
 from qrlsuite.store import EntryStore
@@ -93,10 +95,6 @@ def test_versions_that_mix_are_pointed_out(train: Callable[..., Path], tmp_path:
     record = json.loads(run.read_text())
     record["provenance"][0]["versions"]["torch"] = "2.0"
     run.write_text(json.dumps(record))
-    from typer.testing import CliRunner
-
-    from qrlsuite.cli.app import build
-
     said = CliRunner().invoke(build(), ["leaderboard", "--runs", str(tmp_path / "runs")]).output
     assert "made with several versions, see `qrlsuite show ENTRY`: ddqn mlp width=16 (torch)" in " ".join(
         said.split()
