@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qrlsuite.cli.calibrate import tables
+from qrlsuite.cli.commands.calibrate import tables
 from qrlsuite.leaderboard import calibration
 from qrlsuite.statistics import (
     DifferenceRule,

@@ -36,11 +36,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from qrlsuite.entry import Entry, resolve
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.run import ModelBuilder, build_envs
 from qrlsuite.seeding import Streams
 from qrlsuite.specs import resolve as reference
+from qrlsuite.training.group import ModelBuilder, build_envs
 
 FloatArray = NDArray[np.float64]
 Act = Callable[[NDArray[np.float32]], NDArray[np.int64]]

@@ -16,11 +16,11 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from qrlsuite import provenance
-from qrlsuite.entry import resolve
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.run import GroupRun
-from qrlsuite.store import EntryStore, read_lines
+from qrlsuite.results import provenance
+from qrlsuite.results.store import EntryStore, read_lines
+from qrlsuite.training.group import GroupRun
 
 HEADER = """\
 # Processor seconds of one epoch of one seed, training and validation, measured by benchmarks/speeds.py in groups of

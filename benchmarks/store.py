@@ -20,10 +20,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from qrlsuite import run
-from qrlsuite.entry import resolve
-from qrlsuite.run import GroupRun
-from qrlsuite.store import EntryStore
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import group
+from qrlsuite.training.group import GroupRun
 
 STEPS = {"record": "_record", "capture": "_capture", "save": "_save", "finish": "_finish"}
 
@@ -49,7 +49,7 @@ def measure(task: str, seeds: int, epochs: int, runs: Path) -> dict[str, Any]:
     GroupRun(store.entry(), store, range(seeds), epochs).run()
     total = time.process_time() - began
     mean = {name: sum(values) / len(values) for name, values in seconds.items()}
-    period = max(run.CHECKPOINT_SECONDS, mean["epoch"])
+    period = max(group.CHECKPOINT_SECONDS, mean["epoch"])
     per_epoch = mean["record"] + mean["capture"]
     share = per_epoch / (mean["epoch"] + per_epoch) + max(seconds["save"]) / period
     return {

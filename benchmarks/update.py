@@ -18,12 +18,12 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import torch
 from circuits import Call, median_ms
 
-from qrlsuite.engine.groups import parse_seeds
-from qrlsuite.entry import resolve
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.run import ModelBuilder, build_envs
+from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.seeding import Streams
 from qrlsuite.specs import resolve as reference
+from qrlsuite.training.group import ModelBuilder, build_envs
 
 BATCH = 64
 

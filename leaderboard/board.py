@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
+from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.collect import EntryCurves
-from qrlsuite.rules import DEFAULT
+from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.statistics import (
     MIN_RUNS,
     Comparison,
@@ -32,7 +33,6 @@ from qrlsuite.statistics import (
     unsettled,
     unsettled_at,
 )
-from qrlsuite.task import RankingSection
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def build(
     refused:
         Lines about what could not be read, passed on.
     rule:
-        What counts as significant, see `qrlsuite.rules.load`; None means the paper's.
+        What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means the paper's.
 
     Raises
     ------

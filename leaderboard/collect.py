@@ -11,13 +11,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import naming, registry
+from qrlsuite import registry
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.experiment.task import Task, TaskFile
+from qrlsuite.experiment.task import load as load_task
 from qrlsuite.leaderboard import origin
-from qrlsuite.preset import TUNING_SEEDS
-from qrlsuite.store import EntryStore, SeedCurve, entries
-from qrlsuite.task import Task, TaskFile
-from qrlsuite.task import load as load_task
+from qrlsuite.results import lookup
+from qrlsuite.results.store import EntryStore, SeedCurve, entries
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ def collect(
 
 
 def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
-    """Read the entry that has a name (see `qrlsuite.naming`), or whose folder it is.
+    """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is.
 
     Raises
     ------
@@ -153,9 +154,9 @@ def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = naming.stored(_folders(runs, shipped))
+        everything = lookup.stored(_folders(runs, shipped))
         unique = list({entry.key: entry for entry in everything}.values())
-        key = naming.choose(unique, name, runs).key
+        key = lookup.choose(unique, name, runs).key
         folders = [entry.store for entry in everything if entry.key == key]
     found = [entry for entry in map(read, folders) if entry is not None]
     if not found:

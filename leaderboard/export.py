@@ -7,10 +7,10 @@ import tempfile
 from pathlib import Path
 
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.fingerprint import fingerprint
 from qrlsuite.leaderboard import origin, published
 from qrlsuite.leaderboard.collect import EntryCurves
-from qrlsuite.store import EntryStore
+from qrlsuite.leaderboard.fingerprint import fingerprint
+from qrlsuite.results.store import EntryStore
 
 
 def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from qrlsuite.errors import StoreError
-from qrlsuite.store import SeedStore, read_lines
+from qrlsuite.results.store import SeedStore, read_lines
 
 
 def versions(provenance: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:

@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.entry import from_record
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.fingerprint import Fingerprint
+from qrlsuite.experiment.entry import from_record
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.experiment.task import TaskFile, digest
 from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard.collect import EntryCurves, current, require_scores
-from qrlsuite.preset import TUNING_SEEDS
+from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
+from qrlsuite.results.store import EntryStore, settled
 from qrlsuite.specs import NAME
-from qrlsuite.store import EntryStore, settled
-from qrlsuite.task import TaskFile, digest
 
 SHIPPED = Path(__file__).parent / "entries"
 """The entries that come with the suite."""

@@ -12,11 +12,11 @@ import numpy as np
 
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.collect import EntryCurves, read_entry
-from qrlsuite.preset import TUNING_SEEDS
-from qrlsuite.store import EntryStore
-from qrlsuite.study import Member, PictureSection, Study
+from qrlsuite.results.store import EntryStore
+from qrlsuite.studies.study import Member, PictureSection, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -164,7 +164,7 @@ def _attempt(
 
 def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
     """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
-    from qrlsuite import evaluation
+    from qrlsuite.training import evaluation
 
     tasks = {entry.task_hash for entry in entries}
     if len(tasks) > 1 or picture.evaluation is None:

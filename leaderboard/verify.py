@@ -10,14 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qrlsuite import provenance, registry
-from qrlsuite.entry import Entry, from_record
+from qrlsuite import registry
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.fingerprint import fingerprint
+from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.leaderboard.published import Published
-from qrlsuite.run import GroupRun, Progress
-from qrlsuite.store import EntryStore
+from qrlsuite.results import provenance
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training.group import GroupRun, Progress
 
 AGREEMENT = 1e-5
 """How closely the beginnings of runs agree between machines, relative to 1 or the value."""

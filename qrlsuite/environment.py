@@ -36,7 +36,7 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     autoreset: bool = True
     """False in validation: an ended lane need not be reset; stepping it on is allowed and means nothing."""
     running_statistics: bool = False
-    """True: agents standardize this environment's observations, see `qrlsuite.standardization`."""
+    """True: agents standardize this environment's observations, see `qrlsuite.training.standardization`."""
 
     def seed_lanes(self, streams: Sequence[np.random.Generator]) -> None:
         """Replace the random streams; their number divides `num_envs`. Takes effect at the next reset."""

@@ -2,7 +2,7 @@
 
 Three are fixed before training, and the environment applies them. Running statistics are gathered while a seed trains,
 and training and validation need the same: they belong to the agent, which applies them itself
-(`qrlsuite.standardization`), and its environment only asks for them.
+(`qrlsuite.training.standardization`), and its environment only asks for them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Normalization:
     - `bounds` maps [low, high] linearly to [-1, 1]. Values outside are not clipped: nothing is lost.
     - `arctan` bounds values that have no bounds to (-pi/2, pi/2), angles a circuit can take (Skolik, Jerbi &
       Dunjko 2022, "Quantum agents in the Gym", section 3.2, for CartPole's velocities).
-    - `running` returns them as they are, too: the agent standardizes them, see `qrlsuite.standardization`.
+    - `running` returns them as they are, too: the agent standardizes them, see `qrlsuite.training.standardization`.
 
     Parameters
     ----------

@@ -169,9 +169,9 @@ class StudySpec(Spec):
     Attributes
     ----------
     path:
-        Its TOML file (see `qrlsuite.study`).
+        Its TOML file (see `qrlsuite.studies.study`).
     speeds:
-        A TOML file of reference speeds (see `qrlsuite.speed`), for estimates before anything was measured.
+        A TOML file of reference speeds (see `qrlsuite.results.speed`), for estimates before anything was measured.
     """
 
     path: str

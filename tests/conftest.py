@@ -106,9 +106,9 @@ def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
         settings: Sequence[str] = ("width=16",),
     ) -> Path:
         from qrlsuite.engine.worker import train_group
-        from qrlsuite.entry import resolve
+        from qrlsuite.experiment.entry import resolve
         from qrlsuite.options import parse_setting
-        from qrlsuite.store import EntryStore
+        from qrlsuite.results.store import EntryStore
 
         entry = resolve(tiny_task, model, settings=[parse_setting(word) for word in settings])
         store = EntryStore.create(tmp_path / folder, entry)

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import qrlsuite
-from qrlsuite import rules
+from qrlsuite.leaderboard import rules
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.report import entries, sections, words
 from qrlsuite.leaderboard.report.encode import clean, script_json

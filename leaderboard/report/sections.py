@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.absent import absent
 from qrlsuite.leaderboard.board import Row, Section, ranking_of, undecided_reason
 from qrlsuite.leaderboard.report import ladder
@@ -15,7 +16,6 @@ from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.words import counted, listed, short
 from qrlsuite.statistics import Evidence, Grid, Outcome, SignificanceRule
-from qrlsuite.task import RankingSection
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.report.words import in_unit, short
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled, unsettled_at
-from qrlsuite.task import RankingSection
 
 LEVELS = 10
 """Shades of a surface."""

@@ -101,7 +101,7 @@ class CartPole(CartPoleEnv):
     Jerbi and Dunjko, "Quantum agents in the Gym" (2022). With `"bounds"` each is divided by its bound; the
     default bounds are those of Jerbi et al., "Parametrized quantum policies for reinforcement learning" (2021).
     With `"running"`, in tasks only, the environment leaves them and each agent standardizes them by the mean and
-    variance of what it has trained on (`qrlsuite.standardization`).
+    variance of what it has trained on (`qrlsuite.training.standardization`).
 
     ## Rewards
 

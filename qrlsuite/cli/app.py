@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli import (
+from qrlsuite.cli.commands import (
     calibrate,
     check,
     compare,

@@ -78,7 +78,7 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
 
 def _suite(found: Diagnosis) -> Facts:
     import qrlsuite
-    from qrlsuite.provenance import collect
+    from qrlsuite.results.provenance import collect
 
     location, stated = Path(qrlsuite.__file__).parent, installed.about()["version"]
     if not stated:
@@ -104,7 +104,7 @@ def _python(found: Diagnosis) -> Facts:
 
 
 def _machine(found: Diagnosis) -> Facts:
-    from qrlsuite.provenance import processor
+    from qrlsuite.results.provenance import processor
 
     usable, quota = len(os.sched_getaffinity(0)), _quota()
     if quota is not None and quota < usable:
@@ -193,7 +193,7 @@ def _plugins(found: Diagnosis) -> Facts:
 
 
 def _runs(folder: Path, found: Diagnosis) -> Facts:
-    from qrlsuite.store import entries
+    from qrlsuite.results.store import entries
 
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     facts: Facts = {"folder": str(folder), "exists": folder.exists(), "entries": 0, "seeds": 0}

@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 if TYPE_CHECKING:
-    from qrlsuite.engine.groups import Group
-    from qrlsuite.entry import Entry
-    from qrlsuite.store import EntryStore
+    from qrlsuite.experiment.entry import Entry
+    from qrlsuite.results.seeds import Group
+    from qrlsuite.results.store import EntryStore
 
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from qrlsuite.cli.display import RunDisplay, duration
 from qrlsuite.cli.training import Place, Plan, plan, train
 from qrlsuite.errors import OptionError
-from qrlsuite.speed import Estimate, Speeds
+from qrlsuite.results.speed import Estimate, Speeds
 
 if TYPE_CHECKING:
     from qrlsuite.engine.api import Outcome
-    from qrlsuite.study import Member
+    from qrlsuite.studies.study import Member
 
 BASES = {
     "measured": "measured on its own epochs",

@@ -12,9 +12,9 @@ import typer
 if TYPE_CHECKING:
     from qrlsuite.cli.display import RunDisplay
     from qrlsuite.engine.api import Engine, Outcome
-    from qrlsuite.engine.groups import Group
-    from qrlsuite.entry import Entry
-    from qrlsuite.store import EntryStore
+    from qrlsuite.experiment.entry import Entry
+    from qrlsuite.results.seeds import Group
+    from qrlsuite.results.store import EntryStore
 
 WorkersOption = Annotated[
     int | None,
@@ -108,9 +108,9 @@ def place(
         If there is no such engine, it has no such option or value, a package is not installed, or there can be
         no such device.
     """
-    from qrlsuite import device as devices
     from qrlsuite import options, registry, specs
     from qrlsuite.engine import api
+    from qrlsuite.training import device as devices
 
     devices.check(device)  # whether it is there is seen where the work is done
     given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
@@ -127,14 +127,14 @@ def plan(runs: Path, entry: Entry, seeds: Sequence[int], epochs: int, where: Pla
     StoreError
         If the entry's folder is damaged, or belongs to another entry.
     """
-    from qrlsuite.claims import living
-    from qrlsuite.engine import groups
-    from qrlsuite.store import EntryStore
+    from qrlsuite.results.claims import living
+    from qrlsuite.results.seeds import plan_groups
+    from qrlsuite.results.store import EntryStore
 
     store = EntryStore.find(runs, entry)
     busy = {seed for claim in living(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(seeds)
-    missing = groups.plan(store, sorted(set(seeds) - busy), epochs, where.workers)
+    missing = plan_groups(store, sorted(set(seeds) - busy), epochs, where.workers)
     return Plan(entry, store, seeds, epochs, frozenset(busy), missing)
 
 
@@ -150,7 +150,7 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
     """
     from qrlsuite.cli.terminal import printable
     from qrlsuite.engine import api
-    from qrlsuite.store import EntryStore
+    from qrlsuite.results.store import EntryStore
 
     EntryStore.create(work.store.path.parent.parent, work.entry)
     display.begin(work.busy, where.submits)
@@ -175,7 +175,7 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
 
 def _warnings(store: EntryStore, group: Group) -> list[str]:
     """Return what a group's worker left for the user to know."""
-    from qrlsuite.engine.groups import ProgressFile
+    from qrlsuite.results.seeds import ProgressFile
 
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from qrlsuite.cli.training import Place, Plan
-    from qrlsuite.entry import Entry
+    from qrlsuite.experiment.entry import Entry
     from qrlsuite.tuning.search import Search, Trial
 
 SHOWN = 10
@@ -52,7 +52,7 @@ class TuneDisplay:
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
-        from qrlsuite.engine.groups import format_seeds
+        from qrlsuite.results.seeds import format_seeds
         from qrlsuite.tuning.objective import cell_text
         from qrlsuite.tuning.samplers import NAMES
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from qrlsuite import options, registry, specs
-from qrlsuite.engine.groups import Group, format_seeds
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.store import EntryStore
+from qrlsuite.results.seeds import Group, format_seeds
+from qrlsuite.results.store import EntryStore
 
 Snapshot = dict[str, dict[str, Any]]
 """Progress by group id."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import IO
 
 from qrlsuite.engine.api import Outcome, Show, Work, worker_command
-from qrlsuite.engine.groups import Group, ProgressFile
-from qrlsuite.store import EntryStore
+from qrlsuite.results.seeds import Group, ProgressFile
+from qrlsuite.results.store import EntryStore
 
 ATTEMPTS = 3
 """Deaths of a group's worker, without a finished epoch between them, after which it is given up."""

@@ -22,12 +22,12 @@ from typing import Annotated, Any
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import survey
 from qrlsuite.engine.api import Outcome, Show, Work
-from qrlsuite.engine.groups import Group
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.store import EntryStore, write_json
+from qrlsuite.results import survey
+from qrlsuite.results.seeds import Group
+from qrlsuite.results.store import EntryStore, write_json
 
 TASKS = 10
 """Array tasks, where no number of workers was asked for."""

@@ -19,11 +19,11 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from qrlsuite.checkpoint import group_id
-from qrlsuite.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
-from qrlsuite.engine.groups import ProgressFile, parse_seeds, plan
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.store import EntryStore
+from qrlsuite.results.checkpoint import group_id
+from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
+from qrlsuite.results.seeds import ProgressFile, parse_seeds, plan_groups
+from qrlsuite.results.store import EntryStore
 
 _PR_SET_PDEATHSIG = 1
 
@@ -69,7 +69,7 @@ def train_group(
     KeyboardInterrupt
         After an interruption, with everything saved.
     """
-    from qrlsuite.run import GroupRun, Progress
+    from qrlsuite.training.group import GroupRun, Progress
 
     store = EntryStore(folder)
     progress = ProgressFile(store, group_id(seeds))
@@ -79,7 +79,7 @@ def train_group(
     state = Progress(epochs=epochs)
     try:
         entry = store.entry()
-        for group in plan(store, seeds, epochs, workers=1):
+        for group in plan_groups(store, seeds, epochs, workers=1):
             run = GroupRun(entry, store, group.seeds, epochs, device, progress.write)
             state = run.progress
             run.run()
@@ -111,7 +111,7 @@ def _checkpoint_seconds() -> None:
     StoreError
         If it is not a number of seconds.
     """
-    from qrlsuite import run
+    from qrlsuite.training import group
 
     text = os.environ.get("QRLSUITE_CHECKPOINT_SECONDS")
     if text is None:
@@ -122,7 +122,7 @@ def _checkpoint_seconds() -> None:
         seconds = -1.0
     if not seconds >= 0:
         raise StoreError(f"QRLSUITE_CHECKPOINT_SECONDS={text} is not a number of seconds")
-    run.CHECKPOINT_SECONDS = seconds
+    group.CHECKPOINT_SECONDS = seconds
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

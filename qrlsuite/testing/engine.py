@@ -58,7 +58,7 @@ def _workers(engine: Any) -> None:
 
 
 def _queued(engine: Any) -> None:
-    from qrlsuite.store import EntryStore
+    from qrlsuite.results.store import EntryStore
 
     with tempfile.TemporaryDirectory() as folder:
         got = engine.queued(EntryStore(Path(folder) / "task" / "entry"))

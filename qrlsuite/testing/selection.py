@@ -6,9 +6,10 @@ import importlib.util
 import re
 from dataclasses import dataclass
 
-from qrlsuite import events, registry
+from qrlsuite import registry
 from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.testing import plural
+from qrlsuite.training import trackers
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,7 @@ def _folded(name: str) -> str:
 def _watching() -> dict[str, str]:
     """Return the plugins that implement a run event, by module: their distributions."""
     hooks = registry.load().manager.hook
-    names = [i.plugin_name for event in events.EVENTS for i in getattr(hooks, event).get_hookimpls()]
+    names = [i.plugin_name for event in trackers.EVENTS for i in getattr(hooks, event).get_hookimpls()]
     return {name.partition(":")[2]: name.partition(":")[0] for name in sorted(set(names))}
 
 

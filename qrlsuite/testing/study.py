@@ -7,8 +7,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from qrlsuite import specs, speed
-from qrlsuite.study import Study, parse
+from qrlsuite import specs
+from qrlsuite.results import speed
+from qrlsuite.studies.study import Study, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import environment

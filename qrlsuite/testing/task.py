@@ -9,7 +9,7 @@ import numpy as np
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.task import Task, parse
+from qrlsuite.experiment.task import Task, parse
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.toml import check_format, check_names, in_its_words, parsed
@@ -79,8 +79,8 @@ def _ranking(task: Task) -> None:
 
 
 def _scores(task: Task) -> None:
-    from qrlsuite.entry import Entry
-    from qrlsuite.run import build_envs
+    from qrlsuite.experiment.entry import Entry
+    from qrlsuite.training.group import build_envs
 
     known = registry.load().entries
     algorithm, model = (

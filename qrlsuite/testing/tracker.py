@@ -14,10 +14,10 @@ from typing import Any
 import pluggy
 
 from qrlsuite import hookspecs, specs
-from qrlsuite.events import EVENTS
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import HEAVY, fresh_process
+from qrlsuite.training.trackers import EVENTS
 
 RUNS = "two runs at once, resumed, and a metric without a value"
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite.experiment.task import RankingSection
 from qrlsuite.statistics import sample_complexity, sample_complexity_at, unsettled, unsettled_at
 from qrlsuite.statistics.grid import BoolArray, IntArray
-from qrlsuite.task import RankingSection
 
 Objective = Literal["cell", "area"]
 

@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import options, preset, provenance, registry
-from qrlsuite.engine.groups import format_seeds, parse_seeds
-from qrlsuite.entry import Entry, resolve
+from qrlsuite import options, registry
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment import preset
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.experiment.task import digest
 from qrlsuite.options import Setting
-from qrlsuite.preset import TUNING_SEEDS
-from qrlsuite.store import EntryStore, entries, write_atomically
-from qrlsuite.task import digest
+from qrlsuite.results import provenance
+from qrlsuite.results.seeds import format_seeds, parse_seeds
+from qrlsuite.results.store import EntryStore, entries, write_atomically
 from qrlsuite.tuning import samplers, space
 from qrlsuite.tuning.objective import Merit, Objective, cell_text, merit
 

@@ -31,8 +31,8 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from qrlsuite import options, registry, specs
-from qrlsuite.entry import Entry
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.options import Setting
 
 FOLDER = "search"

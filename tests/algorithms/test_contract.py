@@ -121,9 +121,9 @@ def test_stored_results_do_not_depend_on_groups(
 ) -> None:
     """Through the core, with a circuit: curves, executions and agents are the same bytes, also after a pause."""
     from qrlsuite.engine.worker import train_group
-    from qrlsuite.entry import resolve
+    from qrlsuite.experiment.entry import resolve
     from qrlsuite.options import parse_setting
-    from qrlsuite.store import EntryStore
+    from qrlsuite.results.store import EntryStore
 
     settings = {"qubits": 2, "layers": 1, **{f"algorithm.{k}": v for k, v in case.items()}}
     words = [parse_setting(f"{k}={v}") for k, v in settings.items()]

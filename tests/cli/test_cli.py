@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.cli import main
-from qrlsuite.store import EntryStore
+from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY, results
 
 

@@ -9,13 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
+from qrlsuite.cli.commands.leaderboard import COLUMNS
+from qrlsuite.cli.commands.run import summarize
 from qrlsuite.cli.display import CostEstimate, RunDisplay
-from qrlsuite.cli.leaderboard import COLUMNS
-from qrlsuite.cli.run import summarize
-from qrlsuite.engine.groups import Group, ProgressFile
-from qrlsuite.entry import Entry, resolve
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.store import EntryStore
+from qrlsuite.results.seeds import Group, ProgressFile
+from qrlsuite.results.store import EntryStore
 
 PAIR = [Group((0, 1, 2), 0), Group((3, 4), 0)]
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.cli import doctor, installed
+from qrlsuite.cli import installed
+from qrlsuite.cli.commands import doctor
 from qrlsuite.cli.diagnosis import Diagnosis
 from tests.core.test_hooks import install, suite
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from qrlsuite import registry, speed
+from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
 from qrlsuite.cli.studying import Item, cheapest_first, check_budget, fitting, survey
@@ -23,10 +23,11 @@ from qrlsuite.cli.training import Place
 from qrlsuite.engine.api import Outcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
+from qrlsuite.results import speed
+from qrlsuite.results.speed import Speed, Speeds
+from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec
-from qrlsuite.speed import Speed, Speeds
-from qrlsuite.store import EntryStore
-from qrlsuite.study import parse
+from qrlsuite.studies.study import parse
 from tests.conftest import TINY, results
 
 STUDY = """

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.store import EntryStore
+from qrlsuite.results.store import EntryStore
 from tests.cli.test_cli import qrlsuite
 from tests.conftest import TINY
 from tests.core.test_tuning import SETTINGS, finish, varied, without_hours

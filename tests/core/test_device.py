@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from qrlsuite import device
 from qrlsuite.errors import OptionError
+from qrlsuite.training import device
 
 
 @pytest.mark.parametrize("name", ["cpu", "cuda", "cuda:1"])

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from qrlsuite import options, registry, specs
-from qrlsuite.entry import resolve
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 
 ROOT = Path(__file__).parents[2]

@@ -16,10 +16,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from qrlsuite import events, hookspecs, registry
+from qrlsuite import hookspecs, registry
+from qrlsuite.cli.commands.listing import hooks
 from qrlsuite.cli.extensions import add_commands
-from qrlsuite.cli.listing import hooks
 from qrlsuite.testing.tracker import RECORD, RUN
+from qrlsuite.training import trackers
 
 NAMES = [row["name"] for row in hooks()]
 
@@ -60,14 +61,14 @@ def test_the_example_in_the_manual_works(hook: str, tmp_path: Path) -> None:
         content: dict[str, Any] = {"run": {**RUN, "folder": str(tmp_path), "epochs": 0}}
         if hook == "epoch_finished":
             content["record"] = RECORD
-        sink = events.EventSink(found)
+        sink = trackers.EventSink(found)
         sink.send(hook, **content)
         assert not sink.problems
         assert (tmp_path / "notes.txt").read_text().strip()
 
 
 def test_every_kind_and_event_has_a_hook() -> None:
-    expected = {f"register_{kind}" for kind in registry.KINDS} | {"register_commands", *events.EVENTS}
+    expected = {f"register_{kind}" for kind in registry.KINDS} | {"register_commands", *trackers.EVENTS}
     assert set(NAMES) == expected
 
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from qrlsuite import naming
 from qrlsuite.errors import UnknownNameError
-from qrlsuite.store import entries
+from qrlsuite.results import lookup
+from qrlsuite.results.store import entries
 
 
 class Entry(NamedTuple):
@@ -43,7 +43,7 @@ SEVERAL = [
     ],
 )
 def test_an_entry_answers_to(name: str, found: int) -> None:
-    assert naming.choose(SEVERAL, name, "runs") is SEVERAL[found]
+    assert lookup.choose(SEVERAL, name, "runs") is SEVERAL[found]
 
 
 @pytest.mark.parametrize(
@@ -67,16 +67,16 @@ def test_an_entry_answers_to(name: str, found: int) -> None:
 )
 def test_a_name_that_fits_none_or_several(name: str, message: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        naming.choose(SEVERAL, name, "runs")
+        lookup.choose(SEVERAL, name, "runs")
     assert str(caught.value).startswith(message)
 
 
 def test_what_is_offered_is_found() -> None:
     """Labels are told apart by the task; where one task has two entries of a label, by the name."""
     with pytest.raises(UnknownNameError) as caught:
-        naming.choose(SEVERAL, "ddqn", "runs")
+        lookup.choose(SEVERAL, "ddqn", "runs")
     offered = str(caught.value).split("'")[3::2]
-    found = {naming.choose(SEVERAL, word, "runs").name for word in offered}
+    found = {lookup.choose(SEVERAL, word, "runs").name for word in offered}
     assert found == {e.name for e in SEVERAL if e.label.startswith("ddqn")}
 
 
@@ -84,22 +84,22 @@ def test_long_lists_are_cut() -> None:
     many = [Entry(f"ddqn mlp width={width}", "beam6g", f"ddqn-mlp-{width}") for width in range(100, 160)]
     for name in ("mlp", "q"):
         with pytest.raises(UnknownNameError, match=r"mlp width=119'? and 40 more"):
-            naming.choose(many, name, "runs")
+            lookup.choose(many, name, "runs")
 
 
 def test_a_task_is_known_by_registration_or_by_its_results(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    naming.check_tasks(tmp_path, "mine", "beam6g", None)
-    naming.check_tasks(tmp_path / "nowhere", "beam6g")
+    lookup.check_tasks(tmp_path, "mine", "beam6g", None)
+    lookup.check_tasks(tmp_path / "nowhere", "beam6g")
     with pytest.raises(UnknownNameError, match="unknown task 'mime'; did you mean 'mine'"):
-        naming.check_tasks(tmp_path, "mine", "mime")
+        lookup.check_tasks(tmp_path, "mine", "mime")
 
 
 def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "beam6g" / "ddqn-mlp-88888888"
     folder.mkdir(parents=True)
     (folder / "entry.json").write_text("{")
-    (found,) = naming.stored(entries(tmp_path))
-    assert naming.choose([found], "ddqn-mlp-8", tmp_path).store.path == folder
+    (found,) = lookup.stored(entries(tmp_path))
+    assert lookup.choose([found], "ddqn-mlp-8", tmp_path).store.path == folder
     with pytest.raises(UnknownNameError, match="known: ddqn-mlp-88888888"):
-        naming.choose([found], "x", tmp_path)
+        lookup.choose([found], "x", tmp_path)

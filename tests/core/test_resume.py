@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import checkpoint, run
-from qrlsuite.store import EntryStore
+from qrlsuite.results import checkpoint
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import group
 from tests.conftest import results
 
 EPOCHS = 6
@@ -23,19 +24,19 @@ EPOCHS = 6
 @pytest.fixture
 def frequent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Checkpoint after every epoch."""
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(group, "CHECKPOINT_SECONDS", 0.0)
 
 
 def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
     """Raise KeyboardInterrupt, as Ctrl-C does, in the middle of an epoch's validation."""
-    original = run.GroupRun.validate
+    original = group.GroupRun.validate
 
-    def validate(self: run.GroupRun, number: int) -> object:
+    def validate(self: group.GroupRun, number: int) -> object:
         if number == epoch:
             raise KeyboardInterrupt
         return original(self, number)
 
-    monkeypatch.setattr(run.GroupRun, "validate", validate)
+    monkeypatch.setattr(group.GroupRun, "validate", validate)
 
 
 @pytest.mark.parametrize("model", ["mlp", "vqc-native"])

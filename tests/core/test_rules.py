@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite import registry, rules, specs
+from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard import board, rules
 from qrlsuite.statistics import Evidence, Grid, IntervalRule, LearningCurves, compare, outperformance
 from tests.leaderboard.test_pictures import learner
 

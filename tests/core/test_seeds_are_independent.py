@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.store import EntryStore
+from qrlsuite.results.store import EntryStore
 from tests.conftest import POLE, results
 
 MODELS = {

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import speed
-from qrlsuite.entry import Entry, resolve
 from qrlsuite.errors import TaskError
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.speed import Speed, Speeds
-from qrlsuite.store import EntryStore
+from qrlsuite.results import speed
+from qrlsuite.results.speed import Speed, Speeds
+from qrlsuite.results.store import EntryStore
 
 KIND = ("beam6g", "ddqn", "vqc-native")
 REFERENCES = [Speed(KIND, {"qubits": n}, seconds) for n, seconds in ((4, 1.0), (8, 3.0), (12, 50.0))]

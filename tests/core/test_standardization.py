@@ -13,15 +13,16 @@ import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
-from qrlsuite import checkpoint, evaluation, run
 from qrlsuite.engine.worker import train_group
-from qrlsuite.entry import Entry, resolve
 from qrlsuite.errors import EnvironmentFailure, StoreError
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.run import GroupRun, build_envs
+from qrlsuite.results import checkpoint
+from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
-from qrlsuite.standardization import PREFIX, RunningStatistics
-from qrlsuite.store import EntryStore
+from qrlsuite.training import evaluation, group
+from qrlsuite.training.group import GroupRun, build_envs
+from qrlsuite.training.standardization import PREFIX, RunningStatistics
 from tests.conftest import POLE
 
 STANDARDIZED = POLE.replace("steps = 30", 'steps = 30\nnormalization = "running"')
@@ -240,7 +241,7 @@ def test_killed_before_publishing_publishes_the_statistics_of_the_last_epoch(
         raise MemoryError
 
     with monkeypatch.context() as patch:
-        patch.setattr(run.GroupRun, "_finish", killed)
+        patch.setattr(group.GroupRun, "_finish", killed)
         with pytest.raises(MemoryError):
             train("killed", [0], AGENTS[1])
     assert results(straight, 0) == results(train("killed", [0], AGENTS[1]), 0)

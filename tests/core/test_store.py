@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qrlsuite import checkpoint, store
-from qrlsuite.claims import SeedsClaimedError, acquire, living
-from qrlsuite.engine.groups import format_seeds, parse_seeds, plan
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.results import checkpoint, store
+from qrlsuite.results.claims import SeedsClaimedError, acquire, living
+from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
 from tests.conftest import results
 
 
@@ -156,9 +156,9 @@ def test_format_seeds_is_the_inverse_of_parse_seeds(seeds: list[int]) -> None:
 
 def test_groups_are_even_and_keep_epochs_apart(train: Callable[..., Path]) -> None:
     entry = store.EntryStore(train("runs", [0, 1], 2))
-    groups = plan(entry, range(10), 5, workers=2)
+    groups = plan_groups(entry, range(10), 5, workers=2)
     assert [(g.seeds, g.epoch) for g in groups] == [((2, 3, 4, 5), 0), ((6, 7, 8, 9), 0), ((0, 1), 2)]
-    assert plan(entry, [0, 1], 2, workers=2) == []
+    assert plan_groups(entry, [0, 1], 2, workers=2) == []
 
 
 def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_a_deleted_folder_of_a_seed_starts_again(train: Callable[..., Path]) -> 
     kept = store.EntryStore(path)
     before = results(path, 1)
     shutil.rmtree(kept.seed(1).path)
-    assert [(group.seeds, group.epoch) for group in plan(kept, [0, 1], 2, 1)] == [((1,), 0)]
+    assert [(group.seeds, group.epoch) for group in plan_groups(kept, [0, 1], 2, 1)] == [((1,), 0)]
     train("runs", [0, 1], 2)
     assert results(path, 1) == before
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import registry, study
-from qrlsuite.entry import resolve
+from qrlsuite import registry
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError
-from qrlsuite.matching import nearest_size, parameters
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import Setting, parse_setting
+from qrlsuite.studies import study
+from qrlsuite.studies.sizes import nearest_size, parameters
 
 ROOT = Path(__file__).parents[2]
 SMALL = """
@@ -235,7 +236,7 @@ def test_unknown_names() -> None:
 
 
 def test_speeds_come_with_the_studies() -> None:
-    from qrlsuite import speed
+    from qrlsuite.results import speed
 
     rows = speed.load(Path(str(registry.study("fig7").speeds)))
     kinds = {row.kind for row in rows}

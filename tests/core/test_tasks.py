@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qrlsuite import entry, registry, task
+from qrlsuite import registry
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
+from qrlsuite.experiment import entry, task
 from tests.conftest import TINY
 
 

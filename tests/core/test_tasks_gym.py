@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite import options, registry, run, specs, task
-from qrlsuite.entry import Entry, resolve
+from qrlsuite import options, registry, specs
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
+from qrlsuite.experiment import task
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.gymlanes import GymLanes, quick_name
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.store import EntryStore
+from qrlsuite.results.store import EntryStore
 from qrlsuite.tasks import variants
+from qrlsuite.training import group
 from tests.conftest import results
 from tests.environments.strangers import HERE
 
@@ -208,7 +210,7 @@ def stranger(tmp_path: Path) -> Callable[..., Entry]:
 
 def train(entry: Entry, folder: Path, seeds: list[int], epochs: int = 4) -> EntryStore:
     store = EntryStore.create(folder, entry)
-    run.GroupRun(entry, store, seeds, epochs).run()
+    group.GroupRun(entry, store, seeds, epochs).run()
     return store
 
 
@@ -216,7 +218,7 @@ def test_seeds_together_and_apart_and_resumed(
     stranger: Callable[..., Entry], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Episodes of different lengths, cut by epochs' ends: the same bytes however seeds are grouped."""
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(group, "CHECKPOINT_SECONDS", 0.0)
     entry = stranger()
     together = train(entry, tmp_path / "together", [0, 1])
     mixed = tmp_path / "mixed"
@@ -250,9 +252,9 @@ def test_an_environment_that_raises_fails_its_group_and_keeps_finished_epochs(
         EnvironmentFailure,
         match=r"environment 'gym' failed: ZeroDivisionError: the cart left the rails; finished",
     ):
-        run.GroupRun(entry, store, [0], 4).run()
+        group.GroupRun(entry, store, [0], 4).run()
     assert [row["epoch"] for row in store.seed(0).epochs()] == [1, 2]
-    run.GroupRun(entry, store, [0], 4).run()
+    group.GroupRun(entry, store, [0], 4).run()
     undisturbed = train(entry, tmp_path / "undisturbed", [0])
     assert results(store.path, 0) == results(undisturbed.path, 0)
 
@@ -294,7 +296,7 @@ def test_a_spec_without_a_vector_form_gets_the_generic_one(
     text = TASK.format(env_id="", arguments="", source="info").replace('name = "gym"', 'name = "walk"')
     text = re.sub(r"id = .*\narguments = .*", "start = 3", text)
     entry = Entry(task.parse(text, "t"), *[None] * 5)  # type: ignore[arg-type]
-    envs = run.build_envs(entry, 4, lambda: None)
+    envs = group.build_envs(entry, 4, lambda: None)
     assert isinstance(envs.inner, GymLanes)
     assert envs.inner.envs[3].unwrapped.action_space.start == 3  # type: ignore[attr-defined]
     envs.seed_lanes([np.random.default_rng(g) for g in range(4)])

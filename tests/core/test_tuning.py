@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite import preset
-from qrlsuite.entry import Entry, resolve
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, UnknownNameError
+from qrlsuite.experiment import preset
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.task import RankingSection
 from qrlsuite.options import parse_setting
-from qrlsuite.store import EntryStore
-from qrlsuite.task import RankingSection
+from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space
 
 SETTINGS = (parse_setting("width=4"), parse_setting("depth=1"))

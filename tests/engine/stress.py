@@ -29,8 +29,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from qrlsuite.claims import claims
-from qrlsuite.store import EntryStore, read_lines
+from qrlsuite.results.claims import claims
+from qrlsuite.results.store import EntryStore, read_lines
 from tests.conftest import TINY, results
 
 
@@ -192,7 +192,7 @@ def main() -> None:
     parser.add_argument("--forked", action="store_true", help="start processes by forking")
     given = parser.parse_args()
     if given.forked:
-        import qrlsuite.run  # noqa: F401 - what the forks are to have
+        import qrlsuite.training.group  # noqa: F401 - what the forks are to have
     dice = random.Random(0)
     total: Counter[str] = Counter()
     began = time.monotonic()

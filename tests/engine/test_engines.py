@@ -12,16 +12,17 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from qrlsuite import checkpoint, registry, survey
-from qrlsuite.claims import acquire
+from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.engine import api, worker
-from qrlsuite.engine.groups import Group
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.slurm import Options, SlurmEngine, minutes
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.options import build as build_options
-from qrlsuite.store import EntryStore, write_json
+from qrlsuite.results import checkpoint, survey
+from qrlsuite.results.claims import acquire
+from qrlsuite.results.seeds import Group
+from qrlsuite.results.store import EntryStore, write_json
 from tests.conftest import results
 
 

@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from typer.main import get_command
 
-from qrlsuite import store
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.task import load
+from qrlsuite.experiment.task import load
+from qrlsuite.results import store
 from tests.conftest import TINY
 
 FEW = settings(
@@ -72,7 +72,7 @@ def no_queue(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def entry(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An entry with a finished and an interrupted seed, a claim, a submitted task and a checkpoint."""
     from qrlsuite.engine.worker import train_group
-    from qrlsuite.entry import resolve
+    from qrlsuite.experiment.entry import resolve
     from qrlsuite.options import parse_setting
 
     folder = tmp_path_factory.mktemp("fuzz")

@@ -17,13 +17,13 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from qrlsuite import released
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
-from qrlsuite.importing import import_files
+from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.collect import collect
-from qrlsuite.store import EntryStore, entries, settled
-from qrlsuite.task import load
+from qrlsuite.results import released
+from qrlsuite.results.imports import import_files
+from qrlsuite.results.store import EntryStore, entries, settled
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from qrlsuite import claims
-from qrlsuite.claims import SeedsClaimedError, acquire, living
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
-from qrlsuite.store import EntryStore
+from qrlsuite.results import claims
+from qrlsuite.results.claims import SeedsClaimedError, acquire, living
+from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY, results
 from tests.engine.stress import finished
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import claims
 from qrlsuite.engine import worker
-from qrlsuite.store import EntryStore
+from qrlsuite.results import claims
+from qrlsuite.results.store import EntryStore
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qrlsuite import task as tasks
+from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board
 from qrlsuite.leaderboard.collect import EntryCurves
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite.cli.calibrate import summary, tables
+from qrlsuite.cli.commands.calibrate import summary, tables
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration
 from qrlsuite.statistics import (

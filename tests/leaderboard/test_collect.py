@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from qrlsuite import task as tasks
 from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
+from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board, collect
-from qrlsuite.store import EntryStore
+from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY
 from tests.leaderboard.boards import entry as drawn
 

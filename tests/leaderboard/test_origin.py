@@ -8,7 +8,7 @@ import pytest
 
 from qrlsuite.errors import StoreError
 from qrlsuite.leaderboard import origin
-from qrlsuite.store import SeedStore, json_line, table_bytes
+from qrlsuite.results.store import SeedStore, json_line, table_bytes
 
 
 def test_executions_are_summed_over_table_and_newer_lines(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from qrlsuite import options, specs
-from qrlsuite import task as tasks
 from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.collect import EntryCurves
 

@@ -19,10 +19,10 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import collect, published, verify
 from qrlsuite.leaderboard.export import export
-from qrlsuite.store import EntryStore
-from qrlsuite.task import digest
+from qrlsuite.results.store import EntryStore
 
 EPOCHS = 3
 
@@ -96,8 +96,8 @@ def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
 
 
 def test_the_beginning_of_a_seed_does_not_depend_on_its_company(folder: Path) -> None:
-    from qrlsuite.entry import from_record
-    from qrlsuite.fingerprint import fingerprint
+    from qrlsuite.experiment.entry import from_record
+    from qrlsuite.leaderboard.fingerprint import fingerprint
 
     stated = published.read(folder)
     alone = fingerprint(from_record(stated.record, ""), [5])

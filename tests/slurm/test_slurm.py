@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.claims import claims
-from qrlsuite.store import EntryStore
+from qrlsuite.results.claims import claims
+from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY, results
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite import rules
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import rules
 from qrlsuite.statistics import (
     MIN_RUNS,
     DifferenceRule,

@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
-from qrlsuite import events, registry, specs
+from qrlsuite import registry, specs
 from qrlsuite.errors import QrlSuiteError, UnknownNameError
 from qrlsuite.plugins.trackers.tensorboard import TensorBoard
 from qrlsuite.testing.tracker import RECORD, RUN
+from qrlsuite.training import trackers
 
 Train = Callable[..., Path]
 
@@ -25,14 +26,14 @@ def read(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def test_every_seed_has_its_curves(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(events.TRACK, "tensorboard")
+    monkeypatch.setenv(trackers.TRACK, "tensorboard")
     entry = train("runs", [0, 1], epochs=1)
     train("runs", [0, 1], epochs=3)  # goes on where it stopped
     for seed in (0, 1):
         curves = read(entry / f"seed-{seed:04d}" / "tensorboard")
         assert {"validation/score", "training/loss", "training/return"} <= curves.keys()
         assert [step for step, _ in curves["validation/score"]] == [1, 2, 3]
-        from qrlsuite.store import EntryStore
+        from qrlsuite.results.store import EntryStore
 
         expected = EntryStore(entry).seed(seed).curve().curve
         assert [value for _, value in curves["validation/score"]] == pytest.approx(list(expected), abs=1e-6)
@@ -56,7 +57,7 @@ class Fails:
         self.calls: list[str] = []
 
     def __getattr__(self, name: str) -> Any:
-        if name not in events.EVENTS:
+        if name not in trackers.EVENTS:
             raise AttributeError(name)
 
         def method(*given: Any) -> None:
@@ -84,12 +85,12 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("failing")
-@pytest.mark.parametrize("event", ["factory", *events.EVENTS])
+@pytest.mark.parametrize("event", ["factory", *trackers.EVENTS])
 def test_a_tracker_that_fails_never_stops_a_run(
     event: str, train: Train, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     MADE.clear()
-    monkeypatch.setenv(events.TRACK, f"failing={event}\ntensorboard")
+    monkeypatch.setenv(trackers.TRACK, f"failing={event}\ntensorboard")
     entry = train("runs", [0, 1], epochs=2)
     assert json.loads((entry / "seed-0001" / "run.json").read_text())["status"] == "finished"
     assert len(read(entry / "seed-0001" / "tensorboard")["validation/score"]) == 2
@@ -103,12 +104,12 @@ def test_a_tracker_that_fails_never_stops_a_run(
 
 def test_asking_for_what_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UnknownNameError, match="unknown tracker 'tensorbord'; did you mean 'tensorboard'"):
-        events.parse(["tensorbord"])
+        trackers.parse(["tensorbord"])
     with pytest.raises(QrlSuiteError, match="nothing follows '='"):
-        events.parse(["tensorboard="])
+        trackers.parse(["tensorboard="])
     spec = specs.TrackerSpec("far", "Away", factory="a:b", extras={"no_such_module": "pip install far"})
     monkeypatch.setitem(registry.load().entries["trackers"], "far", registry.Registered(spec, "tests"))
     with pytest.raises(
         QrlSuiteError, match="tracker 'far' needs the package 'no_such_module': pip install far"
     ):
-        events.parse(["far"])
+        trackers.parse(["far"])

@@ -1,0 +1,71 @@
+"""`qrlsuite import`: the result files that the paper's code wrote, as an entry to compare with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qrlsuite.cli.arguments import JsonOption, RunsOption
+
+
+def import_results(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Pickled result files, one per run.")
+    ],
+    task: Annotated[str, typer.Option("--task", help="The task on which they were made.")],
+    algorithm: Annotated[
+        str | None, typer.Option("--algorithm", help="The algorithm that made them; default: the task's.")
+    ] = None,
+    label: Annotated[
+        str | None, typer.Option("--label", help="What to call them; default: the name of their folder.")
+    ] = None,
+    quantum: Annotated[
+        str | None,
+        typer.Option(
+            "--quantum", metavar="PATTERN", help="The model's tensors that belong to a circuit, as 'vqc.*'."
+        ),
+    ] = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Import released result files as the seeds of one entry, marked "(imported)" everywhere.
+
+    A pickle is a program: files are read in a process of their own with little memory, little time, and a closed list
+    of what they may contain; anything else is refused by name. Files that were imported before are left as they are.
+
+    Example: qrlsuite import results/mlp/*.pkl --task beam6g --label "MLP of the paper"
+    """
+    import json
+
+    from qrlsuite.errors import OptionError
+    from qrlsuite.experiment.task import load
+    from qrlsuite.results.imports import import_files
+    from qrlsuite.results.seeds import format_seeds
+
+    loaded = load(task)
+    name = (label if label is not None else files[0].absolute().parent.name).strip()
+    if not name or len(name) > 80 or not name.isprintable():
+        raise OptionError(f"--label {name!r}: one line of at most 80 characters")
+    done = import_files(files, loaded, algorithm or loaded.file.default_algorithm, name, runs, quantum)
+    if json_output:
+        content = {
+            "folder": str(done.store.path),
+            "seeds": done.new,
+            "known": done.known,
+            "differing": done.differing,
+        }
+        typer.echo(json.dumps(content))
+        return
+    if done.known:
+        typer.echo(f"{done.known} of {len(files)} files were there already")
+    if done.new:
+        typer.echo(f"imported {len(done.new)} runs as seeds {format_seeds(done.new)} of {done.store.path}")
+    if done.differing:
+        typer.echo(
+            f"note: the runs differ in their arguments {', '.join(done.differing)}: are they one entry?",
+            err=True,
+        )
+    where = "" if str(runs) == "runs" else f" --runs {runs}"
+    typer.echo(f"next: qrlsuite leaderboard --task {loaded.name}{where}")

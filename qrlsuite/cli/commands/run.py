@@ -1,0 +1,141 @@
+"""`qrlsuite run`: train the missing seeds of an entry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.training import (
+    DeviceOption,
+    EngineOption,
+    EngineOptionsOption,
+    PartitionOption,
+    TimeOption,
+    TrackOption,
+    WorkersOption,
+)
+
+if TYPE_CHECKING:
+    from qrlsuite.experiment.entry import Entry
+    from qrlsuite.results.store import EntryStore
+
+QUICK_SEEDS = 8
+QUICK_EPOCHS = 10
+QUICK_QUBITS = 4
+
+
+def run(
+    task: Annotated[
+        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+    ],
+    model: Annotated[
+        str, typer.Option("--model", help="A function approximator (see `qrlsuite list models`).")
+    ],
+    algorithm: Annotated[
+        str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="An option, for example --set qubits=6, --set algorithm.gamma=.9, --set environment.degree=4.",
+        ),
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="One of the task's presets of settings.")
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: the task's protocol.")
+    ] = None,
+    epochs: Annotated[
+        int | None, typer.Option("--epochs", min=1, help="Default: the task's protocol.")
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
+        ),
+    ] = False,
+    workers: WorkersOption = None,
+    engine: EngineOption = "local",
+    partition: PartitionOption = None,
+    time: TimeOption = None,
+    engine_options: EngineOptionsOption = None,
+    device: DeviceOption = "cpu",
+    track: TrackOption = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Train the missing seeds of an entry (a model and an algorithm on a task).
+
+    Stop with Ctrl-C at any time; the same command continues where it stopped. More --seeds or --epochs add to
+    what is there, and asking again for what is there does nothing.
+
+    Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
+    """
+    import json
+
+    from qrlsuite import options
+    from qrlsuite.cli.display import RunDisplay
+    from qrlsuite.cli.training import place, plan, train
+    from qrlsuite.experiment import entry as entries
+    from qrlsuite.results.seeds import parse_seeds
+    from qrlsuite.training import trackers
+
+    words = [options.parse_setting(word) for word in settings or []]
+    if quick:
+        words = _quick_settings(model, words)
+    entry = entries.resolve(task, model, algorithm, words, preset)
+    if track:
+        trackers.ask(track)
+    protocol = entry.task.file.protocol
+    wanted = parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
+    last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))
+    where = place(engine, workers, partition, time, engine_options, device)
+
+    work = plan(runs, entry, wanted, last, where)
+    display = RunDisplay(entry, work.store, wanted, last, work.groups, where.workers, quiet=json_output)
+    outcome = train(work, where, display)
+    if outcome.submitted is not None:
+        typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
+        return
+    summary = summarize(entry, work.store, wanted, last)
+    if json_output:
+        typer.echo(json.dumps(summary))
+    else:
+        display.finished(summary)
+
+
+def _quick_settings(model: str, words: list[Any]) -> list[Any]:
+    """Reduce the qubits of a circuit, unless they were set by hand."""
+    from qrlsuite import options, registry, specs
+
+    names = options.field_names(specs.resolve(registry.model(model).options))
+    if "qubits" in names and not any(word.name == "qubits" for word in words):
+        return [options.Setting("model", "qubits", QUICK_QUBITS), *words]
+    return words
+
+
+def summarize(entry: Entry, store: EntryStore, seeds: list[int], epochs: int) -> dict[str, Any]:
+    """Return what a finished (or partly finished) run amounts to, as plain values."""
+    import numpy as np
+
+    curves = {seed: store.seed(seed).curve() for seed in seeds if store.seed(seed).record()}
+    complete = {seed: curve.curve[:epochs] for seed, curve in curves.items() if len(curve.scores) >= epochs}
+    summary: dict[str, Any] = {
+        "task": entry.task.name,
+        "entry": entry.name,
+        "label": entry.label,
+        "folder": str(store.path),
+        "seeds": len(complete),
+        "epochs": epochs,
+        "median_score": None,
+    }
+    if complete:
+        summary["median_score"] = float(np.median([curve[-1] for curve in complete.values()]))
+    return summary

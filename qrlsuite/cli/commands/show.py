@@ -1,0 +1,231 @@
+"""`qrlsuite show`: everything about one thing."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.terminal import printable_lines
+
+
+def show(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A task, model, algorithm, environment, ansatz, or an entry: name, label or folder."
+        ),
+    ],
+    second: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="With a kind first: `show ansatz iqp`.")
+    ] = None,
+    qubits: Annotated[
+        int | None, typer.Option("--qubits", help="For an ansatz: the number of qubits to draw; default: 4.")
+    ] = None,
+    layers: Annotated[
+        int | None, typer.Option("--layers", help="For an ansatz: the number of layers to draw; default: 2.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="For an ansatz: an option of its own."),
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="For an ansatz: draw to this picture file.")
+    ] = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Show a thing's options with their defaults and meaning, a task's protocol, an entry's provenance.
+
+    Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4
+    """
+    import json
+
+    from qrlsuite import registry
+    from qrlsuite.errors import OptionError, UnknownNameError, nearest
+
+    manual = _hook(name, second)
+    if manual is not None:
+        typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
+        return
+    kind, wanted = _kind(name, second)
+    known = registry.load()
+    found = [k for k in registry.KINDS if (kind in (None, k)) and wanted in known.entries[k]]
+    if not found and kind is None:
+        folder = _entry_folder(runs, wanted)
+        if folder is not None:
+            content = _entry(folder)
+            typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
+            return
+    if not found:
+        names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
+        raise UnknownNameError(f"nothing called '{wanted}'{nearest(wanted, names)}")
+    if len(found) > 1:
+        singulars = " or ".join(f"`show {registry.SINGULAR[k]} {wanted}`" for k in found)
+        raise UnknownNameError(f"'{wanted}' is several things; write {singulars}")
+    content = _content(found[0], wanted)
+    if found[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
+        raise OptionError(
+            f"{registry.SINGULAR[found[0]]} '{wanted}': --qubits, --layers, --set and --figure draw an ansatz; options "
+            "are changed where they are used, as in `qrlsuite run --set NAME=VALUE`"
+        )
+    if found[0] == "ansatzes":
+        size = (4 if qubits is None else qubits, 2 if layers is None else layers)
+        content["drawing"] = _draw(wanted, *size, settings or [], figure, content)
+    typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
+
+
+def _hook(first: str, second: str | None) -> dict[str, str] | None:
+    """Return a hook and its manual: `show hook register_models`, or `show register_models`."""
+    from qrlsuite.cli.commands.listing import hooks
+    from qrlsuite.errors import UnknownNameError, nearest
+
+    found = {row["name"]: row for row in hooks()}
+    if second is None:
+        return found.get(first)
+    if first not in ("hook", "hooks"):
+        return None
+    if second not in found:
+        raise UnknownNameError(f"unknown hook '{second}'{nearest(second, found)}")
+    return found[second]
+
+
+def _kind(first: str, second: str | None) -> tuple[str | None, str]:
+    """Split `show [KIND] NAME` into the kind in the plural, or None, and the name."""
+    from qrlsuite import registry
+    from qrlsuite.errors import UnknownNameError, nearest
+
+    if second is None:
+        return None, first
+    singulars = {word: kind for kind, word in registry.SINGULAR.items()} | {
+        kind: kind for kind in registry.KINDS
+    }
+    singulars |= {word.replace("_", "-"): kind for word, kind in singulars.items()}
+    if first not in singulars:
+        raise UnknownNameError(f"unknown kind '{first}'{nearest(first, singulars)}")
+    return singulars[first], second
+
+
+def _entry_folder(runs: Path, name: str) -> Path | None:
+    """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits."""
+    from qrlsuite.errors import UnknownNameError
+    from qrlsuite.results import lookup
+    from qrlsuite.results.store import entries
+
+    if (Path(name) / "entry.json").exists():
+        return Path(name)
+    if not runs.is_dir():
+        return None
+    stored = lookup.stored(entries(runs))
+    try:
+        return lookup.choose(stored, name, runs).store.path
+    except UnknownNameError:
+        if any(lookup.mentions(entry, name) for entry in stored):
+            raise
+        return None
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    from qrlsuite.results.store import EntryStore
+
+    store = EntryStore(folder)
+    record = store.record()
+    seeds = store.seeds()
+    records = [store.seed(seed).record() or {} for seed in seeds]
+    made_with: list[Any] = []
+    for run in records:
+        made_with += [made for made in run.get("provenance", []) if made not in made_with]
+    return {
+        **{
+            key: record[key]
+            for key in ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
+        },
+        "seeds": len(seeds),
+        "provenance": made_with,
+        "parameters": (records[0] if records else {}).get("parameters", {}),
+    }
+
+
+def _content(kind: str, name: str) -> dict[str, Any]:
+    """Return what there is to say about a registered thing."""
+    from qrlsuite import options, registry, specs
+
+    registered = registry.load().get(kind, name)
+    spec = registered.spec
+    content: dict[str, Any] = {
+        "kind": registry.SINGULAR[kind],
+        "name": spec.name,
+        "summary": spec.summary,
+        "distribution": registered.distribution,
+    }
+    if isinstance(spec, specs.TaskSpec):
+        from qrlsuite.experiment.task import load
+
+        task = load(name)
+        content |= {
+            "hash": task.hash,
+            "path": spec.path,
+            **task.file.model_dump(mode="json", exclude={"name", "summary"}),
+        }
+        return content
+    if isinstance(spec, specs.SignificanceTestSpec):
+        from qrlsuite.leaderboard import rules
+
+        content["promises"] = rules.load(name).promise
+    for field in dataclasses.fields(spec):
+        if field.name == "family":
+            content["family"] = getattr(spec, field.name)
+    reference = getattr(spec, "options", None)
+    if reference:
+        content["options"] = options.describe(specs.resolve(reference))
+    return content
+
+
+def _draw(
+    name: str, qubits: int, layers: int, words: list[str], figure: Path | None, content: dict[str, Any]
+) -> str:
+    """Draw an ansatz as text (and to a file), and add its resources to the content."""
+    from qrlsuite import circuit
+    from qrlsuite.circuit import drawing
+    from qrlsuite.errors import OptionError
+    from qrlsuite.leaderboard import pictures
+    from qrlsuite.options import parse_setting
+    from qrlsuite.results.store import write_atomically
+
+    format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
+    if figure is not None and format_ not in pictures.FORMATS:
+        raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
+    chosen = {setting.name: setting.value for setting in map(parse_setting, words)}
+    drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
+    content["resources"] = dataclasses.asdict(drawing.resources(drawn))
+    if figure is not None:
+        write_atomically(figure, pictures.encode(drawing.draw_figure(drawn), format_))
+        content["figure"] = str(figure)
+    return str(drawing.draw_text(drawn))
+
+
+def _text(content: dict[str, Any], indent: str = "") -> str:
+    """Lay nested content out as indented lines; option tables with their descriptions."""
+    lines = []
+    for key, value in content.items():
+        if key == "options" and isinstance(value, list):
+            lines.append(f"{indent}options (change with --set NAME=VALUE)")
+            for row in value:
+                lines.append(f"{indent}  {row['name']} = {_value(row['default'])}    {row['values']}")
+                lines.append(f"{indent}      {row['description']}")
+        elif isinstance(value, dict) and value:
+            lines += [f"{indent}{key}", _text(value, indent + "  ")]
+        elif isinstance(value, str) and "\n" in value:
+            lines += [f"{indent}{key}", value]
+        else:
+            lines.append(f"{indent}{key}: {_value(value)}")
+    return "\n".join(lines)
+
+
+def _value(value: Any) -> str:
+    import json
+
+    return value if isinstance(value, str) else json.dumps(value)

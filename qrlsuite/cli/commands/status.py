@@ -1,0 +1,102 @@
+"""`qrlsuite status`: how far everything that has not finished is, wherever it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.terminal import printable
+
+if TYPE_CHECKING:
+    from qrlsuite.results.survey import GroupStatus
+
+
+def status(
+    task: TaskOption = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Show what is running, waiting and stopped, from any machine that sees the results folder.
+
+    Reads the results folder, and disturbs no worker. Where seeds were submitted to a queue, the queue is asked
+    whether it still has them.
+
+    Example: qrlsuite status --task beam6g
+    """
+    import json
+
+    from qrlsuite.engine.api import Queues
+    from qrlsuite.errors import QrlSuiteError
+    from qrlsuite.results import lookup
+    from qrlsuite.results.store import entries
+    from qrlsuite.results.survey import groups, look
+
+    lookup.check_tasks(runs, task)
+    shown: list[dict[str, Any]] = []
+    queues = Queues()
+    for store in entries(runs, task):
+        entry, queued, silence = look(store), None, None
+        if entry.seeds.get("submitted"):
+            try:
+                queued = queues.waiting(store)
+                entry = look(store, queued)
+            except QrlSuiteError as error:
+                silence = str(error)
+        shown.append(
+            {
+                "task": entry.task,
+                "entry": entry.name,
+                "label": entry.label,
+                "seeds": dict(entry.seeds),
+                "problems": list(entry.problems),
+                "queue_problem": silence,
+                "groups": [_plain(group) for group in groups(store, queued)],
+            }
+        )
+    if json_output:
+        typer.echo(json.dumps(shown))
+        return
+    for row in shown:
+        _print(row)
+    if not shown:
+        typer.echo(f"{runs} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
+
+
+def _plain(group: GroupStatus) -> dict[str, Any]:
+    return {
+        "seeds": list(group.seeds),
+        "state": group.state,
+        "where": group.where,
+        "seconds_left": group.seconds_left,
+        **{key: group.progress.get(key) for key in ("phase", "epoch", "epochs", "median_score", "error")},
+    }
+
+
+def _print(row: dict[str, Any]) -> None:
+    from qrlsuite.cli.display import duration
+    from qrlsuite.results.seeds import format_seeds
+
+    seeds = ", ".join(f"{count} {status}" for status, count in row["seeds"].items()) or "none"
+    typer.echo(printable(f"{row['task']}  {row['label']}  ({row['entry']}): {seeds}"))
+    for problem in row["problems"]:
+        typer.echo(f"  damaged: {printable(problem)}")
+    if row["queue_problem"]:
+        typer.echo(
+            f"  what was submitted may have left the queue, which was not asked: {printable(row['queue_problem'])}"
+        )
+    for group in row["groups"]:
+        words = [f"  {group['state']:<9}"]
+        words += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
+        words += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
+        words += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
+        if isinstance(group["median_score"], int | float):
+            words.append(f"median score {group['median_score']:.3f}")
+        if group["seconds_left"] is not None and group["state"] == "running":
+            words.append(f"{duration(group['seconds_left'])} left")
+        words += [group["where"]] if group["where"] != "nobody" else []
+        words += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
+        words += [str(group["error"])] if group["error"] else []
+        typer.echo(printable("  ".join(words)))

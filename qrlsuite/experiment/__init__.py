@@ -1,0 +1,1 @@
+"""What is to be run, and its identity: tasks, presets and entries."""

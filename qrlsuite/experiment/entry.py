@@ -1,0 +1,191 @@
+"""An entry: one algorithm with one model on one task, every option resolved; the unit that is ranked.
+
+Its hash covers the task definition, the algorithm, the model and all their options: not seeds, epochs, device,
+engine, workers or versions. More epochs extend an entry, more seeds widen it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from qrlsuite import options, registry, specs
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment import preset as presets
+from qrlsuite.experiment.task import Task, TaskFile, digest, load
+from qrlsuite.options import Setting
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A resolved entry.
+
+    Attributes
+    ----------
+    preset:
+        The preset that supplied defaults; not part of the identity, its values are.
+    tuning:
+        How the settings were found, where a preset file says so; not part of the identity either.
+    """
+
+    task: Task
+    algorithm: specs.AlgorithmSpec
+    model: specs.ModelSpec
+    algorithm_options: Any
+    model_options: Any
+    preset: str | None
+    tuning: dict[str, Any] | None = field(default=None, compare=False)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything the hash covers, as plain values."""
+        return {
+            "task": self.task.definition,
+            "algorithm": self.algorithm.name,
+            "algorithm_options": options.plain(self.algorithm_options),
+            "model": self.model.name,
+            "model_options": options.plain(self.model_options),
+        }
+
+    @property
+    def hash(self) -> str:
+        """Sixteen hexadecimal digits that identify the entry."""
+        return digest(self.identity)
+
+    @property
+    def name(self) -> str:
+        """The folder's name: algorithm, model, and the first eight digits of the hash."""
+        return f"{self.algorithm.name}-{self.model.name}-{self.hash[:8]}"
+
+    @property
+    def label(self) -> str:
+        """A readable name: the model with its first option and every option that is not the default."""
+        words = [self.model.name]
+        plain = options.plain(self.model_options)
+        defaults = options.plain(specs.resolve(self.model.options)())
+        words += [f"{k}={v}" for i, (k, v) in enumerate(plain.items()) if i == 0 or v != defaults.get(k)]
+        usual = options.plain(self._usual_algorithm_options())
+        words += [f"{k}={v}" for k, v in options.plain(self.algorithm_options).items() if v != usual.get(k)]
+        return f"{self.algorithm.name} {' '.join(words)}"
+
+    def _usual_algorithm_options(self) -> Any:
+        """Return the algorithm's options as the task's default preset has them."""
+        _, values = self.task.preset(None, self.algorithm.name, self.model.family)
+        return options.build(specs.resolve(self.algorithm.options), values, "preset")
+
+    def record(self) -> dict[str, Any]:
+        """Return what `entry.json` stores: enough to build the entry again anywhere."""
+        tuned = {} if self.tuning is None else {"tuning": self.tuning}
+        return {
+            "name": self.name,
+            "hash": self.hash,
+            "label": self.label,
+            "preset": self.preset,
+            **tuned,
+            "task_name": self.task.name,
+            "task_hash": self.task.hash,
+            "task_file": self.task.file.model_dump(mode="json"),
+            "identity": self.identity,
+        }
+
+
+def resolve(
+    task_name: str,
+    model_name: str,
+    algorithm_name: str | None = None,
+    settings: Sequence[Setting] = (),
+    preset: str | None = None,
+) -> Entry:
+    """Build an entry from names and settings.
+
+    Parameters
+    ----------
+    preset:
+        One of the task's presets, or a preset file's path (anything that ends in `.toml`). A file's values come
+        before those of the task's default preset; `settings` come before both.
+
+    Raises
+    ------
+    QrlSuiteError
+        For an unknown name or option, or a value that an option cannot have.
+    """
+    task = load(task_name)
+    file = presets.load(Path(preset)) if preset is not None and preset.endswith(".toml") else None
+    wanted = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
+    algorithm = registry.algorithm(wanted)
+    model = registry.model(model_name)
+    sides = {
+        "environment": specs.resolve(task.environment.options),
+        "model": specs.resolve(model.options),
+        "algorithm": specs.resolve(algorithm.options),
+    }
+    task.check_presets(algorithm.name, sides["algorithm"])
+    values = options.assign(settings, sides)
+    task = task.with_environment(values["environment"])
+    chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
+    model_defaults: Mapping[str, Any] = {}
+    if file is not None and preset is not None:
+        presets.require(file, preset, algorithm.name, model.name)
+        for side, given in (("algorithm", file.algorithm_options), ("model", file.model_options)):
+            options.build(sides[side], given, f"preset file {preset}: {side} '{getattr(file, side)}'")
+        chosen, defaults, model_defaults = (
+            Path(preset).name,
+            {**defaults, **file.algorithm_options},
+            file.model_options,
+        )
+    model_options = options.build(
+        sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
+    )
+    if hasattr(model_options, "check"):
+        model_options.check()
+    return Entry(
+        task=task,
+        algorithm=algorithm,
+        model=model,
+        algorithm_options=options.build(
+            sides["algorithm"], {**defaults, **values["algorithm"]}, f"algorithm '{algorithm.name}'"
+        ),
+        model_options=model_options,
+        preset=chosen,
+        tuning=None if file is None or chosen is None else presets.record_of(file, chosen, values),
+    )
+
+
+def from_record(record: Mapping[str, Any], source: str) -> Entry:
+    """Build an entry from what `Entry.record` returned.
+
+    Raises
+    ------
+    StoreError
+        If the record is malformed or, after a change of code, stands for another entry than it did.
+    """
+    try:
+        identity = record["identity"]
+        file = TaskFile.model_validate(record["task_file"])
+        names = [str(record["task_name"]), str(identity["algorithm"]), str(identity["model"])]
+        values = dict(identity["algorithm_options"]), dict(identity["model_options"])
+        preset, expected = record["preset"], record["hash"]
+    except (KeyError, TypeError, ValueError, pydantic.ValidationError) as error:
+        raise StoreError(f"{source} is not an entry's record: {type(error).__name__}: {error}") from None
+    task = Task(file, source)
+    task.name = names[0]
+    algorithm, model = registry.algorithm(names[1]), registry.model(names[2])
+    entry = Entry(
+        task=task,
+        algorithm=algorithm,
+        model=model,
+        algorithm_options=options.build(specs.resolve(algorithm.options), values[0], source),
+        model_options=options.build(specs.resolve(model.options), values[1], source),
+        preset=preset,
+        tuning=record.get("tuning"),
+    )
+    if entry.hash != expected:
+        raise StoreError(
+            f"{source} was made by a version of the suite or a plugin in which its options meant something else "
+            f"(hash {expected}, now {entry.hash}): keep it for reading, and choose another folder with --runs"
+        )
+    return entry

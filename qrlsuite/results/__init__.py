@@ -1,0 +1,1 @@
+"""What is on disk: results folders, checkpoints and claims, and what can be read from them."""

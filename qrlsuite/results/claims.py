@@ -1,0 +1,234 @@
+"""Claims: two workers never train the same seed, and the claim of a dead worker is taken over.
+
+A claim is a file with host, process and seeds. Its holder refreshes the file's time every few seconds. On the
+holder's own host a claim lives exactly as long as the process. Elsewhere it is suspect when the file system's own
+clock says that it was not refreshed for `ABANDONED` seconds, or will only be refreshed in the future; that clock may
+have jumped, so a suspect claim is then watched for `WATCH` seconds of this process's monotonic clock, and taken over
+only if nobody refreshes it meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import secrets
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from qrlsuite.errors import StoreError
+from qrlsuite.results.store import EntryStore
+
+HEARTBEAT = 5.0
+"""Seconds between two refreshes of a claim."""
+
+ABANDONED = 120.0
+"""Seconds without a refresh after which another host's claim is suspected to be abandoned."""
+
+WATCH = 3 * HEARTBEAT
+"""Seconds for which a suspect claim is watched before it is taken over."""
+
+
+class SeedsClaimedError(StoreError):
+    """Another worker is training some of the seeds."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Who holds which seeds."""
+
+    path: Path
+    host: str
+    pid: int
+    namespace: str
+    started: str
+    token: str
+    seeds: tuple[int, ...]
+
+    def refresh(self) -> bool:
+        """Show that the holder is alive; returns False where the claim was taken over.
+
+        A file system that does not answer for a moment is no reason to give up.
+        """
+        try:
+            if json.loads(self.path.read_bytes()).get("token") != self.token:
+                return False
+            os.utime(self.path)
+        except (FileNotFoundError, ValueError, AttributeError):
+            return False
+        except OSError:
+            return True
+        return True
+
+    @property
+    def local(self) -> bool:
+        """Whether the holder runs where this process can see it: same host, same process numbers."""
+        return (self.host, self.namespace) == (socket.gethostname(), _namespace())
+
+    def release(self) -> None:
+        """Give the seeds back, if they are still held."""
+        if self.refresh():
+            self.path.unlink(missing_ok=True)
+
+
+def _process_start(pid: int) -> str | None:
+    """Return something that tells a process from a later one with the same number; None if it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        pass
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return None
+    except PermissionError:
+        pass
+    return "unknown"
+
+
+def _namespace() -> str:
+    """Return what tells containers of one host apart: in each, process numbers mean something else."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock for the moment it takes to look and claim."""
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def living(store: EntryStore) -> list[Claim]:
+    """Return the claims whose holders are alive, or may be: suspect ones are not watched.
+
+    Works in a folder that cannot be written, too.
+    """
+    now = _file_system_time(store.claims)
+    return [claim for claim in claims(store) if _state(claim, now) != "dead"]
+
+
+def claims(store: EntryStore) -> list[Claim]:
+    """Return every claim that can be read, alive or not."""
+    if not store.claims.is_dir():
+        return []
+    return [claim for path in sorted(store.claims.glob("*.json")) if (claim := _read(path))]
+
+
+def _file_system_time(folder: Path) -> float:
+    """Return the time that a file written now would get, which is the file server's."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder) as probe:
+            return os.stat(probe.name).st_mtime
+    except OSError:
+        return time.time()
+
+
+def _read(path: Path) -> Claim | None:
+    try:
+        content = json.loads(path.read_bytes())
+        return Claim(
+            path=path,
+            host=str(content["host"]),
+            pid=int(content["pid"]),
+            namespace=str(content.get("namespace", "")),
+            started=str(content["started"]),
+            token=str(content["token"]),
+            seeds=tuple(int(seed) for seed in content["seeds"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None  # gone, or torn by a killed writer: nobody holds it
+
+
+def _state(claim: Claim, now: float) -> Literal["alive", "suspect", "dead"]:
+    if claim.local:
+        return "alive" if _process_start(claim.pid) == claim.started else "dead"
+    try:
+        age = now - claim.path.stat().st_mtime
+    except OSError:
+        return "dead"
+    return "alive" if abs(age) < ABANDONED else "suspect"
+
+
+def _abandoned(suspects: Sequence[Claim]) -> list[Claim]:
+    """Watch suspect claims, all at once; returns those that nobody refreshed."""
+    seen = {claim: _refreshed(claim) for claim in suspects}
+    deadline = time.monotonic() + WATCH
+    while seen and time.monotonic() < deadline:
+        time.sleep(0.2)
+        seen = {claim: before for claim, before in seen.items() if _refreshed(claim) == before}
+    return list(seen)
+
+
+def _refreshed(claim: Claim) -> int | None:
+    try:
+        return claim.path.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
+def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
+    """Claim seeds for this process.
+
+    Raises
+    ------
+    SeedsClaimedError
+        If a living worker holds any of them; the message says who.
+    StoreError
+        If the folder cannot be written.
+    """
+    try:
+        store.claims.mkdir(parents=True, exist_ok=True)
+        with _locked(store.claims):
+            now = _file_system_time(store.claims)
+            states = {claim: _state(claim, now) for claim in claims(store)}
+            wanted = set(seeds)
+            suspects = [c for c, state in states.items() if state == "suspect" and wanted & set(c.seeds)]
+            states |= dict.fromkeys(_abandoned(suspects), "dead")
+            holders = [claim for claim, state in states.items() if state != "dead"]
+            for holder in holders:
+                shared = sorted(wanted & set(holder.seeds))
+                if shared:
+                    raise SeedsClaimedError(_refusal(holder, shared))
+            for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
+                path.unlink(missing_ok=True)
+            token = secrets.token_hex(8)
+            claim = Claim(
+                path=store.claims / f"{token}.json",
+                host=socket.gethostname(),
+                pid=os.getpid(),
+                namespace=_namespace(),
+                started=_process_start(os.getpid()) or "unknown",
+                token=token,
+                seeds=tuple(int(seed) for seed in seeds),
+            )
+            content = {
+                name: getattr(claim, name) for name in ("host", "pid", "namespace", "started", "token")
+            }
+            claim.path.write_text(json.dumps({**content, "seeds": list(claim.seeds)}))
+    except OSError as error:
+        raise StoreError(f"cannot write {store.claims}: {error.strerror or error}") from None
+    return claim
+
+
+def _refusal(holder: Claim, shared: Sequence[int]) -> str:
+    if holder.local:
+        advice = "wait for it, or stop it"
+    else:
+        advice = (
+            f"wait for it, or stop it there; if it no longer exists (it was killed, or this folder is a copy), "
+            f"its seeds are free {ABANDONED:.0f} seconds after its last sign of life"
+        )
+    return (
+        f"{len(shared)} of these seeds (from {shared[0]}) are being trained by process {holder.pid} "
+        f"on {holder.host}: {advice}; this command can be repeated at any time"
+    )

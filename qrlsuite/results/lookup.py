@@ -1,0 +1,139 @@
+"""How an entry is called on the command line: by name, label or hash, or the beginning of one of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from qrlsuite import registry
+from qrlsuite.errors import StoreError, UnknownNameError, listed, nearest
+from qrlsuite.results.store import EntryStore
+
+
+class Named(Protocol):
+    """What has a name (`ddqn-mlp-90e7f8d4`), a label (`ddqn mlp width=64`) and a task."""
+
+    @property
+    def name(self) -> str:
+        """Algorithm, model and hash."""
+
+    @property
+    def label(self) -> str:
+        """Algorithm, model and the options that are not defaults."""
+
+    @property
+    def task(self) -> str:
+        """The task's name."""
+
+
+N = TypeVar("N", bound=Named)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An entry's folder, and what it is called by; its curves are not read.
+
+    Attributes
+    ----------
+    key:
+        Equal for folders of the same entry.
+    """
+
+    store: EntryStore
+    name: str
+    label: str
+    task: str
+    key: tuple[str, str, str]
+
+
+def stored(stores: Iterable[EntryStore]) -> list[Stored]:
+    """Return what the entries in some folders are called by; a damaged one is called by its folder."""
+    found = []
+    for store in stores:
+        name, task = store.path.name, store.path.parent.name
+        try:
+            record = store.record()
+        except StoreError:  # is said where it is the one that was asked for
+            found.append(Stored(store, name, name, task, (task, "", str(store.path))))
+        else:
+            key = (record["task_name"], record["task_hash"], record["name"])
+            found.append(Stored(store, record["name"], record["label"], record["task_name"], key))
+    return found
+
+
+def check_tasks(runs: Path, *tasks: str | None) -> None:
+    """Refuse the name of a task that is neither registered nor has a folder of results; None names no task.
+
+    Raises
+    ------
+    UnknownNameError
+        With the nearest name, or what there is.
+    """
+    held = {path.name for path in runs.iterdir() if path.is_dir()} if runs.is_dir() else set()
+    for name in tasks:
+        if name is None or name in held:
+            continue
+        known = registry.load().entries["tasks"]
+        if name not in known:
+            raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
+
+
+def choose(among: Sequence[N], name: str, where: object) -> N:
+    """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
+
+    Where several tasks have such an entry, `TASK/NAME` is one of them. A whole name goes before a beginning.
+
+    Parameters
+    ----------
+    where:
+        For the message: the folder that was looked into.
+
+    Raises
+    ------
+    UnknownNameError
+        If none or several match; the message says what to type.
+    """
+    fitting = [e for e in among if name in _names(e)]
+    fitting = fitting or [e for e in among if any(known.startswith(name) for known in _names(e))]
+    if not fitting:
+        alike = [e for e in among if mentions(e, name)]
+        if not alike:
+            labels = {_short(e) for e in among}
+            raise UnknownNameError(f"no entry '{name}' in {where}{nearest(name, labels)}")
+        raise UnknownNameError(f"no entry begins with '{name}'; did you mean {_choices(alike, among)}?")
+    if len(fitting) > 1:
+        raise UnknownNameError(f"'{name}' may be any of {_choices(fitting, among)}: write one of these")
+    return fitting[0]
+
+
+def mentions(entry: Named, word: str) -> bool:
+    """Return whether a word occurs in an entry's task or label; hexadecimal hashes hold too many words."""
+    return word in f"{entry.task}/{entry.label}"
+
+
+def _short(entry: Named) -> str:
+    """Return the label without the algorithm."""
+    return entry.label.partition(" ")[2] or entry.label
+
+
+def _names(entry: Named) -> tuple[str, ...]:
+    """Return what an entry answers to."""
+    plain = (entry.name, entry.label, _short(entry), entry.name.rpartition("-")[2])
+    return (*plain, *(f"{entry.task}/{name}" for name in plain))
+
+
+def _choices(entries: Sequence[Named], among: Sequence[Named]) -> str:
+    """List what to type for some entries: the label, with task or hash where several among all have that label."""
+    labels = Counter(e.label for e in among)
+    places = Counter((e.task, e.label) for e in among)
+    words = []
+    for entry in entries:
+        if labels[entry.label] == 1:
+            words.append(entry.label)
+        else:
+            unique = places[entry.task, entry.label] == 1
+            words.append(f"{entry.task}/{entry.label if unique else entry.name}")
+    return listed([f"'{word}'" for word in sorted(words)])

@@ -1,0 +1,138 @@
+"""Dividing the seeds of an entry into groups, each trained as one population in one process."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.results import checkpoint
+from qrlsuite.results.store import EntryStore, write_atomically
+
+if TYPE_CHECKING:
+    from qrlsuite.training.group import Progress  # torch, which a supervisor can do without
+
+LARGEST_GROUP = 100
+MOST_SEEDS = 100_000
+LONGEST_RANGE = 36
+"""Digits of a seed or of both ends of a range: more are a slip of the hand, and may be too many for a number."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Seeds that are at the same epoch and are trained together."""
+
+    seeds: tuple[int, ...]
+    epoch: int
+
+    @property
+    def id(self) -> str:
+        """The group's folder name."""
+        return checkpoint.group_id(self.seeds)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Parse `100` (seeds 0..99), `0:20`, or a list such as `0,3,10:12`.
+
+    Raises
+    ------
+    OptionError
+        If the text is none of these, or names no seed, or one twice.
+    """
+    seeds: list[int] = []
+    for piece in (f"0:{text}" if text.isdecimal() else text).split(","):
+        first, colon, last = piece.strip().partition(":")
+        if not first.isdecimal() or (colon and not last.isdecimal()) or len(first + last) > LONGEST_RANGE:
+            raise OptionError(f"seeds '{text}': write a number (100), a range (0:20) or a list (0,3,10:12)")
+        more = range(int(first), int(last) if colon else int(first) + 1)
+        if len(seeds) + max(0, more.stop - more.start) > MOST_SEEDS:
+            raise OptionError(f"seeds '{text}': {MOST_SEEDS} seeds are the most that an entry takes at once")
+        seeds += more
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise OptionError(f"seeds '{text}': at least one seed, none twice, is needed")
+    return sorted(seeds)
+
+
+def format_seeds(seeds: Sequence[int]) -> str:
+    """Write sorted seeds as `parse_seeds` reads them."""
+    pieces: list[str] = []
+    start = previous = None
+    for seed in [*sorted(seeds), None]:
+        if start is None:
+            start = previous = seed
+        elif seed is not None and previous is not None and seed == previous + 1:
+            previous = seed
+        else:
+            pieces.append(
+                f"{start}:{previous + 1}" if previous is not None and previous != start else f"{start}"
+            )
+            start = previous = seed
+    text = ",".join(pieces)
+    return f"{text}:{int(text) + 1}" if text.isdecimal() else text  # a lone number would count from 0
+
+
+def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: int) -> list[Group]:
+    """Divide the unfinished seeds into groups: as many as workers, seeds at different epochs apart."""
+    finished = store.finished(seeds, epochs)
+    newest = checkpoint.latest(store)
+    by_epoch: dict[int, list[int]] = {}
+    for seed in sorted(set(seeds) - finished):
+        by_epoch.setdefault(newest[seed].epoch if seed in newest else 0, []).append(seed)
+    unfinished = sum(len(members) for members in by_epoch.values())
+    size = min(LARGEST_GROUP, max(1, math.ceil(unfinished / max(1, workers))))
+    groups = []
+    for epoch, members in sorted(by_epoch.items()):
+        pieces = math.ceil(len(members) / size)
+        for piece in range(pieces):  # as even as can be
+            low, high = piece * len(members) // pieces, (piece + 1) * len(members) // pieces
+            groups.append(Group(tuple(members[low:high]), epoch))
+    return groups
+
+
+class ProgressFile:
+    """A group's progress on disk: written by its worker at most twice a second, read by any display."""
+
+    def __init__(self, store: EntryStore, group: str) -> None:
+        self.path = store.groups / group / "progress.json"
+        self._written = 0.0
+
+    def write(self, progress: Progress, error: str | None = None, force: bool = False) -> None:
+        """Write the progress, unless it was just written."""
+        now = time.monotonic()
+        if not force and now - self._written < 0.5:
+            return
+        self._written = now
+        content = json.dumps({**asdict(progress), "error": error}).encode()
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = self.path.with_suffix(".tmp")
+            temporary.write_bytes(content)
+            temporary.replace(self.path)
+        except OSError:
+            if force:
+                write_atomically(self.path, content)  # raises the clear error
+
+    def read(self) -> dict[str, Any]:
+        """Return the last progress written, empty where there is none."""
+        return read_progress(self.path)
+
+    def clear(self) -> None:
+        """Forget an earlier attempt's progress."""
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"cannot write {self.path}: {error.strerror or error}") from None
+
+
+def read_progress(path: Path) -> dict[str, Any]:
+    """Read a progress file; empty where it is missing or damaged."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,538 @@
+"""The results on disk: the one source of truth, readable without this suite.
+
+    runs/<task>/<entry>/entry.json              what was run: every option resolved
+                        seed-0007/run.json      status, parameters, versions, machine
+                                  epochs.jsonl  one line per epoch while the run goes on
+                                  epochs.parquet  the same once it has finished
+                                  timings.jsonl everything that may differ between two equal runs
+                                  final.safetensors  the trained agent
+                        groups/<id>/checkpoint.safetensors, progress.json
+                        claims/<id>.json        who is working on which seeds
+
+Files are replaced atomically (temporary file, fsync, rename) and carry a format version; lines are appended,
+and a torn last line is dropped. Nothing is ever pickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.task import TaskFile
+
+FORMAT_VERSION = 1
+_SEED_FOLDER = re.compile(r"seed-(\d{4,})")
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content, or leave it as it is.
+
+    Raises
+    ------
+    StoreError
+        If the disk is full or the folder cannot be written.
+    """
+    try:
+        with contextlib.suppress(FileExistsError):  # a file in the folder's place is named by the next line
+            path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o666 & ~_umask())
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise StoreError(
+            f"cannot write {path}: {error.strerror or error}; what was there is unchanged"
+        ) from None
+
+
+def _umask() -> int:
+    current = os.umask(0)
+    os.umask(current)
+    return current
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object with a format version.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be read, is not an object, or has another format version.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise StoreError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise StoreError(f"{path} does not hold a JSON object")
+    version = content.get("format_version")
+    if version != FORMAT_VERSION:
+        raise StoreError(
+            f"{path} has format version {version!r}, this suite reads {FORMAT_VERSION}: "
+            "use the suite that wrote it (pip install -U qrlsuite), or another folder (--runs DIR)"
+        )
+    return content
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace a JSON file, stamped with the format version."""
+    text = json.dumps({"format_version": FORMAT_VERSION, **content}, indent=1, allow_nan=False)
+    write_atomically(path, text.encode() + b"\n")
+
+
+def json_line(record: Mapping[str, Any]) -> bytes:
+    """Encode one line of a JSON lines file."""
+    return json.dumps(record, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read JSON lines; a torn last line (a writer was killed) is dropped.
+
+    Raises
+    ------
+    StoreError
+        If any other line is malformed; the message names it.
+    """
+    try:
+        pieces = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error}") from None
+    records = []
+    for number, piece in enumerate(pieces[:-1], start=1):  # what follows the last newline is torn, or empty
+        try:
+            record = json.loads(piece)
+        except (ValueError, RecursionError):
+            raise StoreError(
+                f"{path}, line {number}: not JSON; restore the file or delete the seed's folder"
+            ) from None
+        if not isinstance(record, dict):
+            raise StoreError(f"{path}, line {number}: not a JSON object")
+        records.append(record)
+    return records
+
+
+def _drop_torn_line(path: Path) -> None:
+    """Remove what follows the last newline: the next line would be written behind it."""
+    if path.exists():
+        content = path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            write_atomically(path, whole)
+
+
+def append(path: Path, content: bytes) -> None:
+    """Append whole lines.
+
+    Raises
+    ------
+    StoreError
+        If the disk is full or the file cannot be written.
+    """
+    try:
+        with path.open("ab") as file:
+            file.write(content)
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from None
+
+
+def shortest(values: NDArray[Any]) -> list[float]:
+    """Return float32 values as the shortest decimals that read back to the same float32."""
+    return [float(text) for text in np.asarray(values, np.float32).astype(str).ravel()]
+
+
+def settled(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round means of float32 scores to 7 decimals: a hundred scores of 0.95 have the mean 0.949999988 before."""
+    return np.round(means, 7)
+
+
+@dataclass(frozen=True)
+class SeedCurve:
+    """What one seed's run holds so far: `scores` (T, validation episodes) float32, one row per epoch."""
+
+    seed: int
+    scores: NDArray[np.float32]
+    finished: bool
+
+    @property
+    def curve(self) -> NDArray[np.float64]:
+        """The learning curve V_1..V_T (T,): the mean score of every epoch's validation, see `settled`."""
+        return settled(np.asarray(self.scores, np.float64).mean(axis=1))
+
+
+class SeedStore:
+    """The folder of one seed's run."""
+
+    def __init__(self, path: Path, seed: int) -> None:
+        self.path = path
+        self.seed = seed
+        self.lines = path / "epochs.jsonl"
+        self.table = path / "epochs.parquet"
+        self.timings = path / "timings.jsonl"
+
+    def record(self) -> dict[str, Any] | None:
+        """Return `run.json`, or None where the run never began.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged.
+        """
+        path = self.path / "run.json"
+        if not path.exists():
+            return None
+        record = read_json(path)
+        epochs, parameters = record.get("epochs"), record.get("parameters", {})
+        made_with = record.get("provenance", [])
+        if not (
+            record.get("status") in ("running", "finished")
+            and _is_count(epochs)
+            and isinstance(parameters, dict)
+            and all(_is_count(count) for count in parameters.values())
+            and isinstance(made_with, list)
+            and all(isinstance(origin, dict) for origin in made_with)
+        ):
+            raise StoreError(f"{path} is not a run's record; restore the file or delete the seed's folder")
+        return record
+
+    def write_record(self, content: Mapping[str, Any]) -> None:
+        """Replace `run.json`."""
+        write_json(self.path / "run.json", content)
+
+    def epochs(self, decimals: bool = True) -> list[dict[str, Any]]:
+        """Return every epoch's record in order: the table, then newer lines.
+
+        Parameters
+        ----------
+        decimals:
+            Whether scores are the shortest decimals, as in the lines; else those of the table are the float32 as they
+            are, which saves most of the time.
+
+        Raises
+        ------
+        StoreError
+            If a file is damaged or an epoch is missing.
+        """
+        rows = read_table(self.table, decimals) if self.table.exists() else []
+        last = _epoch(rows[-1], self.table) if rows else 0
+        rows += [line for line in read_lines(self.lines) if _epoch(line, self.lines) > last]
+        for expected, row in enumerate(rows, start=1):
+            if _epoch(row, self.path) != expected:
+                raise StoreError(f"{self.path}: epoch {expected} is missing (found {row.get('epoch')!r})")
+        return rows
+
+    def cut(self, epoch: int) -> int:
+        """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again.
+
+        Returns
+        -------
+        int
+            The number of epochs that are left: fewer than `epoch` where some are gone.
+        """
+        _drop_torn_line(self.timings)
+        rows = [row for row in self.epochs() if row["epoch"] <= epoch]
+        last = int(read_table(self.table, decimals=False)[-1]["epoch"]) if self.table.exists() else 0
+        if last > epoch:
+            write_atomically(self.lines, b"".join(json_line(row) for row in rows))
+            self.table.unlink()
+        elif self.lines.exists():
+            write_atomically(self.lines, b"".join(json_line(row) for row in rows if row["epoch"] > last))
+        return len(rows)
+
+    def sync(self) -> None:
+        """Force appended lines to the disk: called before a checkpoint that supersedes them is written."""
+        for path in (self.lines, self.timings):
+            if path.exists():
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+
+    def compact(self) -> None:
+        """Turn the lines into a table."""
+        rows = self.epochs()
+        if rows and self.lines.exists():
+            write_atomically(self.table, table_bytes(rows))
+            self.lines.unlink(missing_ok=True)
+
+    def seconds(self) -> float:
+        """Return the core-seconds spent on this seed's epochs so far: its share of its group's.
+
+        Processor time where it was recorded (training on the CPU), which other work on the same cores does not
+        stretch; otherwise the time by the clock.
+
+        Raises
+        ------
+        StoreError
+            If a line of the timings is damaged.
+        """
+        total = 0.0
+        for line in read_lines(self.timings):
+            for name in ("cpu",) if "cpu" in line else ("train", "validate"):
+                value = line.get(name, 0.0)
+                if not isinstance(value, int | float) or not 0 <= value < 1e12:
+                    raise StoreError(f"{self.timings}: {name} = {value!r} is not a number of seconds")
+                total += value
+        return total
+
+    def curve(self) -> SeedCurve:
+        """Return the validation scores so far.
+
+        Raises
+        ------
+        StoreError
+            If scores are missing, not finite, or differ in number between epochs.
+        """
+        rows = self.epochs(decimals=False)
+        try:
+            with np.errstate(over="ignore"):
+                scores = np.array([row["scores"] for row in rows], dtype=np.float32)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise StoreError(f"{self.path}: an epoch has no list of validation scores") from None
+        if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):
+            raise StoreError(f"{self.path}: validation scores must be finite and equally many in every epoch")
+        record = self.record() or {}
+        finished = record.get("status") == "finished"
+        if finished and len(rows) < int(record["epochs"]):
+            raise StoreError(
+                f"{self.path} finished {record['epochs']} epochs and holds {len(rows)}: restore the file or delete "
+                "the seed's folder"
+            )
+        shaped = scores if rows else np.empty((0, 0), np.float32)
+        return SeedCurve(self.seed, shaped, finished)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _epoch(row: Mapping[str, Any], path: Path) -> int:
+    epoch = row.get("epoch")
+    if not isinstance(epoch, int) or epoch < 1:
+        raise StoreError(f"{path}: a record has epoch {epoch!r}")
+    return epoch
+
+
+def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Encode epoch records as parquet: one row per epoch, nested values as their own columns."""
+    import pyarrow
+    import pyarrow.parquet
+
+    columns: dict[str, list[Any]] = {}
+    flat = [_flatten(row) for row in rows]
+    for name in sorted({name for row in flat for name in row}):
+        columns[name] = [row.get(name) for row in flat]
+    arrays = {
+        name: pyarrow.array(values, pyarrow.list_(pyarrow.float32()))
+        if name == "scores"
+        else pyarrow.array(values)
+        for name, values in columns.items()
+    }
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(arrays), sink, compression="zstd")
+    result: bytes = sink.getvalue().to_pybytes()
+    return result
+
+
+def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}.{inner}": item for inner, item in value.items()})
+        else:
+            flat[name] = value
+    return flat
+
+
+def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
+    """Read what `table_bytes` encoded.
+
+    Parameters
+    ----------
+    decimals:
+        See `SeedStore.epochs`.
+
+    Raises
+    ------
+    StoreError
+        If the file is truncated or not parquet.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.ParquetFile(path).read()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise StoreError(f"{path} is not a readable parquet file: {error}") from None
+    try:
+        rows = [_nest(flat, decimals) for flat in table.to_pylist()]
+    except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
+        raise StoreError(
+            f"{path} does not hold epochs; restore the file or delete the seed's folder"
+        ) from None
+    if not rows:
+        raise StoreError(f"{path} holds no epoch")
+    return rows
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _nest(flat: Mapping[str, Any], decimals: bool) -> dict[str, Any]:
+    """Undo `_flatten`."""
+    row: dict[str, Any] = {}
+    for name, value in flat.items():
+        outer, dot, inner = name.partition(".")
+        if dot:
+            row.setdefault(outer, {})[inner] = value
+        else:
+            exact = decimals and name == "scores" and value is not None
+            row[name] = shortest(np.array(value)) if exact else value
+    return row
+
+
+class EntryStore:
+    """The folder of one entry."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.groups = path / "groups"
+        self.claims = path / "claims"
+
+    @classmethod
+    def find(cls, runs: Path, entry: Entry) -> EntryStore:
+        """Return the entry's folder below a results folder, whether it is there or not.
+
+        Raises
+        ------
+        StoreError
+            If a folder of another format version or another entry is in its place.
+        """
+        store = cls(runs / entry.task.name / entry.name)
+        if (store.path / "entry.json").exists() and store.record().get("hash") != entry.hash:
+            raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
+        return store
+
+    @classmethod
+    def create(cls, runs: Path, entry: Entry) -> EntryStore:
+        """Return the entry's folder below a results folder, made if it is not there.
+
+        Where the entry's settings are known to come from tuning, its record says so from now on; of two records
+        of tuning the one that took more steps stands.
+
+        Raises
+        ------
+        StoreError
+            If a folder of another format version or another entry is in its place, or it cannot be made.
+        """
+        store = cls.find(runs, entry)
+        path = store.path / "entry.json"
+        if not path.exists():
+            write_json(path, entry.record())
+        elif entry.tuning is not None:
+            record = store.record()
+            known = record.pop("tuning") or {}
+            if known.get("steps", -1) < entry.tuning["steps"]:
+                del record["format_version"]
+                write_json(path, {**record, "tuning": entry.tuning})
+        return store
+
+    def record(self) -> dict[str, Any]:
+        """Return `entry.json`.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged.
+        """
+        path = self.path / "entry.json"
+        record = read_json(path)
+        identity = record.get("identity")
+        try:
+            if not isinstance(identity, dict):
+                raise ValueError("it has no identity")
+            named = {
+                **{name: record.get(name) for name in ("name", "hash", "label", "task_name", "task_hash")}
+            }
+            named |= {f"identity.{name}": identity.get(name) for name in ("algorithm", "model")}
+            for name, value in named.items():
+                if not isinstance(value, str):
+                    raise ValueError(f"{name} is not text")
+            tuning = record.get("tuning")
+            if tuning is not None and not (isinstance(tuning, dict) and _is_count(tuning.get("steps"))):
+                raise ValueError("tuning is not a record of it")
+            TaskFile.model_validate(record.get("task_file"))
+        except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
+            raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None
+        return {"preset": None, "tuning": None, **record}
+
+    def entry(self) -> Entry:
+        """Build the entry that the folder belongs to.
+
+        Raises
+        ------
+        StoreError
+            If its record is damaged, means something else by now, or it was imported.
+        """
+        if self.record().get("imported"):
+            raise StoreError(
+                f"{self.path} was imported from other files: it can be compared, not trained further"
+            )
+        return from_record(self.record(), str(self.path / "entry.json"))
+
+    def seed(self, seed: int) -> SeedStore:
+        """Return the folder of one seed (it need not exist)."""
+        return SeedStore(self.path / f"seed-{seed:04d}", seed)
+
+    def seeds(self) -> list[int]:
+        """Return the seeds that have a folder, sorted."""
+        found = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
+        return sorted(int(match.group(1)) for match in found if match)
+
+    def curves(self) -> list[SeedCurve]:
+        """Return the curves of all seeds, sorted by seed."""
+        return [self.seed(seed).curve() for seed in self.seeds()]
+
+    def finished(self, seeds: Iterable[int], epochs: int) -> set[int]:
+        """Return which of the seeds have completed that many epochs."""
+        done = set()
+        for seed in seeds:
+            record = self.seed(seed).record()
+            if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= epochs:
+                done.add(seed)
+        return done
+
+
+def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
+    """Return every entry's folder below a results folder, sorted by path.
+
+    Raises
+    ------
+    StoreError
+        If there is no such folder.
+    """
+    if not runs.is_dir():
+        raise StoreError(
+            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another"
+        )
+    pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
+    return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]

@@ -1,0 +1,299 @@
+"""What a results folder holds and how far it is: read from our own files only, on any machine that sees them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.results import checkpoint
+from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living
+from qrlsuite.results.seeds import read_progress
+from qrlsuite.results.store import EntryStore, entries, read_json, read_lines
+
+STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
+"""What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
+
+
+@dataclass(frozen=True)
+class EntrySurvey:
+    """One entry's folder.
+
+    Attributes
+    ----------
+    seeds:
+        Number of seeds by status.
+    epochs:
+        Fewest and most epochs that a seed has recorded; None where none has begun.
+    size:
+        Bytes on disk.
+    last_activity:
+        When anything in it was last written, seconds since 1970 by the file system's clock.
+    problems:
+        What is damaged, one line each.
+    """
+
+    folder: Path
+    task: str
+    name: str
+    label: str
+    seeds: Mapping[str, int]
+    epochs: tuple[int, int] | None
+    size: int
+    last_activity: float
+    problems: tuple[str, ...] = ()
+
+
+def survey(runs: Path, task: str | None = None) -> list[EntrySurvey]:
+    """Look at every entry below a results folder; damage is reported per entry, never raised.
+
+    Raises
+    ------
+    StoreError
+        If there is no such folder.
+    """
+    return [look(store) for store in entries(runs, task)]
+
+
+def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurvey:
+    """Look at one entry.
+
+    Parameters
+    ----------
+    queued:
+        The seeds that a queue still has; None where no queue was asked, and our own files are believed.
+    """
+    problems: list[str] = []
+    try:
+        record = store.record()
+    except StoreError as error:
+        problems.append(str(error))
+        record = {}
+    statuses, epochs = _seeds(store, problems, queued)
+    size, newest = _usage(store.path)
+    return EntrySurvey(
+        folder=store.path,
+        task=str(record.get("task_name", store.path.parent.name)),
+        name=store.path.name,
+        label=str(record.get("label", "?")),
+        seeds=dict(Counter(statuses.values())),
+        epochs=(min(epochs), max(epochs)) if epochs else None,
+        size=size,
+        last_activity=newest,
+        problems=tuple(problems),
+    )
+
+
+def _seeds(
+    store: EntryStore, problems: list[str], queued: Collection[int] | None
+) -> tuple[dict[int, str], list[int]]:
+    """Return the status of every seed, and the epochs that those begun have recorded."""
+    held = {seed for claim in living(store) for seed in claim.seeds}
+    statuses: dict[int, str] = {}
+    for task in waiting(store, problems):
+        for seed in task["seeds"]:
+            statuses[seed] = "submitted" if queued is None or seed in queued else "interrupted"
+    epochs = []
+    for seed in store.seeds():
+        folder = store.seed(seed)
+        try:
+            record = folder.record() or {}
+            finished = record.get("status") == "finished"
+            lines = [] if finished else read_lines(folder.lines)
+            newest = lines[-1].get("epoch") if lines else record.get("epochs", 0)
+            epochs.append(newest if isinstance(newest, int) else 0)
+        except StoreError as error:
+            statuses[seed] = "damaged"
+            problems.append(str(error))
+            continue
+        if finished:
+            statuses[seed] = "finished"
+        elif seed not in held and statuses.get(seed) != "submitted":
+            statuses[seed] = "interrupted"
+    statuses |= {seed: "running" for seed in held if statuses.get(seed) != "finished"}
+    return statuses, epochs
+
+
+def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
+    """Return the tasks that an engine wrote down when it handed them to a queue (`job`, `seeds`, `epochs`)."""
+    found: list[dict[str, Any]] = []
+    for path in sorted(store.path.glob("*/submitted.json")):
+        try:
+            tasks = read_json(path).get("tasks")
+        except StoreError as error:
+            problems.append(str(error))
+            continue
+        if not isinstance(tasks, list) or not all(is_task(task) for task in tasks):
+            problems.append(
+                f"{path} is damaged: delete it; seeds that still wait may then be submitted twice"
+            )
+            continue
+        found += tasks
+    return found
+
+
+def is_task(task: Any) -> bool:
+    """Tell whether a value of `submitted.json` is a task."""
+    return (
+        isinstance(task, dict)
+        and isinstance(task.get("job"), str)
+        and isinstance(task.get("seeds"), list)
+        and all(isinstance(seed, int) for seed in task["seeds"])
+    )
+
+
+def _usage(folder: Path) -> tuple[int, float]:
+    """Return the bytes that a folder takes, and the newest time in it."""
+    size, newest = 0, 0.0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            try:
+                status = os.lstat(os.path.join(parent, name))
+            except OSError:
+                continue  # replaced a moment ago
+            size += status.st_size
+            newest = max(newest, status.st_mtime)
+    return size, newest
+
+
+@dataclass(frozen=True)
+class GroupStatus:
+    """A group at work, waiting, or stopped.
+
+    Attributes
+    ----------
+    state:
+        `running`, `submitted`, `stopped` or `failed`.
+    where:
+        Host and process, or the job in a queue, or the job that is no longer there.
+    progress:
+        Its `progress.json`: phase, epoch, epochs, median_score, epoch_seconds, error.
+    """
+
+    seeds: tuple[int, ...]
+    state: str
+    where: str
+    progress: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds to the last epoch at the pace of the last one; None where unknown."""
+        pace, epoch, epochs = (self.progress.get(name) for name in ("epoch_seconds", "epoch", "epochs"))
+        if not all(isinstance(value, int | float) for value in (pace, epoch, epochs)):
+            return None
+        return float(max(0.0, (epochs - epoch) * pace))  # type: ignore[operator]
+
+
+def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[GroupStatus]:
+    """Return the groups of an entry that have not finished: those at work first, then waiting, then stopped.
+
+    Parameters
+    ----------
+    queued:
+        As for `look`.
+    """
+    alive = living(store)
+    found = [_running(store, claim) for claim in alive]
+    seen = {seed for claim in alive for seed in claim.seeds}
+    done = _finished(store)
+    gone: list[GroupStatus] = []
+    for task in waiting(store, []):
+        rest = tuple(seed for seed in task["seeds"] if seed not in seen | done)
+        if rest:
+            path = store.groups / checkpoint.group_id(task["seeds"]) / "progress.json"
+            progress, job = read_progress(path), f"job {task['job']}"
+            waits = tuple(seed for seed in rest if queued is None or seed in queued)
+            if waits:
+                found.append(GroupStatus(waits, "submitted", job, progress))
+            if len(waits) < len(rest):
+                left_out = tuple(seed for seed in rest if seed not in waits)
+                gone.append(GroupStatus(left_out, "stopped", f"{job} has left the queue", progress))
+            seen |= set(rest)
+    left = set(store.seeds()) - seen - done
+    for path in sorted(store.groups.glob("*/progress.json")):
+        progress = read_progress(path)
+        if progress.get("error") and left:
+            found.append(GroupStatus((), "failed", path.parent.name, progress))
+    found += gone
+    if left:
+        found.append(GroupStatus(tuple(sorted(left)), "stopped", "nobody"))
+    return found
+
+
+def _running(store: EntryStore, claim: Claim) -> GroupStatus:
+    path = store.groups / checkpoint.group_id(claim.seeds or (0,)) / "progress.json"
+    return GroupStatus(claim.seeds, "running", f"{claim.host}, process {claim.pid}", read_progress(path))
+
+
+def _finished(store: EntryStore) -> set[int]:
+    done = set()
+    for seed in store.seeds():
+        try:
+            record = store.seed(seed).record() or {}
+        except StoreError:
+            continue
+        if record.get("status") == "finished":
+            done.add(seed)
+    return done
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """A group's folder that is not needed to read the results: its seeds have all finished."""
+
+    store: EntryStore
+    folder: Path
+    seeds: tuple[int, ...]
+    size: int
+
+
+def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[str]]:
+    """Find the checkpoints of groups whose seeds have all finished and are not being extended.
+
+    Returns
+    -------
+    tuple
+        What can be removed, and one line for each entry that was left alone because it is damaged.
+    """
+    found: list[Garbage] = []
+    problems: list[str] = []
+    for store in entries(runs, task):
+        try:
+            done = store.finished(store.seeds(), 0)
+            held = {seed for claim in living(store) for seed in claim.seeds}
+            for header in checkpoint.headers(store):
+                if set(header.seeds) <= done - held:
+                    size, _ = _usage(header.path.parent)
+                    found.append(Garbage(store, header.path.parent, header.seeds, size))
+        except QrlSuiteError as error:
+            problems.append(str(error))
+    return found, problems
+
+
+def remove(items: Sequence[Garbage]) -> int:
+    """Remove what `garbage` found, unless somebody began to extend it meanwhile; returns the bytes freed.
+
+    Raises
+    ------
+    StoreError
+        If a folder cannot be removed.
+    """
+    freed = 0
+    for item in items:
+        try:
+            claim = acquire(item.store, item.seeds)
+        except SeedsClaimedError:
+            continue
+        try:
+            shutil.rmtree(item.folder)
+        except OSError as error:
+            raise StoreError(f"cannot remove {item.folder}: {error.strerror or error}") from None
+        finally:
+            claim.release()
+        freed += item.size
+    return freed

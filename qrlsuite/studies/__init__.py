@@ -1,0 +1,1 @@
+"""Studies: named sets of entries that answer one question together."""

@@ -1,0 +1,58 @@
+"""Models of equal size: the option at which a model's parameter count is nearest to another entry's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import Entry
+
+LARGEST_SIZE = 4096
+
+
+def parameters(entry: Entry) -> int:
+    """Return the number of parameters of an entry's first network, classical and quantum together."""
+    import numpy as np
+    import torch
+
+    from qrlsuite import population, specs
+    from qrlsuite.training.group import build_envs
+
+    envs = build_envs(entry, 1, lambda: None)
+    inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
+    outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+    build = specs.resolve(entry.model.build)
+    agent = build(inputs, outputs, entry.model_options, torch.Generator())
+    return sum(population.count_parameters(agent))
+
+
+def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:
+    """Return the size at which an entry has as many parameters as a target, or as nearly as can be.
+
+    Parameters
+    ----------
+    make:
+        Builds the entry of a size 1, 2, ...; its parameter count grows with the size.
+    target:
+        The entry to be matched. Where two sizes are equally near, the smaller is taken.
+
+    Raises
+    ------
+    OptionError
+        If no size up to 4096 is large enough.
+    """
+    wanted = parameters(target)
+    low, high = 1, 1
+    while parameters(make(high)) < wanted:
+        low, high = high, 2 * high
+        if high > LARGEST_SIZE:
+            raise OptionError(f"no size up to {LARGEST_SIZE} has the {wanted} parameters of {target.label}")
+    while low < high:
+        middle = (low + high) // 2
+        if parameters(make(middle)) < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return min(
+        (size for size in (low - 1, low) if size >= 1), key=lambda size: abs(parameters(make(size)) - wanted)
+    )

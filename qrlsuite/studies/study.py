@@ -1,0 +1,291 @@
+"""Studies as data: one TOML file names the entries of an experiment, the pictures of it, and what a paper reports.
+
+A study trains nothing of its own: its entries are those that `qrlsuite run` would train, in the same folders, so
+that entries which several studies share are trained once.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from qrlsuite import options, registry, specs
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.task import load as load_task
+from qrlsuite.options import Setting
+
+Name = Annotated[str, Field(pattern=specs.NAME.pattern, max_length=64)]
+LARGEST = 1000
+"""Entries that a study may have."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MatchSection(_Section):
+    """An option that is computed: the value whose parameter count is nearest to that of another group's entry."""
+
+    option: Annotated[
+        str, Field(min_length=1, description="an integer option of the model that sets its size")
+    ]
+    group: Annotated[str, Field(description="the group of entries whose parameter counts are matched")]
+
+
+class EntriesSection(_Section):
+    """A group of entries: every combination of its tasks, models and grid."""
+
+    name: Annotated[Name, Field(description="by which pictures and other groups refer to it")]
+    task: str | Annotated[list[str], Field(min_length=1)]
+    model: str | Annotated[list[str], Field(min_length=1)]
+    algorithm: str | None = None
+    preset: str | None = None
+    options: Annotated[
+        dict[str, Any], Field(description='options as in --set: qubits, "environment.degree", "algorithm.lr"')
+    ] = {}
+    grid: Annotated[
+        dict[str, Annotated[list[Any], Field(min_length=1)]],
+        Field(description="options that take each of several values"),
+    ] = {}
+    match: MatchSection | None = None
+
+
+class EvaluationSection(_Section):
+    """For a picture of episodes: how many of each entry's runs play how many episodes."""
+
+    best: Annotated[int, Field(ge=1)] = 10
+    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+
+
+class PictureSection(_Section):
+    """A picture of the study's entries."""
+
+    name: Annotated[Name, Field(description="part of the file's name")] = "picture"
+    kind: Annotated[str, Field(min_length=1, description="see `qrlsuite plot --help`")]
+    entries: Annotated[list[str], Field(description="groups that it shows; all where none is named")] = []
+    settings: Annotated[dict[str, Any], Field(description="settings of the picture")] = {}
+    evaluation: EvaluationSection | None = None
+
+
+class StudyFile(_Section):
+    """A whole study file."""
+
+    format_version: Literal[1]
+    name: Name
+    summary: Annotated[str, Field(min_length=1)]
+    source: Annotated[str, Field(description="where it was published: section, figure")] = ""
+    reports: Annotated[str, Field(description="what was reported there")] = ""
+    core_hours: Annotated[float | None, Field(ge=0, description="what it cost there, in core-hours")] = None
+    entries: list[EntriesSection] = []
+    pictures: Annotated[list[PictureSection], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _groups_exist(self) -> StudyFile:
+        names = [group.name for group in self.entries]
+        problems = [
+            f"two groups are named '{name}'" for name in sorted({n for n in names if names.count(n) > 1})
+        ]
+        for place, group in enumerate(self.entries):
+            earlier = names[:place]
+            if group.match is not None and group.match.group not in earlier:
+                problems.append(
+                    f"entries.{place}.match.group = '{group.match.group}' is no earlier group"
+                    f"{nearest(group.match.group, earlier)}"
+                )
+        titles = [picture.name for picture in self.pictures]
+        problems += [
+            f"two pictures are named '{name}'" for name in sorted({t for t in titles if titles.count(t) > 1})
+        ]
+        for place, picture in enumerate(self.pictures):
+            problems += [
+                f"pictures.{place}.entries: no group '{word}'{nearest(word, names)}"
+                for word in picture.entries
+                if word not in names
+            ]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+@dataclass(frozen=True)
+class Member:
+    """An entry of a study, and the group that it belongs to."""
+
+    group: str
+    entry: Entry
+
+
+@dataclass(frozen=True)
+class Study:
+    """A validated study.
+
+    Attributes
+    ----------
+    file:
+        The study file's content.
+    source:
+        Where it came from, for messages.
+    """
+
+    file: StudyFile
+    source: str
+
+    @property
+    def name(self) -> str:
+        """The study's name."""
+        return self.file.name
+
+    def members(
+        self, settings: Sequence[Setting] = (), models: Mapping[str, str] | None = None
+    ) -> list[Member]:
+        """Return the entries, group by group, none twice within a group.
+
+        Parameters
+        ----------
+        settings:
+            Options that replace the study's own, in every entry that has them.
+        models:
+            Models to be used in the place of others, by name.
+
+        Raises
+        ------
+        QrlSuiteError
+            For an unknown name or option, or a value that an option cannot have; the message names the study.
+        """
+        models = models or {}
+        named = {name for group in self.file.entries for name in _listed(group.model)}
+        for name in sorted(set(models) - named):
+            raise OptionError(f"study '{self.name}' has no entry with model '{name}'{nearest(name, named)}")
+        found: dict[str, list[Member]] = {}
+        used: set[tuple[str | None, str]] = set()
+        for group in self.file.entries:
+            members: dict[tuple[str, str], Member] = {}
+            for draft in _drafts(group):
+                targets = [m.entry for m in found[group.match.group]] if group.match is not None else [None]
+                for target in targets:
+                    try:
+                        entry = _entry(group, draft, settings, models, target, used)
+                    except QrlSuiteError as error:
+                        raise type(error)(f"{self.source}, group '{group.name}': {error}") from None
+                    members.setdefault((entry.task.name, entry.name), Member(group.name, entry))
+            found[group.name] = list(members.values())
+        for setting in settings:
+            if (setting.side, setting.name) not in used:
+                raise OptionError(
+                    f"{setting.written}: no entry of study '{self.name}' has an option of that name"
+                )
+        every = [member for members_ in found.values() for member in members_]
+        if len(every) > LARGEST:
+            raise OptionError(f"study '{self.name}' has {len(every)} entries, more than {LARGEST}")
+        return every
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """Names and settings that are about to become an entry."""
+
+    task: str
+    model: str
+    settings: tuple[Setting, ...]
+
+
+def _listed(words: str | list[str]) -> list[str]:
+    return [words] if isinstance(words, str) else words
+
+
+def _setting(key: str, word: str, value: Any) -> Setting:
+    side, dot, name = word.rpartition(".")
+    return Setting(side if dot else None, name, value, f"{key}.")
+
+
+def _drafts(group: EntriesSection) -> Iterator[_Draft]:
+    fixed = [_setting("options", word, value) for word, value in group.options.items()]
+    for task, model in itertools.product(_listed(group.task), _listed(group.model)):
+        for values in itertools.product(*group.grid.values()):
+            varied = [_setting("grid", word, value) for word, value in zip(group.grid, values)]
+            yield _Draft(task, model, (*fixed, *varied))
+
+
+def _entry(
+    group: EntriesSection,
+    draft: _Draft,
+    settings: Sequence[Setting],
+    models: Mapping[str, str],
+    target: Entry | None,
+    used: set[tuple[str | None, str]],
+) -> Entry:
+    model = models.get(draft.model, draft.model)
+    applicable = [s for s in settings if _has(draft.task, model, group.algorithm, s)]
+    used |= {(s.side, s.name) for s in applicable}
+    words = [*draft.settings, *applicable]
+    if target is not None and group.match is not None:
+        from qrlsuite.studies.sizes import nearest_size
+
+        option = group.match.option
+        if not any(s.name == option and s.side in (None, "model") for s in applicable):
+            value = nearest_size(
+                lambda size: resolve(
+                    draft.task, model, group.algorithm, [*words, Setting("model", option, size)], group.preset
+                ),
+                target,
+            )
+            words.append(Setting("model", option, value))
+    return resolve(draft.task, model, group.algorithm, words, group.preset)
+
+
+def _has(task: str, model: str, algorithm: str | None, setting: Setting) -> bool:
+    """Whether an entry of these names has the option that a setting is for."""
+    loaded = load_task(task)
+    sides = {
+        "environment": loaded.environment.options,
+        "model": registry.model(model).options,
+        "algorithm": registry.algorithm(algorithm or loaded.file.default_algorithm).options,
+    }
+    if setting.side is not None and setting.side not in sides:
+        raise OptionError(f"{setting.written}: sides are {', '.join(sides)}")
+    chosen = [sides[setting.side]] if setting.side is not None else list(sides.values())
+    return any(setting.name in options.field_names(specs.resolve(reference)) for reference in chosen)
+
+
+def parse(text: str, source: str) -> Study:
+    """Parse and validate a study; the entries are resolved by `Study.members`.
+
+    Raises
+    ------
+    TaskError
+        Listing every problem with its path in the file.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TaskError(f"{source}: not valid TOML: {error}") from None
+    try:
+        return Study(StudyFile.model_validate(data), source)
+    except pydantic.ValidationError as error:
+        raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, StudyFile))) from None
+
+
+def load(name: str) -> Study:
+    """Load a registered study by name, or a study file by path (anything that ends in `.toml`).
+
+    Raises
+    ------
+    UnknownNameError
+        If no study has the name.
+    TaskError
+        If the file cannot be read or is malformed.
+    """
+    path = Path(name) if name.endswith(".toml") else Path(registry.study(name).path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TaskError(f"study file {path} cannot be read: {error}") from None
+    return parse(text, path.name)

@@ -1,0 +1,414 @@
+"""Trained agents, and reference policies beside them, on fresh episodes.
+
+Every episode is one random stream of its own, keyed by (task, evaluation seed, "evaluation", episode): all
+policies of a task, whatever the entry, meet the same episodes, and no training or validation episode is among
+them. Episodes are played in rounds of lanes that each finish exactly one, so that short episodes are not
+counted more often than long ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from qrlsuite import specs
+from qrlsuite.environment import LaneEnv
+from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, StoreError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.store import EntryStore, SeedStore
+from qrlsuite.seeding import Streams
+from qrlsuite.training.group import MAX_EPISODE_STEPS, ModelBuilder, build_envs
+from qrlsuite.training.standardization import RunningStatistics
+
+LANES = 100
+"""Episodes of a policy that are played side by side."""
+PERCENTILES = (5, 25, 50, 75, 95)
+
+FloatArray = NDArray[np.float64]
+Policy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
+"""Maps observations (L, ...) of all lanes to actions (L,)."""
+Report = Callable[[str, int, int], None]
+"""Called with a policy's name, the steps played and the steps of a round before, for a progress display."""
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """Episodes of P agents, N each.
+
+    Attributes
+    ----------
+    name:
+        An entry's label, or a reference policy's name.
+    returns:
+        Sums of rewards (P, N), undiscounted.
+    scores:
+        Relative scores (P, N) as the task defines them, None where it knows no maximum.
+    seeds:
+        Seeds of the P agents; empty for a reference policy.
+    validation:
+        Last validation score of each agent, by which it was chosen (P,); empty for a reference policy.
+    runs:
+        Finished runs among which the agents were chosen.
+    """
+
+    name: str
+    returns: FloatArray
+    scores: FloatArray | None
+    seeds: tuple[int, ...] = ()
+    validation: tuple[float, ...] = ()
+    runs: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """Return mean, percentiles and extremes over all episodes, as plain values."""
+        content: dict[str, Any] = {
+            "policy": self.name,
+            "agents": len(self.returns),
+            "episodes": int(self.returns.shape[1]),
+            "return": distribution(self.returns),
+            "score": None if self.scores is None else distribution(self.scores),
+        }
+        if self.seeds:
+            content |= {"runs": self.runs, "seeds": [self._agent(p) for p in range(len(self.seeds))]}
+        return content
+
+    def _agent(self, p: int) -> dict[str, Any]:
+        return {
+            "seed": self.seeds[p],
+            "validation_score": self.validation[p],
+            "mean_return": float(self.returns[p].mean()),
+            "mean_score": None if self.scores is None else float(self.scores[p].mean()),
+        }
+
+
+def distribution(values: FloatArray) -> dict[str, float]:
+    """Return mean, standard deviation, minimum, percentiles (`p5` .. `p95`) and maximum of all values."""
+    flat = np.asarray(values, np.float64).ravel()
+    levels = np.percentile(flat, PERCENTILES)
+    return {
+        "mean": float(flat.mean()),
+        "std": float(flat.std()),
+        "min": float(flat.min()),
+        **{f"p{level}": float(value) for level, value in zip(PERCENTILES, levels)},
+        "max": float(flat.max()),
+    }
+
+
+def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], int]:
+    """Choose the runs with the highest last validation score, earlier seeds first where equal.
+
+    Only finished runs count, and of these only those with the most epochs that any has.
+
+    Returns
+    -------
+    tuple
+        Their seeds, their last validation scores, and the number of runs to choose from.
+
+    Raises
+    ------
+    OptionError
+        If `count` is not positive.
+    StoreError
+        If no run has finished, or a file is damaged.
+    """
+    if count < 1:
+        raise OptionError(f"--best {count}: at least one run is needed")
+    records = {seed: store.seed(seed).record() or {} for seed in store.seeds()}
+    lengths = {
+        seed: int(record["epochs"]) for seed, record in records.items() if record.get("status") == "finished"
+    }
+    longest = max(lengths.values(), default=0)
+    last: dict[int, float] = {}
+    for seed in sorted(seed for seed, epochs in lengths.items() if epochs == longest):
+        curve = store.seed(seed).curve().curve
+        if len(curve):
+            last[seed] = float(curve[-1])
+    if not last:
+        raise StoreError(
+            f"{store.path}: no run has finished, so there is no trained agent; `qrlsuite run` finishes them"
+        )
+    chosen = sorted(last, key=lambda seed: (-last[seed], seed))[:count]
+    return chosen, [last[seed] for seed in chosen], len(last)
+
+
+def parameters(folder: SeedStore) -> dict[str, NDArray[Any]]:
+    """Read a trained agent's parameters by name.
+
+    Raises
+    ------
+    StoreError
+        If there are none, or the file is damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    path = folder.path / "final.safetensors"
+    try:
+        arrays: dict[str, NDArray[Any]] = load(path.read_bytes())
+    except FileNotFoundError:
+        raise StoreError(
+            f"{path} is missing: seed {folder.seed} has a learning curve but no trained parameters (entries "
+            "that were imported or exported have none); train the entry here with `qrlsuite run`"
+        ) from None
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise StoreError(
+            f"{path} is damaged ({type(error).__name__}: {error}); restore the file or delete the seed's folder"
+        ) from None
+    return arrays
+
+
+class Agents:
+    """Trained agents of an entry as one population.
+
+    Parameters
+    ----------
+    entry, store:
+        The entry and its folder.
+    seeds:
+        Finished runs.
+
+    Raises
+    ------
+    StoreError
+        If a run has no parameters, or they are not those of the entry's model.
+    """
+
+    def __init__(self, entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> None:
+        torch.set_num_threads(1)
+        stored = [parameters(store.seed(seed)) for seed in seeds]
+        self.seeds = list(seeds)
+        streams = [Streams(entry.task.hash, seed) for seed in seeds]
+        envs = build_envs(entry, len(self.seeds), lambda: None)
+        size = int(np.prod(envs.single_observation_space.shape or (1,)))
+        place = torch.device(device)
+        self.statistics: RunningStatistics | None = None
+        if envs.inner.running_statistics:
+            self.statistics = RunningStatistics(len(self.seeds), 1, size, place)
+        models = ModelBuilder(entry, size, streams, self.statistics)
+        factory = specs.resolve(entry.algorithm.factory)
+        self.algorithm = factory(envs, models, entry.algorithm_options, streams, place)
+        self._load(store, stored)
+
+    def _load(self, store: EntryStore, stored: Sequence[Mapping[str, NDArray[Any]]]) -> None:
+        own: dict[str, torch.Tensor] = dict(self.algorithm.policy_state())
+        if self.statistics is not None:
+            own |= self.statistics.published()
+        for seed, arrays in zip(self.seeds, stored):
+            problem = _misfit({name: value[0] for name, value in own.items()}, arrays)
+            if problem:
+                raise StoreError(
+                    f"{store.seed(seed).path / 'final.safetensors'} does not fit the entry's model: {problem}"
+                )
+        with torch.no_grad():
+            for name, value in own.items():
+                together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
+                value.copy_(together.reshape(value.shape))
+        if self.statistics is not None:
+            self.statistics.refresh()
+        for name, loaded in self.algorithm.policy_state().items():
+            value = own[name]
+            if not torch.equal(value.cpu(), loaded.cpu()) and not bool(torch.isnan(value).any()):
+                raise PluginError(
+                    f"algorithm '{type(self.algorithm).__name__}': policy_state() returns copies; it has to return "
+                    "the tensors that act() uses, into which trained parameters are loaded"
+                )
+
+    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the actions that validation would take (P * L,) for seed-major observations (P * L, ...)."""
+        population = np.ascontiguousarray(observations, np.float32).reshape(
+            len(self.seeds), len(observations) // len(self.seeds), -1
+        )
+        actions: NDArray[np.int64] = self.algorithm.act(population).reshape(-1)
+        return actions
+
+
+def _misfit(own: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[Any]]) -> str | None:
+    """Say where names, shapes or types of stored parameters differ from the model's own; None where they agree."""
+    missing, unexpected = sorted(set(own) - set(stored)), sorted(set(stored) - set(own))
+    if missing:
+        return f"it has no '{missing[0]}'" + (f", but '{unexpected[0]}'" if unexpected else "")
+    if unexpected:
+        return f"it has '{unexpected[0][:80]}', which the model has not"
+    for name, value in own.items():
+        given = stored[name]
+        wanted = str(value.dtype).removeprefix("torch.")
+        scalar = value.dim() == 0 and given.shape == (1,)  # how a number per agent is stored
+        if not (given.shape == tuple(value.shape) or scalar) or given.dtype.name != wanted:
+            return f"'{name}' is {given.dtype.name} of shape {given.shape}, not {wanted} of shape {tuple(value.shape)}"
+    return None
+
+
+def trained(
+    store: EntryStore,
+    best: int = 10,
+    episodes: int = 1000,
+    seed: int = 0,
+    device: str = "cpu",
+    report: Report = lambda name, done, total: None,
+) -> Played:
+    """Evaluate the best runs of an entry.
+
+    Parameters
+    ----------
+    best:
+        How many runs: those with the highest last *validation* score. The evaluation's episodes are others, so
+        its mean is not raised by the choice.
+    episodes:
+        Complete episodes of each agent.
+    seed:
+        Evaluation seed; another one gives other episodes.
+
+    Raises
+    ------
+    StoreError
+        If there is no trained agent.
+    EnvironmentFailure
+        If the environment fails.
+    """
+    record = store.record()
+    if record.get("imported"):
+        raise StoreError(
+            f"{store.path} was imported from other files, which hold learning curves and no trained parameters: "
+            "train the entry here with `qrlsuite run` to evaluate its policies"
+        )
+    entry = store.entry()
+    seeds, validation, runs = best_runs(store, best)
+    agents = Agents(entry, store, seeds, device)
+    returns, scores = play(
+        entry, len(seeds), episodes, seed, lambda envs, block: agents.act, entry.label, report
+    )
+    return Played(entry.label, returns, scores, tuple(seeds), tuple(validation), runs)
+
+
+def references(
+    entry: Entry,
+    episodes: int = 1000,
+    seed: int = 0,
+    report: Report = lambda name, done, total: None,
+) -> list[Played]:
+    """Evaluate the environment's reference policies, and the random one, on the episodes of `trained`.
+
+    Raises
+    ------
+    EnvironmentFailure
+        If the environment fails.
+    PluginError
+        If a reference policy cannot be built or does not give actions.
+    """
+    played = []
+    for name, reference in entry.task.environment.policies.items():
+        factory = specs.resolve(reference)
+
+        def build(envs: LaneEnv, block: int, factory: Any = factory, name: str = name) -> Policy:
+            return _checked(name, factory(envs), envs)
+
+        returns, scores = play(entry, 1, episodes, seed, build, name, report)
+        played.append(Played(name, returns, scores))
+    if "random" not in entry.task.environment.policies:
+        streams = Streams(entry.task.hash, seed)
+
+        def uniform(envs: LaneEnv, block: int) -> Policy:
+            stream = streams.numpy("evaluation random", block)
+            choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+            return lambda observations: stream.integers(choices, size=envs.num_envs)
+
+        returns, scores = play(entry, 1, episodes, seed, uniform, "random", report)
+        played.append(Played("random", returns, scores))
+    return played
+
+
+def _checked(name: str, policy: Policy, envs: LaneEnv) -> Policy:
+    """Return a reference policy whose actions are looked at before the environment takes them."""
+    choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+
+    def act(observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        actions = np.asarray(policy(observations))
+        if (
+            actions.shape != (envs.num_envs,)
+            or actions.dtype.kind not in "iu"
+            or actions.min() < 0
+            or actions.max() >= choices
+        ):
+            raise PluginError(
+                f"reference policy '{name}' gave {actions.dtype} of shape {actions.shape}: it has to give "
+                f"{envs.num_envs} integers in 0..{choices - 1}"
+            )
+        return actions.astype(np.int64)
+
+    return act
+
+
+def play(
+    entry: Entry,
+    agents: int,
+    episodes: int,
+    seed: int,
+    build: Callable[[LaneEnv, int], Policy],
+    name: str = "policy",
+    report: Report = lambda name, done, total: None,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Play the evaluation's episodes with P agents at once.
+
+    Parameters
+    ----------
+    build:
+        Called at the beginning of each round of episodes with the lanes, seed-major in the agents, and the
+        round's number.
+
+    Returns
+    -------
+    tuple
+        Returns (P, N), and scores (P, N) or None where the task knows no maximum.
+
+    Raises
+    ------
+    OptionError
+        If there is no episode to play.
+    EnvironmentFailure
+        If the environment fails, or an episode does not end.
+    """
+    if episodes < 1:
+        raise OptionError(f"--episodes {episodes}: at least one is needed")
+    streams = Streams(entry.task.hash, seed)
+    lanes = min(LANES, episodes)
+    envs = build_envs(entry, agents * lanes, lambda: None)
+    envs.inner.autoreset = False
+    rounds = -(-episodes // lanes)
+    returns, scores = (np.empty((agents, rounds * lanes)) for _ in range(2))
+    for block in range(rounds):
+        columns = slice(block * lanes, (block + 1) * lanes)
+        keys = range(columns.start, columns.stop)
+        envs.seed_lanes([streams.numpy("evaluation", key) for _ in range(agents) for key in keys])
+        report(name, block * lanes * agents, episodes * agents)
+        ended = _round(entry, envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
+        returns[:, columns], scores[:, columns] = (values.reshape(agents, lanes) for values in ended)
+    report(name, episodes * agents, episodes * agents)
+    section = entry.task.file.score
+    known = section.source == "info" or section.max_return is not None
+    return returns[:, :episodes].copy(), scores[:, :episodes].copy() if known else None
+
+
+def _round(entry: Entry, envs: Any, begin: Callable[[], Policy]) -> tuple[FloatArray, FloatArray]:
+    """Play one episode in every lane; returns returns and scores (L,)."""
+    observations, _ = envs.reset()
+    envs.take_finished()
+    policy = begin()
+    returns, scores = (np.full(envs.num_envs, np.nan) for _ in range(2))
+    still = np.ones(envs.num_envs, dtype=np.bool_)
+    for _ in range(MAX_EPISODE_STEPS):
+        observations, _, terminated, truncated, _ = envs.step(policy(observations))
+        if (terminated | truncated).any():
+            lanes, sums, given = envs.take_finished()
+            first = still[lanes]
+            returns[lanes[first]], scores[lanes[first]] = sums[first], given[first]
+            still[lanes] = False
+            if not still.any():
+                return returns, scores
+    raise EnvironmentFailure(
+        f"environment '{entry.task.environment.name}': an episode did not end within {MAX_EPISODE_STEPS} steps; "
+        "give it a time limit"
+    )

@@ -1,0 +1,117 @@
+"""Counting what environments do: rounds for the progress display, returns and scores of finished episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.errors import EnvironmentFailure
+from qrlsuite.experiment.task import ScoreSection
+
+
+class MeteredEnv(LaneEnv):
+    """A lane environment seen through: it behaves as the one inside, and is counted.
+
+    Attributes
+    ----------
+    returns:
+        Undiscounted return of every lane's unfinished episode (num_envs,).
+    observe:
+        Called with the observations (num_envs, ...) that every step returns, unless None.
+    finished:
+        (lane, return, score) of every episode that ended since `take_finished` was last called.
+    """
+
+    def __init__(self, inner: LaneEnv, name: str, score: ScoreSection, tick: Callable[[], None]) -> None:
+        self.inner = inner
+        self.environment_name = name
+        self.score = score
+        self.tick = tick
+        batched_spaces(self, inner.single_observation_space, inner.single_action_space, inner.num_envs)
+        self.returns = np.zeros(inner.num_envs)
+        self.observe: Callable[[NDArray[np.float32]], None] | None = None
+        self.finished: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Reset every lane."""
+        self.returns[:] = 0.0
+        try:
+            return self.inner.reset(seed=seed, options=options)
+        except Exception as error:
+            raise self._failure(error) from error
+
+    def step(self, actions: NDArray[np.int64]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step every lane."""
+        try:
+            observations, rewards, terminated, truncated, infos = self.inner.step(actions)
+            if self.observe is not None:
+                self.observe(observations)
+        except Exception as error:
+            raise self._failure(error) from error
+        self.returns += rewards
+        ended = np.flatnonzero(terminated | truncated)
+        if ended.size:
+            self.finished.append((ended, self.returns[ended].copy(), self._scores(ended, infos)))
+            self.returns[ended] = 0.0
+        self.tick()
+        return observations, rewards, terminated, truncated, infos
+
+    def _scores(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return the scores of the episodes that have just ended in the lanes `ended`."""
+        if self.score.source == "return":
+            scores = self.returns[ended] / (
+                self.score.max_return if self.score.max_return is not None else 1.0
+            )
+            if not np.isfinite(scores).all():
+                raise EnvironmentFailure(
+                    f"environment '{self.environment_name}' gave an episode the return "
+                    f"{self.returns[ended][~np.isfinite(scores)][0]}: are there rewards that are nan or infinite?"
+                )
+            return scores
+        given = infos.get("final_info", {}).get("score")
+        if given is None:
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}' gave no info['score'] at the end of an episode: "
+                "set [score] source = 'return' and max_return in the task file"
+            )
+        scores = np.asarray(given, np.float64)[ended]
+        if not (np.isfinite(scores).all() and (scores >= 0).all() and (scores <= 1 + 1e-9).all()):
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}' gave a score outside [0, 1]: {scores[:5].tolist()}"
+            )
+        return scores
+
+    def take_finished(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return lanes, returns and scores of the episodes finished since the last call, and forget them."""
+        finished, self.finished = self.finished, []
+        if not finished:
+            return np.empty(0, np.int64), np.empty(0), np.empty(0)
+        lanes, returns, scores = (np.concatenate(parts) for parts in zip(*finished))
+        return lanes, returns, scores
+
+    def seed_lanes(self, streams: Any) -> None:
+        """Replace the random streams."""
+        self.inner.seed_lanes(streams)
+
+    def state_dict(self) -> State:
+        """Return the inner state and the unfinished episodes' returns, lane-first."""
+        return {**self.inner.state_dict(), "metered.returns": self.returns}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore what `state_dict` returned."""
+        self.inner.load_state_dict({k: v for k, v in state.items() if k != "metered.returns"})
+        self.returns = np.array(state["metered.returns"])
+
+    def _failure(self, error: Exception) -> Exception:
+        if isinstance(error, EnvironmentFailure):
+            return error
+        return EnvironmentFailure(
+            f"environment '{self.environment_name}' failed: {type(error).__name__}: {error}; "
+            "finished epochs are kept, and the same command tries again"
+        )
