@@ -17,8 +17,9 @@ from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.leaderboard.published import Published
 from qrlsuite.results import provenance
+from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training.group import GroupRun, Progress
+from qrlsuite.training.group import GroupRun
 
 AGREEMENT = 1e-5
 """How closely the beginnings of runs agree between machines, relative to 1 or the value."""

@@ -19,7 +19,8 @@ from typing import Any, cast
 
 import pluggy
 
-from qrlsuite import compatibility, hookspecs, specs
+import qrlsuite
+from qrlsuite import hookspecs, specs
 from qrlsuite.errors import PluginError, UnknownNameError, nearest
 
 STRICT = "QRLSUITE_STRICT"
@@ -256,8 +257,8 @@ def create(
         found = Plugin(point.name, point.value, distribution, version)
         registry.plugins.append(found)
         try:
-            found.requires = compatibility.required(point.dist)
-            compatibility.check(point.dist)
+            found.requires = required_versions(point.dist)
+            check_version(point.dist)
             found.registered = registry.add_plugin(_import(point, distribution), distribution)
         except PluginError as error:
             if strict:
@@ -325,3 +326,55 @@ def ansatz(name: str) -> specs.AnsatzSpec:
 def circuit_backend(name: str) -> specs.CircuitBackendSpec:
     """Look up a circuit backend by name."""
     return cast(specs.CircuitBackendSpec, load().get("circuit_backends", name).spec)
+
+
+def required_versions(distribution: metadata.Distribution | None) -> str:
+    """Return the versions of the suite that a distribution requires, such as `"<0.2,>=0.1"`; `""` for any.
+
+    pip honors the requirement when the plugin is installed, and lets a later upgrade of the suite break it; so it
+    is read again before the plugin is imported.
+
+    Raises
+    ------
+    PluginError
+        If what it requires cannot be read.
+    """
+    if distribution is None or distribution.name == "qrlsuite":
+        return ""
+    from packaging.requirements import InvalidRequirement, Requirement  # 50 ms: only where there are plugins
+
+    stated = []
+    for line in distribution.requires or []:
+        try:
+            requirement = Requirement(line)
+            applies = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        except (InvalidRequirement, ValueError) as error:
+            if line.lower().startswith("qrlsuite"):
+                raise PluginError(
+                    f"distribution '{distribution.name}' requires {line!r}, which cannot be read: {error}"
+                ) from error
+            continue
+        if applies and requirement.name.lower().replace("_", "-") == "qrlsuite":
+            stated += [str(specifier) for specifier in requirement.specifier]
+    return ",".join(sorted(stated))
+
+
+def check_version(distribution: metadata.Distribution | None, version: str | None = None) -> None:
+    """Refuse a distribution that does not work with this version of the suite.
+
+    Raises
+    ------
+    PluginError
+        Naming the distribution, what it requires, what there is, and what to type.
+    """
+    needs = required_versions(distribution)
+    if not needs or distribution is None:
+        return
+    from packaging.specifiers import SpecifierSet
+
+    ours = qrlsuite.__version__ if version is None else version
+    if not SpecifierSet(needs).contains(ours, prereleases=True):
+        raise PluginError(
+            f"distribution '{distribution.name}' {distribution.version} requires qrlsuite{needs}, and this is "
+            f"qrlsuite {ours}: pip install --upgrade {distribution.name}, or pip install 'qrlsuite{needs}'"
+        )

@@ -1,36 +1,97 @@
-"""The Typer application: every command, its own file."""
+"""The Typer application. Built-in commands are references, imported when they are called."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
-from qrlsuite.cli.commands import (
-    calibrate,
-    check,
-    compare,
-    doctor,
-    evaluate,
-    export,
-    import_,
-    leaderboard,
-    listing,
-    new,
-    plot,
-    run,
-    runs,
-    show,
-    status,
-    study,
-    tune,
-)
+import qrlsuite
+from qrlsuite import registry
+from qrlsuite.cli.extensions import add_commands
+from qrlsuite.specs import resolve
+
+
+@dataclass(frozen=True)
+class Command:
+    """A built-in command.
+
+    Attributes
+    ----------
+    summary:
+        Its line in `qrlsuite --help`, short enough for a terminal of 80 columns.
+    reference:
+        `module:function`, or `module:app` for a group of commands.
+    cls:
+        Class of the command, `module:class`, where it is not Typer's.
+    """
+
+    name: str
+    summary: str
+    reference: str
+    cls: str | None = None
+
+
+_ROOM = "qrlsuite.cli.commands"
+BUILT_IN = {
+    command.name: command
+    for command in (
+        Command("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
+        Command("status", "Show what is running, waiting and stopped.", f"{_ROOM}.status:status"),
+        Command("runs", "List the results folder: entries, seeds, size.", f"{_ROOM}.runs:runs"),
+        Command("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
+        Command("compare", "Compare two entries cell by cell, and in words.", f"{_ROOM}.compare:compare"),
+        Command("calibrate", "Measure how often the significance rules err.", f"{_ROOM}.calibrate:calibrate"),
+        Command(
+            "plot",
+            "Draw a picture of results or of an environment.",
+            f"{_ROOM}.plot:plot",
+            f"{_ROOM}.plot:Command",
+        ),
+        Command("evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"),
+        Command("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
+        Command("export", "Write entries to publish on a leaderboard.", f"{_ROOM}.export:export"),
+        Command("import", "Import released result files as one entry.", f"{_ROOM}.import_:import_results"),
+        Command("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
+        Command("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
+        Command("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
+        Command("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
+        Command("study", "Run a paper's experiments by name.", f"{_ROOM}.study:app"),
+        Command("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
+    )
+}
+
+
+def load(command: Command) -> Any:
+    """Import a built-in command and return it as Typer builds it."""
+    target = resolve(command.reference)
+    holder = typer.Typer(rich_markup_mode=None)
+    holder.callback()(lambda: None)  # with a callback it is a group, even of one command
+    if isinstance(target, typer.Typer):
+        holder.add_typer(target, name=command.name)
+    else:
+        holder.command(command.name, cls=resolve(command.cls) if command.cls else None)(target)
+    group: Any = get_command(holder)
+    return group.commands[command.name]
+
+
+class LazyGroup(TyperGroup):
+    """The group of all commands; a built-in one is a placeholder with its summary until it is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return name, command and the remaining arguments, importing a built-in command."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, load(BUILT_IN[name]) if name in BUILT_IN else command, rest
 
 
 def build() -> typer.Typer:
     """Return the application with every built-in and plugin command."""
     app = typer.Typer(
         name="qrlsuite",
+        cls=LazyGroup,
         help=(
             "Does a quantum model really beat a classical one at reinforcement learning, or did five lucky seeds "
             "say so? Train many seeds, estimate sample complexity with confidence intervals, and rank by "
@@ -42,23 +103,8 @@ def build() -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
-    app.command("run")(run.run)
-    app.command("status")(status.status)
-    app.command("runs")(runs.runs)
-    app.add_typer(leaderboard.app, name="leaderboard")
-    app.command("compare")(compare.compare)
-    app.command("calibrate")(calibrate.calibrate)
-    app.command("plot", cls=plot.Command)(plot.plot)
-    app.command("evaluate")(evaluate.evaluate)
-    app.command("tune")(tune.tune)
-    app.command("export")(export.export)
-    app.command("import")(import_.import_results)
-    app.command("list")(listing.list_things)
-    app.command("show")(show.show)
-    app.command("check")(check.check)
-    app.command("doctor")(doctor.doctor)
-    app.add_typer(study.app, name="study")
-    app.add_typer(new.app, name="new")
+    for command in BUILT_IN.values():
+        app.command(command.name, help=command.summary)(lambda: None)
 
     @app.callback()
     def common(
@@ -74,16 +120,11 @@ def build() -> typer.Typer:
     ) -> None:
         pass  # `cli.main` sees to --strict, for plugins are loaded before options are read
 
-    from qrlsuite import registry
-    from qrlsuite.cli.extensions import add_commands
-
     add_commands(app, registry.load())
     return app
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        import qrlsuite
-
         typer.echo(f"qrlsuite {qrlsuite.__version__}")
         raise typer.Exit

@@ -175,7 +175,7 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
 
 def _warnings(store: EntryStore, group: Group) -> list[str]:
     """Return what a group's worker left for the user to know."""
-    from qrlsuite.results.seeds import ProgressFile
+    from qrlsuite.results.progress import ProgressFile
 
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from typing import IO
 
 from qrlsuite.engine.api import Outcome, Show, Work, worker_command
-from qrlsuite.results.seeds import Group, ProgressFile
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import Group
 from qrlsuite.results.store import EntryStore
 
 ATTEMPTS = 3

@@ -22,7 +22,8 @@ from pathlib import Path
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
-from qrlsuite.results.seeds import ProgressFile, parse_seeds, plan_groups
+from qrlsuite.results.progress import Progress, ProgressFile
+from qrlsuite.results.seeds import parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
 
 _PR_SET_PDEATHSIG = 1
@@ -69,7 +70,7 @@ def train_group(
     KeyboardInterrupt
         After an interruption, with everything saved.
     """
-    from qrlsuite.training.group import GroupRun, Progress
+    from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
 
     store = EntryStore(folder)
     progress = ProgressFile(store, group_id(seeds))

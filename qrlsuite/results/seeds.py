@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.errors import OptionError
 from qrlsuite.results import checkpoint
-from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.results.store import EntryStore
 
 if TYPE_CHECKING:
-    from qrlsuite.training.group import Progress  # torch, which a supervisor can do without
+    pass  # torch, which a supervisor can do without
 
 LARGEST_GROUP = 100
 MOST_SEEDS = 100_000
@@ -92,47 +89,3 @@ def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: i
             low, high = piece * len(members) // pieces, (piece + 1) * len(members) // pieces
             groups.append(Group(tuple(members[low:high]), epoch))
     return groups
-
-
-class ProgressFile:
-    """A group's progress on disk: written by its worker at most twice a second, read by any display."""
-
-    def __init__(self, store: EntryStore, group: str) -> None:
-        self.path = store.groups / group / "progress.json"
-        self._written = 0.0
-
-    def write(self, progress: Progress, error: str | None = None, force: bool = False) -> None:
-        """Write the progress, unless it was just written."""
-        now = time.monotonic()
-        if not force and now - self._written < 0.5:
-            return
-        self._written = now
-        content = json.dumps({**asdict(progress), "error": error}).encode()
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = self.path.with_suffix(".tmp")
-            temporary.write_bytes(content)
-            temporary.replace(self.path)
-        except OSError:
-            if force:
-                write_atomically(self.path, content)  # raises the clear error
-
-    def read(self) -> dict[str, Any]:
-        """Return the last progress written, empty where there is none."""
-        return read_progress(self.path)
-
-    def clear(self) -> None:
-        """Forget an earlier attempt's progress."""
-        try:
-            self.path.unlink(missing_ok=True)
-        except OSError as error:
-            raise StoreError(f"cannot write {self.path}: {error.strerror or error}") from None
-
-
-def read_progress(path: Path) -> dict[str, Any]:
-    """Read a progress file; empty where it is missing or damaged."""
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}

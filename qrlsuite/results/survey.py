@@ -13,7 +13,7 @@ from typing import Any
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living
-from qrlsuite.results.seeds import read_progress
+from qrlsuite.results.progress import read_progress
 from qrlsuite.results.store import EntryStore, entries, read_json, read_lines
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")

@@ -13,7 +13,6 @@ import math
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import checkpoint, provenance, store
+from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, unpack
 from qrlsuite.training.device import find as find_device
 from qrlsuite.training.interrupts import Interruptible
@@ -36,25 +36,6 @@ from qrlsuite.training.trackers import EventSink, asked
 CHECKPOINT_SECONDS = 60.0
 MAX_EPISODE_STEPS = 100_000
 """A validation episode that has not ended after so many steps is an error, not an endless loop."""
-
-
-@dataclass
-class Progress:
-    """Where a group stands: what a progress display shows."""
-
-    phase: str = "starting"
-    epoch: int = 0
-    epochs: int = 0
-    done: int = 0
-    """Rounds of the current phase done so far."""
-    total: int = 0
-    """Rounds of the current phase, 0 where unknown."""
-    median_score: float | None = None
-    seed_scores: list[float] = dataclasses.field(default_factory=list)
-    """Each seed's score after `epoch`, for a median over all groups."""
-    epoch_seconds: float | None = None
-    warnings: list[str] = dataclasses.field(default_factory=list)
-    """What the user should know although nothing failed: a tracker that was left out."""
 
 
 Report = Callable[[Progress], None]

@@ -14,7 +14,8 @@ from qrlsuite.cli.commands.run import summarize
 from qrlsuite.cli.display import CostEstimate, RunDisplay
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.results.seeds import Group, ProgressFile
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import Group
 from qrlsuite.results.store import EntryStore
 
 PAIR = [Group((0, 1, 2), 0), Group((3, 4), 0)]

@@ -17,7 +17,29 @@ FOLDERS = {
     "qrlsuite.tasks": ROOT / "tasks",
     "qrlsuite.leaderboard": ROOT / "leaderboard",
 }
-CORE_MAY_NOT = ("qrlsuite.plugins", "qrlsuite.cli", "qrlsuite.leaderboard", "qrlsuite.tasks")
+TOP = {
+    "algorithm", "environment", "errors", "gymlanes", "hookspecs", "normalization", "options", "population",
+    "registry", "seeding", "specs",
+}  # fmt: skip
+"""What a plugin or a user may import, beside `qrlsuite.api`."""
+
+ROOMS = (
+    ("statistics",),
+    ("contracts",),  # the modules of TOP
+    ("circuit",),
+    ("experiment",),
+    ("results",),
+    ("training",),
+    ("engine",),
+    ("tuning",),
+    ("studies",),
+    ("leaderboard", "testing", "scaffold"),
+    ("api",),
+    ("cli",),
+)
+"""A room imports from itself and from the rows above it."""
+LEVELS = {room: level for level, row in enumerate(ROOMS) for room in row}
+PLUGINS_MAY = ("contracts", "statistics", "circuit", "testing")
 
 
 def modules() -> dict[str, Path]:
@@ -43,39 +65,47 @@ def imports(path: Path, module: str) -> set[str]:
     return found
 
 
-def inside(name: str, packages: tuple[str, ...]) -> bool:
-    return any(name == package or name.startswith(package + ".") for package in packages)
+def room(name: str) -> str:
+    """Return the room of a module of the suite."""
+    parts = [*name.split("."), "", ""]
+    if parts[0] == "qrlsuite" and parts[1] in TOP | {""}:
+        return "contracts"
+    return {"__main__": "cli"}.get(parts[1], parts[1])
 
 
 ALL = modules()
 
 
+def rooms_of(used: set[str]) -> dict[str, str]:
+    """Return the modules of the suite among what is imported, with their rooms."""
+    return {name: room(name) for name in used if name in ALL and name != "qrlsuite"}
+
+
 @pytest.mark.parametrize("module", sorted(ALL))
 def test_imports_point_one_way(module: str) -> None:
     used = imports(ALL[module], module)
-    ours = {name for name in used if inside(name, ("qrlsuite",))}
-    if inside(module, ("qrlsuite.statistics",)):
-        allowed = ("qrlsuite.errors", "qrlsuite.statistics")
-        assert all(name == "qrlsuite" or inside(name, allowed) for name in ours), ours
-        foreign = {name.partition(".")[0] for name in used - ours} - set(sys.stdlib_module_names)
-        assert foreign <= {"numpy", "scipy"}, foreign
-    elif module == "qrlsuite.circuit.description":
-        assert all(inside(name, ("qrlsuite.errors",)) or name == "qrlsuite" for name in ours), ours
-        assert {name.partition(".")[0] for name in used - ours} - set(sys.stdlib_module_names) <= {"numpy"}
-    elif inside(module, ("qrlsuite.plugins.algorithms",)) and module != "qrlsuite.plugins.algorithms":
-        others = ("qrlsuite.plugins", "qrlsuite.run", "qrlsuite.cli", "qrlsuite.leaderboard")
-        assert not any(inside(name, others) for name in ours), (
-            "algorithms import neither each other nor a model"
-        )
-    elif inside(module, ("qrlsuite.plugins", "qrlsuite.tasks")):
-        others = ("qrlsuite.run", "qrlsuite.cli", "qrlsuite.leaderboard", "qrlsuite.engine")
-        assert not any(inside(name, others) for name in ours), ours
-    elif inside(module, ("qrlsuite.leaderboard",)):
-        assert not any(inside(name, ("qrlsuite.cli", "qrlsuite.plugins")) for name in ours), ours
-    elif inside(module, ("qrlsuite.cli", "qrlsuite.__main__")):
-        assert not any(inside(name, ("qrlsuite.plugins",)) for name in ours), ours
+    ours, own = rooms_of(used), room(module)
+    foreign = {name.partition(".")[0] for name in used} - {"qrlsuite"} - set(sys.stdlib_module_names)
+    if own in ("plugins", "tasks"):  # tasks come with their environments
+        upward = {name for name, where in ours.items() if where not in (*PLUGINS_MAY, "plugins")}
+    elif own == "statistics" or module == "qrlsuite.circuit.description":
+        upward = {name for name, where in ours.items() if where != own and name != "qrlsuite.errors"}
+        assert foreign <= {"numpy", "scipy"}, f"{module} imports {foreign}"
     else:
-        assert not any(inside(name, CORE_MAY_NOT) for name in ours), ours
+        level = LEVELS[own]
+        upward = {name for name, where in ours.items() if where != own and LEVELS.get(where, 99) >= level}
+    assert not upward, f"{module} (in {own}) imports upward: {sorted(upward)}"
+
+
+def test_algorithms_import_neither_each_other_nor_a_model() -> None:
+    for module, path in ALL.items():
+        if module.startswith("qrlsuite.plugins.algorithms."):
+            assert not [name for name in imports(path, module) if name.startswith("qrlsuite.plugins")], module
+
+
+def test_the_top_level_holds_what_plugins_and_users_import() -> None:
+    files = {path.stem for path in FOLDERS["qrlsuite"].glob("*.py")} - {"__init__", "__main__", "api"}
+    assert files == TOP
 
 
 def test_the_package_list_names_every_folder() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from qrlsuite import compatibility, registry, specs
+from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
 
@@ -130,17 +130,17 @@ def test_the_versions_that_a_distribution_requires(
 ) -> None:
     found = distribution(tmp_path, requires)
     if fits:
-        compatibility.check(found, version)
+        registry.check_version(found, version)
     else:
         with pytest.raises(
             PluginError, match=r"'acme' 2.5 requires qrlsuite.*, and this is qrlsuite 0\..*pip install"
         ):
-            compatibility.check(found, version)
+            registry.check_version(found, version)
 
 
 def test_a_requirement_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(PluginError, match="distribution 'acme' requires 'qrlsuite>>1', which cannot be read"):
-        compatibility.required(distribution(tmp_path, ["qrlsuite>>1"]))
+        registry.required_versions(distribution(tmp_path, ["qrlsuite>>1"]))
 
 
 def distribution(folder: Path, requires: list[str]) -> metadata.Distribution:

@@ -44,7 +44,7 @@ def verify(
 
     from qrlsuite.leaderboard import published
     from qrlsuite.leaderboard import verify as checks
-    from qrlsuite.training.group import Progress as RunProgress
+    from qrlsuite.results.progress import Progress as RunProgress
 
     folders = [folder for path in paths or [published.SHIPPED] for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice

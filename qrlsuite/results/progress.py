@@ -1,0 +1,75 @@
+"""Where a group of seeds stands: written by its worker, read by any display."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qrlsuite.errors import StoreError
+from qrlsuite.results.store import EntryStore, write_atomically
+
+
+@dataclass
+class Progress:
+    """Where a group stands: what a progress display shows."""
+
+    phase: str = "starting"
+    epoch: int = 0
+    epochs: int = 0
+    done: int = 0
+    """Rounds of the current phase done so far."""
+    total: int = 0
+    """Rounds of the current phase, 0 where unknown."""
+    median_score: float | None = None
+    seed_scores: list[float] = field(default_factory=list)
+    """Each seed's score after `epoch`, for a median over all groups."""
+    epoch_seconds: float | None = None
+    warnings: list[str] = field(default_factory=list)
+    """What the user should know although nothing failed: a tracker that was left out."""
+
+
+class ProgressFile:
+    """A group's progress on disk: written by its worker at most twice a second, read by any display."""
+
+    def __init__(self, store: EntryStore, group: str) -> None:
+        self.path = store.groups / group / "progress.json"
+        self._written = 0.0
+
+    def write(self, progress: Progress, error: str | None = None, force: bool = False) -> None:
+        """Write the progress, unless it was just written."""
+        now = time.monotonic()
+        if not force and now - self._written < 0.5:
+            return
+        self._written = now
+        content = json.dumps({**asdict(progress), "error": error}).encode()
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = self.path.with_suffix(".tmp")
+            temporary.write_bytes(content)
+            temporary.replace(self.path)
+        except OSError:
+            if force:
+                write_atomically(self.path, content)  # raises the clear error
+
+    def read(self) -> dict[str, Any]:
+        """Return the last progress written, empty where there is none."""
+        return read_progress(self.path)
+
+    def clear(self) -> None:
+        """Forget an earlier attempt's progress."""
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"cannot write {self.path}: {error.strerror or error}") from None
+
+
+def read_progress(path: Path) -> dict[str, Any]:
+    """Read a progress file; empty where it is missing or damaged."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
