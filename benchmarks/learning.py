@@ -40,7 +40,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.seeding import Streams
 from qrlsuite.specs import resolve as reference
-from qrlsuite.training.group import ModelBuilder, build_envs
+from qrlsuite.training.trainer import ModelBuilder, build_envs
 
 FloatArray = NDArray[np.float64]
 Act = Callable[[NDArray[np.float32]], NDArray[np.int64]]

@@ -24,12 +24,19 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from qrlsuite.training.group import GroupRun
+from qrlsuite.training.trainer import Trainer
 
-STEPS = {"record": "_record", "capture": "_capture", "save": "_save", "finish": "_finish"}
+STEPS = {
+    "epoch": (Trainer, "train_epoch"),
+    "record": (GroupRun, "_record"),
+    "capture": (Trainer, "capture"),
+    "save": (GroupRun, "_save"),
+    "finish": (GroupRun, "_finish"),
+}
 
 
 def clocked(seconds: dict[str, list[float]], name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    def step(self: GroupRun, *arguments: Any) -> Any:
+    def step(self: Any, *arguments: Any) -> Any:
         began = time.process_time()
         try:
             return method(self, *arguments)
@@ -42,8 +49,8 @@ def clocked(seconds: dict[str, list[float]], name: str, method: Callable[..., An
 def measure(task: str, seeds: int, epochs: int, runs: Path) -> dict[str, Any]:
     """Train and return seconds per step, shares and sizes."""
     seconds: dict[str, list[float]] = defaultdict(list)
-    for name, method in {"epoch": "_one_epoch", **STEPS}.items():
-        setattr(GroupRun, method, clocked(seconds, name, getattr(GroupRun, method)))
+    for name, (owner, method) in STEPS.items():
+        setattr(owner, method, clocked(seconds, name, getattr(owner, method)))
     store = EntryStore.create(runs, resolve(task, "mlp"))
     began = time.process_time()
     GroupRun(store.entry(), store, range(seeds), epochs).run()

@@ -23,7 +23,7 @@ from qrlsuite.options import parse_setting
 from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.seeding import Streams
 from qrlsuite.specs import resolve as reference
-from qrlsuite.training.group import ModelBuilder, build_envs
+from qrlsuite.training.trainer import ModelBuilder, build_envs
 
 BATCH = 64
 

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results.store import EntryStore
-from qrlsuite.training.group import GroupRun
+from qrlsuite.training.trainer import Trainer
 
 CHUNK = 25
 """Seeds at a time: memory stays that of a small group."""
@@ -58,13 +56,12 @@ def fingerprint(entry: Entry, seeds: Sequence[int]) -> Fingerprint:
 
 
 def _chunk(entry: Entry, seeds: list[int]) -> Fingerprint:
-    group = GroupRun(entry, EntryStore(Path()), seeds, epochs=0)
-    group.begin_episodes()
-    observations, _ = group.envs.reset()
+    trainer = Trainer(entry, seeds)
+    trainer.seed_environments()
+    observations, _ = trainer.envs.reset()
     first = np.asarray(observations, np.float64).reshape(len(seeds), -1)
-    group.begin_episodes()
-    group.algorithm.start()
-    policy = group.algorithm.policy_state()
+    trainer.start()
+    policy = trainer.algorithm.policy_state()
     tensors = [
         np.asarray(policy[name].detach().cpu().numpy(), np.float64).reshape(len(seeds), -1)
         for name in sorted(policy)
@@ -72,7 +69,7 @@ def _chunk(entry: Entry, seeds: list[int]) -> Fingerprint:
     return Fingerprint(
         np.concatenate([_moments(tensor) for tensor in tensors], axis=1),
         _moments(first),
-        group.validate(0).mean(axis=1),
+        trainer.validate(0).mean(axis=1),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.leaderboard.published import Published
 from qrlsuite.results import provenance
 from qrlsuite.results.progress import Progress
-from qrlsuite.results.store import EntryStore
-from qrlsuite.training.group import GroupRun
+from qrlsuite.results.store import learning_curve
+from qrlsuite.training.trainer import Trainer
 
 AGREEMENT = 1e-5
 """How closely the beginnings of runs agree between machines, relative to 1 or the value."""
@@ -147,11 +146,16 @@ def _beginning(entry: Published, made_by: Entry, places: Sequence[int]) -> str |
 def _train(
     made_by: Entry, seeds: Sequence[int], epochs: int, report: Callable[[Progress], None]
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Train seeds from nothing in a temporary folder; returns their curves."""
-    with tempfile.TemporaryDirectory(prefix="qrlsuite-verify-") as temporary:
-        store = EntryStore.create(Path(temporary), made_by)
-        GroupRun(made_by, store, seeds, epochs, report=report).run()
-        return np.stack([store.seed(seed).curve().curve for seed in seeds])
+    """Train seeds from nothing, in memory; returns their curves (seeds, epochs)."""
+    trainer = Trainer(made_by, seeds, report=report)
+    trainer.progress.epochs = epochs
+    trainer.start()
+    curves = []
+    for _ in range(epochs):
+        scores = trainer.train_epoch().scores
+        curves.append(learning_curve(np.asarray(scores, np.float32)))
+        trainer.progress.epoch = trainer.epoch
+    return np.stack(curves, axis=1)
 
 
 def _elsewhere(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:

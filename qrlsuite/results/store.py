@@ -161,9 +161,13 @@ def shortest(values: NDArray[Any]) -> list[float]:
     return [float(text) for text in np.asarray(values, np.float32).astype(str).ravel()]
 
 
-def settled(means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round means of float32 scores to 7 decimals: a hundred scores of 0.95 have the mean 0.949999988 before."""
-    return np.round(means, 7)
+def learning_curve(scores: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mean of every epoch's validation scores (..., episodes), rounded to 7 decimals.
+
+    Without the rounding a hundred float32 scores of 0.95 would have the mean 0.949999988, below a threshold of 0.95.
+    """
+    means: NDArray[np.float64] = np.round(np.asarray(scores, np.float64).mean(axis=-1), 7)
+    return means
 
 
 @dataclass(frozen=True)
@@ -176,8 +180,8 @@ class SeedCurve:
 
     @property
     def curve(self) -> NDArray[np.float64]:
-        """The learning curve V_1..V_T (T,): the mean score of every epoch's validation, see `settled`."""
-        return settled(np.asarray(self.scores, np.float64).mean(axis=1))
+        """The learning curve V_1..V_T (T,): the mean score of every epoch's validation, see `learning_curve`."""
+        return learning_curve(self.scores)
 
 
 class SeedStore:

@@ -16,7 +16,7 @@ def parameters(entry: Entry) -> int:
     import torch
 
     from qrlsuite import population, specs
-    from qrlsuite.training.group import build_envs
+    from qrlsuite.training.trainer import build_envs
 
     envs = build_envs(entry, 1, lambda: None)
     inputs = int(np.prod(envs.single_observation_space.shape or (1,)))

@@ -80,7 +80,7 @@ def _ranking(task: Task) -> None:
 
 def _scores(task: Task) -> None:
     from qrlsuite.experiment.entry import Entry
-    from qrlsuite.training.group import build_envs
+    from qrlsuite.training.trainer import build_envs
 
     known = registry.load().entries
     algorithm, model = (

@@ -18,20 +18,17 @@ from numpy.typing import NDArray
 
 from qrlsuite import specs
 from qrlsuite.environment import LaneEnv
-from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, StoreError
+from qrlsuite.errors import OptionError, PluginError, StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.store import EntryStore, SeedStore
 from qrlsuite.seeding import Streams
-from qrlsuite.training.group import MAX_EPISODE_STEPS, ModelBuilder, build_envs
-from qrlsuite.training.standardization import RunningStatistics
+from qrlsuite.training.trainer import Policy, Trainer, build_envs, play_episodes
 
 LANES = 100
 """Episodes of a policy that are played side by side."""
 PERCENTILES = (5, 25, 50, 75, 95)
 
 FloatArray = NDArray[np.float64]
-Policy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
-"""Maps observations (L, ...) of all lanes to actions (L,)."""
 Report = Callable[[str, int, int], None]
 """Called with a policy's name, the steps played and the steps of a round before, for a progress display."""
 
@@ -161,69 +158,39 @@ def parameters(folder: SeedStore) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-class Agents:
-    """Trained agents of an entry as one population.
-
-    Parameters
-    ----------
-    entry, store:
-        The entry and its folder.
-    seeds:
-        Finished runs.
+def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> Trainer:
+    """Return finished runs of an entry with their trained parameters, as one population that can act.
 
     Raises
     ------
     StoreError
         If a run has no parameters, or they are not those of the entry's model.
     """
-
-    def __init__(self, entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> None:
-        torch.set_num_threads(1)
-        stored = [parameters(store.seed(seed)) for seed in seeds]
-        self.seeds = list(seeds)
-        streams = [Streams(entry.task.hash, seed) for seed in seeds]
-        envs = build_envs(entry, len(self.seeds), lambda: None)
-        size = int(np.prod(envs.single_observation_space.shape or (1,)))
-        place = torch.device(device)
-        self.statistics: RunningStatistics | None = None
-        if envs.inner.running_statistics:
-            self.statistics = RunningStatistics(len(self.seeds), 1, size, place)
-        models = ModelBuilder(entry, size, streams, self.statistics)
-        factory = specs.resolve(entry.algorithm.factory)
-        self.algorithm = factory(envs, models, entry.algorithm_options, streams, place)
-        self._load(store, stored)
-
-    def _load(self, store: EntryStore, stored: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-        own: dict[str, torch.Tensor] = dict(self.algorithm.policy_state())
-        if self.statistics is not None:
-            own |= self.statistics.published()
-        for seed, arrays in zip(self.seeds, stored):
-            problem = _misfit({name: value[0] for name, value in own.items()}, arrays)
-            if problem:
-                raise StoreError(
-                    f"{store.seed(seed).path / 'final.safetensors'} does not fit the entry's model: {problem}"
-                )
-        with torch.no_grad():
-            for name, value in own.items():
-                together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
-                value.copy_(together.reshape(value.shape))
-        if self.statistics is not None:
-            self.statistics.refresh()
-        for name, loaded in self.algorithm.policy_state().items():
-            value = own[name]
-            if not torch.equal(value.cpu(), loaded.cpu()) and not bool(torch.isnan(value).any()):
-                raise PluginError(
-                    f"algorithm '{type(self.algorithm).__name__}': policy_state() returns copies; it has to return "
-                    "the tensors that act() uses, into which trained parameters are loaded"
-                )
-
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the actions that validation would take (P * L,) for seed-major observations (P * L, ...)."""
-        population = np.ascontiguousarray(observations, np.float32).reshape(
-            len(self.seeds), len(observations) // len(self.seeds), -1
-        )
-        actions: NDArray[np.int64] = self.algorithm.act(population).reshape(-1)
-        return actions
+    stored = [parameters(store.seed(seed)) for seed in seeds]
+    trainer = Trainer(entry, seeds, device)
+    own: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())
+    if trainer.statistics is not None:
+        own |= trainer.statistics.published()
+    for seed, arrays in zip(seeds, stored):
+        problem = _misfit({name: value[0] for name, value in own.items()}, arrays)
+        if problem:
+            raise StoreError(
+                f"{store.seed(seed).path / 'final.safetensors'} does not fit the entry's model: {problem}"
+            )
+    with torch.no_grad():
+        for name, value in own.items():
+            together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
+            value.copy_(together.reshape(value.shape))
+    if trainer.statistics is not None:
+        trainer.statistics.refresh()
+    for name, loaded in trainer.algorithm.policy_state().items():
+        value = own[name]
+        if not torch.equal(value.cpu(), loaded.cpu()) and not bool(torch.isnan(value).any()):
+            raise PluginError(
+                f"algorithm '{type(trainer.algorithm).__name__}': policy_state() returns copies; it has to return "
+                "the tensors that act() uses, into which trained parameters are loaded"
+            )
+    return trainer
 
 
 def _misfit(own: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[Any]]) -> str | None:
@@ -277,7 +244,7 @@ def trained(
         )
     entry = store.entry()
     seeds, validation, runs = best_runs(store, best)
-    agents = Agents(entry, store, seeds, device)
+    agents = trained_agents(entry, store, seeds, device)
     returns, scores = play(
         entry, len(seeds), episodes, seed, lambda envs, block: agents.act, entry.label, report
     )
@@ -384,31 +351,10 @@ def play(
         keys = range(columns.start, columns.stop)
         envs.seed_lanes([streams.numpy("evaluation", key) for _ in range(agents) for key in keys])
         report(name, block * lanes * agents, episodes * agents)
-        ended = _round(entry, envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
-        returns[:, columns], scores[:, columns] = (values.reshape(agents, lanes) for values in ended)
+        ended = play_episodes(envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
+        returns[:, columns] = ended.returns.reshape(agents, lanes)
+        scores[:, columns] = ended.scores.reshape(agents, lanes)
     report(name, episodes * agents, episodes * agents)
     section = entry.task.file.score
     known = section.source == "info" or section.max_return is not None
     return returns[:, :episodes].copy(), scores[:, :episodes].copy() if known else None
-
-
-def _round(entry: Entry, envs: Any, begin: Callable[[], Policy]) -> tuple[FloatArray, FloatArray]:
-    """Play one episode in every lane; returns returns and scores (L,)."""
-    observations, _ = envs.reset()
-    envs.take_finished()
-    policy = begin()
-    returns, scores = (np.full(envs.num_envs, np.nan) for _ in range(2))
-    still = np.ones(envs.num_envs, dtype=np.bool_)
-    for _ in range(MAX_EPISODE_STEPS):
-        observations, _, terminated, truncated, _ = envs.step(policy(observations))
-        if (terminated | truncated).any():
-            lanes, sums, given = envs.take_finished()
-            first = still[lanes]
-            returns[lanes[first]], scores[lanes[first]] = sums[first], given[first]
-            still[lanes] = False
-            if not still.any():
-                return returns, scores
-    raise EnvironmentFailure(
-        f"environment '{entry.task.environment.name}': an episode did not end within {MAX_EPISODE_STEPS} steps; "
-        "give it a time limit"
-    )

@@ -55,7 +55,7 @@ def test_random_actions_earn_what_the_tables_say(tiny_task: str) -> None:
     """The mean over antennas of every intensity is what uniformly random actions expect."""
     entry = resolve(tiny_task, "mlp")
     *_, random = evaluation.references(entry, episodes=300)
-    from qrlsuite.training.group import build_envs
+    from qrlsuite.training.trainer import build_envs
 
     envs = build_envs(entry, 300, lambda: None)
     envs.seed_lanes([Streams(entry.task.hash, 0).numpy("evaluation", key) for key in range(300)])
@@ -110,11 +110,11 @@ def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Callab
 
 def test_loaded_agents_are_the_trained_ones(train: Callable[..., Path]) -> None:
     """On the validation's own episodes, a loaded agent repeats the last validation scores bit by bit."""
-    from qrlsuite.training.group import build_envs
+    from qrlsuite.training.trainer import build_envs
 
     store = EntryStore(train("runs", [0, 1], 2))
     entry = store.entry()
-    agents = evaluation.Agents(entry, store, [0, 1])
+    agents = evaluation.trained_agents(entry, store, [0, 1])
     envs = build_envs(entry, 2 * 5, lambda: None)
     envs.seed_lanes([Streams(entry.task.hash, seed).numpy("validation", 2) for seed in (0, 1)])
     observations, _ = envs.reset()

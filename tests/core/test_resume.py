@@ -16,6 +16,7 @@ import pytest
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
+from qrlsuite.training.trainer import Trainer
 from tests.conftest import results
 
 EPOCHS = 6
@@ -29,14 +30,14 @@ def frequent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
     """Raise KeyboardInterrupt, as Ctrl-C does, in the middle of an epoch's validation."""
-    original = group.GroupRun.validate
+    original = Trainer._validate
 
-    def validate(self: group.GroupRun, number: int) -> object:
+    def validate(self: Trainer, number: int) -> object:
         if number == epoch:
             raise KeyboardInterrupt
         return original(self, number)
 
-    monkeypatch.setattr(group.GroupRun, "validate", validate)
+    monkeypatch.setattr(Trainer, "_validate", validate)
 
 
 @pytest.mark.parametrize("model", ["mlp", "vqc-native"])
@@ -100,7 +101,7 @@ def test_sigkill_at_random_moments(train: Callable[..., Path], tmp_path: Path) -
     """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
     straight = train("straight", [0, 1, 2], 12)
     entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
-    command = [sys.executable, "-c", "from qrlsuite import run; run.CHECKPOINT_SECONDS = 0.0\n"]
+    command = [sys.executable, "-c", "from qrlsuite.training import group; group.CHECKPOINT_SECONDS = 0.0\n"]
     command[-1] += "from qrlsuite.engine import worker; raise SystemExit(worker.main())"
     command += [str(entry), "--seeds", "0:3", "--epochs", "12"]
     dice = random.Random(1)

@@ -21,8 +21,9 @@ from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation, group
-from qrlsuite.training.group import GroupRun, build_envs
+from qrlsuite.training.group import GroupRun
 from qrlsuite.training.standardization import PREFIX, RunningStatistics
+from qrlsuite.training.trainer import Trainer, build_envs
 from tests.conftest import POLE
 
 STANDARDIZED = POLE.replace("steps = 30", 'steps = 30\nnormalization = "running"')
@@ -65,7 +66,7 @@ def results(folder: Path, seed: int) -> tuple[list[dict[str, Any]], bytes]:
     return store.epochs(), (store.path / "final.safetensors").read_bytes()
 
 
-def recorded(group: GroupRun) -> list[NDArray[np.float32]]:
+def recorded(group: Trainer) -> list[NDArray[np.float32]]:
     """Return a list to which every training step will append the observations (S, E, 4) that it returns."""
     seen: list[NDArray[np.float32]] = []
     step = group.envs.inner.step
@@ -79,14 +80,13 @@ def recorded(group: GroupRun) -> list[NDArray[np.float32]]:
     return seen
 
 
-def start(entry: Entry, seeds: Sequence[int]) -> GroupRun:
-    group = GroupRun(entry, EntryStore(Path()), seeds, epochs=0)
-    group.begin_episodes()
-    group.algorithm.start()
-    return group
+def start(entry: Entry, seeds: Sequence[int]) -> Trainer:
+    trainer = Trainer(entry, seeds)
+    trainer.start()
+    return trainer
 
 
-def statistics_of(group: GroupRun) -> RunningStatistics:
+def statistics_of(group: Trainer) -> RunningStatistics:
     assert group.statistics is not None
     return group.statistics
 
@@ -98,7 +98,7 @@ def test_networks_standardize_by_mean_and_variance_of_all_earlier_epochs(
     group = start(entry(algorithm), [0, 1, 2])
     used, seen = statistics_of(group).used, recorded(group)
     for epoch in range(4):
-        group._one_epoch()
+        group.train_epoch()
         assert len(seen) == 15 * (epoch + 1)
         if epoch == 0:
             assert torch.equal(used["mean"], torch.zeros(3, 4, dtype=torch.float64))
@@ -138,7 +138,7 @@ def test_every_model_is_given_clipped_standardized_observations(
 def test_a_copied_network_uses_the_statistics_of_the_original(entry: Callable[..., Entry]) -> None:
     group = start(entry("ddqn"), [0, 1])
     copied = copy.deepcopy(group.models.built[0])
-    group._one_epoch()
+    group.train_epoch()
     statistics_of(group).adopt()
     x = torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(0))
     copied.load_state_dict(group.models.built[0].state_dict())
@@ -150,7 +150,7 @@ def test_a_copied_network_uses_the_statistics_of_the_original(entry: Callable[..
 def test_validation_uses_the_statistics_and_leaves_them(entry: Callable[..., Entry]) -> None:
     group = start(entry("ppo"), [0, 1])
     for _ in range(2):
-        group._one_epoch()
+        group.train_epoch()
     before = statistics_of(group).state_dict()
     group.validate(7)
     after = statistics_of(group).state_dict()
@@ -162,7 +162,7 @@ def test_ppo_learns_from_the_log_probabilities_of_the_policy_that_acted(entry: C
     """One pass in one minibatch moves nothing before its loss is taken: the divergence must be nil."""
     group = start(entry("ppo", "mlp", ("width=16", "repeats=1", "batch=60")), [0, 1])
     for _ in range(3):
-        metrics, *_ = group._one_epoch()
+        metrics = group.train_epoch().metrics
         assert np.abs(metrics["kl"]).max() < 1e-6
 
 
@@ -213,15 +213,15 @@ def test_interrupted_split_and_resumed_equals_undisturbed(
 ) -> None:
     agent = (algorithm, model, settings)
     straight = train("straight", [0, 1], agent, 4)
-    original = GroupRun.validate
+    original = Trainer._validate
 
-    def stop(self: GroupRun, epoch: int) -> Any:
+    def stop(self: Trainer, epoch: int) -> Any:
         if epoch == 3:
             raise KeyboardInterrupt
         return original(self, epoch)
 
     with monkeypatch.context() as patch:
-        patch.setattr(GroupRun, "validate", stop)
+        patch.setattr(Trainer, "_validate", stop)
         with pytest.raises(KeyboardInterrupt):
             train("stopped", [0, 1], agent, 4)
     store = EntryStore(straight.parent.parent.parent / "stopped" / straight.parent.name / straight.name)
@@ -253,7 +253,7 @@ def test_evaluated_agents_are_the_trained_ones(
 ) -> None:
     """On the validation's own episodes they repeat the last scores."""
     store = EntryStore(train("runs", [0, 1], (algorithm, model, settings)))
-    player = evaluation.Agents(store.entry(), store, [0, 1])
+    player = evaluation.trained_agents(store.entry(), store, [0, 1])
     np.testing.assert_array_equal(play(store.entry(), player), last_scores(store))
     assert player.statistics is not None
     assert player.statistics.used["count"].tolist() == [120, 120], "of the first two of three epochs"
@@ -261,7 +261,7 @@ def test_evaluated_agents_are_the_trained_ones(
 
 def test_with_other_statistics_an_agent_is_another(train: Callable[..., Path]) -> None:
     store = EntryStore(train("runs", [0, 1], AGENTS[1]))
-    player = evaluation.Agents(store.entry(), store, [0, 1])
+    player = evaluation.trained_agents(store.entry(), store, [0, 1])
     assert player.statistics is not None
     player.statistics.used["mean"] += 1.0
     player.statistics.refresh()
@@ -272,7 +272,7 @@ def last_scores(store: EntryStore) -> NDArray[np.float32]:
     return np.stack([store.seed(seed).curve().scores[-1] for seed in (0, 1)])
 
 
-def play(entry: Entry, player: evaluation.Agents) -> NDArray[np.float32]:
+def play(entry: Entry, player: Trainer) -> NDArray[np.float32]:
     """Play the third epoch's validation episodes of two seeds; returns scores (2, 5)."""
     envs = build_envs(entry, 2 * 5, lambda: None)
     envs.inner.autoreset = False
@@ -298,11 +298,11 @@ def test_an_agent_without_its_statistics_is_not_played(train: Callable[..., Path
 
 def test_an_observation_that_is_no_number_fails_the_group(entry: Callable[..., Entry]) -> None:
     group = start(entry("ppo"), [0, 1])
-    group._one_epoch()
+    group.train_epoch()
     before = statistics_of(group).state_dict()
     group.envs.inner.state[2, 3] = np.nan  # type: ignore[attr-defined]
     with pytest.raises(EnvironmentFailure, match=r"'cartpole' failed: .* value nan, .* needs finite ones"):
-        group._one_epoch()
+        group.train_epoch()
     assert np.array_equal(before["mean"], statistics_of(group).state_dict()["mean"])
 
 
@@ -311,4 +311,4 @@ def test_without_the_option_nothing_is_kept(entry: Callable[..., Entry]) -> None
     assert group.statistics is None
     assert group.envs.observe is None
     assert not group.models.built[0]._forward_pre_hooks
-    assert not any(PREFIX in name for name in group._capture())
+    assert not any(PREFIX in name for name in group.capture())

@@ -22,6 +22,7 @@ from qrlsuite.hookspecs import hookimpl
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tasks import variants
 from qrlsuite.training import group
+from qrlsuite.training.trainer import build_envs
 from tests.conftest import results
 from tests.environments.strangers import HERE
 
@@ -296,7 +297,7 @@ def test_a_spec_without_a_vector_form_gets_the_generic_one(
     text = TASK.format(env_id="", arguments="", source="info").replace('name = "gym"', 'name = "walk"')
     text = re.sub(r"id = .*\narguments = .*", "start = 3", text)
     entry = Entry(task.parse(text, "t"), *[None] * 5)  # type: ignore[arg-type]
-    envs = group.build_envs(entry, 4, lambda: None)
+    envs = build_envs(entry, 4, lambda: None)
     assert isinstance(envs.inner, GymLanes)
     assert envs.inner.envs[3].unwrapped.action_space.start == 3  # type: ignore[attr-defined]
     envs.seed_lanes([np.random.default_rng(g) for g in range(4)])

@@ -23,7 +23,7 @@ from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.collect import collect
 from qrlsuite.results import released
 from qrlsuite.results.imports import import_files
-from qrlsuite.results.store import EntryStore, entries, settled
+from qrlsuite.results.store import EntryStore, entries, learning_curve
 
 ROOT = Path(__file__).parents[2]
 
@@ -187,7 +187,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     assert refused == []
     assert found.label == "ddqn hybrid (imported)"
     assert found.parameters == (16, 15)
-    expected = settled(np.float32(content(1)["val_returns"][1:]).astype(np.float64).mean(axis=1))
+    expected = learning_curve(np.float32(content(1)["val_returns"][1:]))
     assert (found.curves[1] == expected).all()
     (store,) = entries(tmp_path / "runs")
     record = store.seed(1).record() or {}

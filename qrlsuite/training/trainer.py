@@ -1,0 +1,396 @@
+"""Training and validating a group of seeds in memory: no files, no claims, no trackers.
+
+A group is one population, trained in one process on one thread. Everything that the rest of its training depends on
+is in `Trainer.capture()` or keyed by the epoch, so that a group captured after any epoch and restored elsewhere ends
+with the same curves and parameters, byte for byte, as one never stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+import qrlsuite
+from qrlsuite import population, specs
+from qrlsuite.environment import LaneEnv
+from qrlsuite.errors import EnvironmentFailure, StoreError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.gymlanes import GymLanes
+from qrlsuite.results.checkpoint import Arrays
+from qrlsuite.results.progress import Progress
+from qrlsuite.seeding import Streams, pack, unpack
+from qrlsuite.training.device import find as find_device
+from qrlsuite.training.metering import MeteredEnv
+from qrlsuite.training.standardization import PREFIX, RunningStatistics
+
+MAX_EPISODE_STEPS = 100_000
+"""An episode that has not ended after so many steps is an error, not an endless loop."""
+
+Floats = NDArray[np.float64]
+Policy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
+"""Maps observations (lanes, ...) to actions (lanes,)."""
+
+Report = Callable[[Progress], None]
+
+
+def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
+    """Build the task's environment with a number of lanes."""
+    spec = entry.task.environment
+    given = entry.task.environment_options
+    inner: LaneEnv
+    if spec.vector is not None:
+        inner = specs.resolve(spec.vector)(given, lanes)
+    else:
+        qrlsuite.register_environments()
+        inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(given))
+    return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """One complete episode of every lane.
+
+    Attributes
+    ----------
+    returns, scores:
+        Sums of rewards and scores (lanes,).
+    lengths:
+        Steps of each lane's episode (lanes,).
+    rounds:
+        Steps that every lane made: all lanes go on until the last episode has ended.
+    """
+
+    returns: Floats
+    scores: Floats
+    lengths: NDArray[np.int64]
+    rounds: int
+
+
+def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
+    """Play one episode in every lane.
+
+    Parameters
+    ----------
+    envs:
+        Lanes whose streams are set, with `autoreset` off.
+    begin:
+        Called after the reset; returns the policy.
+
+    Raises
+    ------
+    EnvironmentFailure
+        If the environment fails, or an episode does not end within `MAX_EPISODE_STEPS`.
+    """
+    envs.take_finished()
+    observations, _ = envs.reset()
+    policy = begin()
+    returns, scores = (np.full(envs.num_envs, np.nan) for _ in range(2))
+    lengths = np.zeros(envs.num_envs, np.int64)
+    unfinished = np.ones(envs.num_envs, dtype=np.bool_)
+    for played in range(1, MAX_EPISODE_STEPS + 1):
+        observations, _, terminated, truncated, _ = envs.step(policy(observations))
+        if not (terminated | truncated).any():
+            continue
+        lanes, sums, given = envs.take_finished()
+        first = lanes[unfinished[lanes]]
+        returns[first], scores[first] = sums[unfinished[lanes]], given[unfinished[lanes]]
+        lengths[first] = played
+        unfinished[lanes] = False
+        if not unfinished.any():
+            return Episodes(returns, scores, lengths, played)
+    raise EnvironmentFailure(
+        f"environment '{envs.environment_name}': an episode did not end within {MAX_EPISODE_STEPS} steps; "
+        "give it a time limit"
+    )
+
+
+class ModelBuilder:
+    """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
+
+    With `statistics`, all of them standardize their observations by these.
+    """
+
+    def __init__(
+        self,
+        entry: Entry,
+        observation_size: int,
+        streams: Sequence[Streams],
+        statistics: RunningStatistics | None = None,
+    ) -> None:
+        self.entry = entry
+        self.observation_size = observation_size
+        self.streams = streams
+        self.statistics = statistics
+        self.built: list[nn.Module] = []
+        self.parameters: list[tuple[int, int]] = []
+
+    def __call__(self, out_dim: int) -> nn.Module:
+        """Return a population of freshly initialized agents."""
+        spec, given = self.entry.model, self.entry.model_options
+        build = specs.resolve(spec.build)
+        call = len(self.built)
+        agents = [
+            build(self.observation_size, out_dim, given, streams.torch("init", call))
+            for streams in self.streams
+        ]
+        self.parameters.append(population.count_parameters(agents[0]))
+        if spec.population is None:
+            together = population.stack(agents)
+        else:
+            together = specs.resolve(spec.population)(agents, given)
+        if self.statistics is not None:
+            self.statistics.attach(together)
+        self.built.append(together)
+        return together
+
+    def executions(self) -> dict[str, int]:
+        """Return each agent's circuit executions so far, summed over its networks; empty without circuits."""
+        total: dict[str, int] = {}
+        for module in self.built:
+            counter = getattr(module, "executions", None)
+            if counter is not None:
+                for name, count in counter.as_dict().items():
+                    total[name] = total.get(name, 0) + int(count)
+        return total
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One epoch of S seeds.
+
+    Attributes
+    ----------
+    number:
+        1 for the first.
+    metrics:
+        The algorithm's, and mean return and score of the training episodes that ended, (S,) each; NaN where there
+        was none.
+    scores:
+        Validation scores (S, episodes).
+    executions:
+        Circuit executions of each seed by name, validation included; empty without circuits.
+    seconds:
+        Wall time of training and validation, and on a processor its time, of the whole group.
+    """
+
+    number: int
+    metrics: dict[str, Floats]
+    scores: Floats
+    executions: list[dict[str, int]]
+    seconds: dict[str, float]
+
+
+class Trainer:
+    """S seeds of an entry, trained together and validated after every epoch.
+
+    Begin with `start()` or `restore(...)`; then each `train_epoch()` adds one.
+
+    Parameters
+    ----------
+    entry:
+        What is trained.
+    seeds:
+        S seeds, all at the same epoch.
+    device:
+        Where the populations live: `cpu`, `cuda` or `cuda:1`.
+    report:
+        Called after every round with the group's progress.
+
+    Attributes
+    ----------
+    epoch:
+        Epochs finished.
+    algorithm:
+        The learning algorithm, see `qrlsuite.algorithm.Algorithm`.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the entry cannot be built, or there is no such device.
+    """
+
+    def __init__(
+        self,
+        entry: Entry,
+        seeds: Sequence[int],
+        device: str = "cpu",
+        report: Report = lambda progress: None,
+    ) -> None:
+        torch.set_num_threads(1)
+        self.entry, self.seeds, self.device, self.report = entry, list(seeds), device, report
+        self.progress = Progress()
+        self.epoch = 0
+        protocol = entry.task.file.protocol
+        self.S, self.E, self.V = len(self.seeds), protocol.environments, protocol.validation_episodes
+        self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
+        self.envs = build_envs(entry, self.S * self.E, self._tick)
+        size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
+        found = find_device(device)
+        self.statistics: RunningStatistics | None = None
+        if self.envs.inner.running_statistics:
+            self.statistics = RunningStatistics(self.S, self.E, size, found)
+            self.envs.observe = self.statistics.observe
+        self.models = ModelBuilder(entry, size, self.streams, self.statistics)
+        factory = specs.resolve(entry.algorithm.factory)
+        self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, found)
+
+    @functools.cached_property
+    def validation(self) -> MeteredEnv:
+        """The validation's lanes, built when first needed: trained agents are also played without them."""
+        envs = build_envs(self.entry, self.S * self.V, self._tick)
+        envs.inner.autoreset = False
+        return envs
+
+    def start(self) -> None:
+        """Begin at epoch 0: every training environment gets the stream that its seed and place determine."""
+        self.seed_environments()
+        self.algorithm.start()
+
+    def seed_environments(self) -> None:
+        """Give every training environment its stream of epoch 0, from the beginning."""
+        self.envs.seed_lanes([s.numpy("environment", lane) for s in self.streams for lane in range(self.E)])
+
+    def train_epoch(self) -> Epoch:
+        """Train and validate one epoch.
+
+        Raises
+        ------
+        EnvironmentFailure
+            If the environment fails, or a score cannot be ranked.
+        """
+        before = self.models.executions()
+        started, processor = time.perf_counter(), time.process_time()
+        rounds = self.entry.task.file.protocol.rounds
+        self._phase("training", rounds)
+        if self.statistics is not None:
+            self.statistics.adopt()
+        metrics = dict(self.algorithm.train_epoch(rounds))
+        metrics["train_return"], metrics["train_score"] = self._training_episodes()
+        trained, between = time.perf_counter(), self.models.executions()
+        episodes = self._validate(self.epoch + 1)
+        finished, after = time.perf_counter(), self.models.executions()
+        own_steps, played = episodes.lengths.reshape(self.S, self.V).sum(1), episodes.rounds * self.V
+        executions = [
+            {
+                name: between[name] - before.get(name, 0) + (after[name] - between[name]) * steps // played
+                for name in between
+            }
+            for steps in own_steps.tolist()
+        ]
+        self.progress.epoch_seconds = finished - started
+        seconds = {"train": trained - started, "validate": finished - trained}
+        if self.device == "cpu":
+            seconds["cpu"] = time.process_time() - processor
+        self.epoch += 1
+        return Epoch(self.epoch, metrics, episodes.scores.reshape(self.S, self.V), executions, seconds)
+
+    def validate(self, epoch: int) -> Floats:
+        """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V).
+
+        Circuit executions are counted by each seed's own steps, and the models' buffers, such as how many passes with
+        shots there were, are left as they were: neither depends on the company that a seed is trained in.
+        """
+        return self._validate(epoch).scores.reshape(self.S, self.V)
+
+    def capture(self) -> Arrays:
+        """Return a copy of everything that the rest of the training depends on, seed-first, by name."""
+        arrays = {
+            f"algorithm.{k}": v.detach().cpu().numpy().copy() for k, v in self.algorithm.state_dict().items()
+        }
+        for name, array in self.envs.state_dict().items():
+            arrays[f"environment.{name}"] = array.reshape(self.S, self.E, *array.shape[1:]).copy()
+        arrays["streams"] = pack(self.envs.inner.streams).reshape(self.S, self.E, -1)
+        if self.statistics is not None:
+            arrays |= {f"{PREFIX}{name}": array for name, array in self.statistics.state_dict().items()}
+        return arrays
+
+    def restore(self, epoch: int, arrays: Arrays) -> None:
+        """Continue after an epoch, from what `capture` returned then.
+
+        Raises
+        ------
+        StoreError
+            If the arrays do not fit this entry.
+        """
+        try:
+            self.envs.inner.seed_lanes(unpack(arrays["streams"].reshape(self.S * self.E, -1)))
+            lanes = {
+                name: array.reshape(self.S * self.E, *array.shape[2:])
+                for name, array in _part(arrays, "environment.").items()
+            }
+            self.envs.load_state_dict(lanes)
+            state = _part(arrays, "algorithm.")
+            self.algorithm.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in state.items()})
+            if self.statistics is not None:
+                self.statistics.load_state_dict(_part(arrays, PREFIX))
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise StoreError(f"the checkpoint does not fit this version: {error}") from error
+        self.epoch = epoch
+
+    def policy(self) -> Arrays:
+        """Return the parameters of the trained agents, seed-first, by name: what is published of them."""
+        tensors = self.algorithm.policy_state()
+        if self.statistics is not None:
+            tensors = {**tensors, **self.statistics.published()}
+        return {name: value.detach().cpu().numpy() for name, value in tensors.items()}
+
+    def _tick(self) -> None:
+        self.progress.done += 1
+        self.report(self.progress)
+
+    def _phase(self, name: str, total: int) -> None:
+        self.progress.phase, self.progress.done, self.progress.total = name, 0, total
+        self.report(self.progress)
+
+    def _training_episodes(self) -> tuple[Floats, Floats]:
+        """Return mean return and score (S,) of the training episodes that ended in this epoch; NaN without any."""
+        lanes, returns, scores = self.envs.take_finished()
+        owners = lanes // self.E
+        counts = np.bincount(owners, minlength=self.S)
+        with np.errstate(invalid="ignore"):
+            means = [
+                np.bincount(owners, weights=values, minlength=self.S) / counts for values in (returns, scores)
+            ]
+        return means[0], means[1]
+
+    def _validate(self, epoch: int) -> Episodes:
+        buffers = [buffer for model in self.models.built for buffer in model.buffers()]
+        before = [buffer.clone() for buffer in buffers]
+        self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
+        self.validation.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
+        try:
+            episodes = play_episodes(self.validation, lambda: self.act)
+        finally:
+            with torch.no_grad():
+                for buffer, value in zip(buffers, before):
+                    buffer.copy_(value)
+        self._require_scores(episodes.scores)
+        return episodes
+
+    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the greedy actions (S * L,) for observations (S * L, ...) of seed-major lanes."""
+        stacked = np.ascontiguousarray(observations, np.float32)
+        actions: NDArray[np.int64] = self.algorithm.act(stacked.reshape(self.S, len(stacked) // self.S, -1))
+        return actions.reshape(-1)
+
+    def _require_scores(self, scores: Floats) -> None:
+        """Refuse scores that no leaderboard would rank now, not after hours."""
+        outside = scores[(scores < 0) | (scores > 1 + 1e-9)]
+        if self.entry.task.file.ranking.thresholds is None and outside.size:
+            raise EnvironmentFailure(
+                f"environment '{self.entry.task.environment.name}': a validation episode has the score {outside[0]:g}, "
+                "outside [0, 1]: is score.max_return in the task file the best possible return, and none negative?"
+            )
+
+
+def _part(arrays: Arrays, prefix: str) -> Arrays:
+    """Return the arrays under a prefix, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
