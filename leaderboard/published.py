@@ -28,7 +28,7 @@ from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard.collect import EntryCurves, current, require_scores
 from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
-from qrlsuite.results.store import EntryStore, settled
+from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
 SHIPPED = Path(__file__).parent / "entries"
@@ -280,7 +280,7 @@ def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray
             f"seed {seed} has {count} of {length} epochs: some are missing",
         )
     require_scores(scores, task_file, folder)
-    return tuple(int(seed) for seed in seeds), settled(scores[order].reshape(len(seeds), length))
+    return tuple(int(seed) for seed in seeds), round_means(scores[order].reshape(len(seeds), length))
 
 
 def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:

@@ -162,12 +162,13 @@ def shortest(values: NDArray[Any]) -> list[float]:
 
 
 def learning_curve(scores: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the mean of every epoch's validation scores (..., episodes), rounded to 7 decimals.
+    """Return the mean of every epoch's validation scores (..., episodes), rounded by `round_means`."""
+    return round_means(np.asarray(scores, np.float64).mean(axis=-1))
 
-    Without the rounding a hundred float32 scores of 0.95 would have the mean 0.949999988, below a threshold of 0.95.
-    """
-    means: NDArray[np.float64] = np.round(np.asarray(scores, np.float64).mean(axis=-1), 7)
-    return means
+
+def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round means of float32 scores to 7 decimals: a hundred scores of 0.95 have the mean 0.949999988 before."""
+    return np.round(means, 7)
 
 
 @dataclass(frozen=True)

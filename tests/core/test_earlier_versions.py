@@ -17,10 +17,10 @@ import pytest
 from safetensors.numpy import load_file
 
 from qrlsuite.engine.worker import train_group
-from qrlsuite.entry import from_record, resolve
+from qrlsuite.experiment.entry import from_record, resolve
+from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.published import SHIPPED
-from qrlsuite.store import EntryStore, json_line
-from qrlsuite.task import load
+from qrlsuite.results.store import EntryStore, json_line
 from tests.golden.make import EPOCHS, GOLDEN, SEEDS, machine
 
 VERSIONS = sorted(path.parent for path in GOLDEN.glob("v*/hashes.json"))

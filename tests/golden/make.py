@@ -23,14 +23,16 @@ from typing import Any
 import torch
 
 import qrlsuite
-from qrlsuite import provenance, registry
+from qrlsuite import registry
 from qrlsuite.engine.worker import train_group
-from qrlsuite.entry import Entry, resolve
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.published import SHIPPED
 from qrlsuite.options import parse_setting
-from qrlsuite.run import GroupRun, Progress
-from qrlsuite.store import EntryStore, json_line
-from qrlsuite.task import load
+from qrlsuite.results import provenance
+from qrlsuite.results.progress import Progress
+from qrlsuite.results.store import EntryStore, json_line
+from qrlsuite.training.group import GroupRun
 from tests.conftest import POLE, TINY
 
 GOLDEN = Path(__file__).parent
