@@ -32,6 +32,22 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 @hookspec
+def register(register: Callable[[specs.Spec], None]) -> None:
+    """Register anything: the type of a spec says what it is.
+
+    This one hook serves for all of the `register_KIND` hooks below, whose manuals say what each kind needs::
+
+        from qrlsuite import hookimpl
+        from qrlsuite.specs import AnsatzSpec, TaskSpec
+
+        @hookimpl
+        def register(register):
+            register(AnsatzSpec("ring", "RY and a ring", "my_package.ring:Options", "my_package.ring:ring"))
+            register(TaskSpec("short", "A short task", "my_package/short.toml"))
+    """
+
+
+@hookspec
 def register_environments(register: Callable[[specs.EnvironmentSpec], None]) -> None:
     """Register environments: a task file then names one under `[environment]`.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any, cast
@@ -145,11 +145,11 @@ class Registry:
             self.manager.register(plugin, name=name)
             self._know_hooks(plugin)
             others = [p for p in self.manager.get_plugins() if p is not plugin]
-            for kind, expected in KINDS.items():
-                hook = f"register_{kind}"
+            hooks = {"register": KINDS} | {f"register_{kind}": {kind: KINDS[kind]} for kind in KINDS}
+            for hook, kinds in hooks.items():
                 try:
                     self.manager.subset_hook_caller(hook, others)(
-                        register=functools.partial(_collect, handed, kind, expected)
+                        register=functools.partial(_collect, handed, kinds)
                     )
                 except Exception as error:
                     reason = str(error) if isinstance(error, PluginError) else words(error)
@@ -199,11 +199,14 @@ class Registry:
         warnings.warn(problem, PluginWarning, stacklevel=3)
 
 
-def _collect(handed: list[tuple[str, specs.Spec]], kind: str, expected: type[specs.Spec], spec: Any) -> None:
-    """Be the `register` of a hook."""
-    if type(spec) is not expected:
-        raise PluginError(f"register() needs a {expected.__name__}, got {type(spec).__name__}")
-    handed.append((kind, spec))
+def _collect(handed: list[tuple[str, specs.Spec]], kinds: Mapping[str, type[specs.Spec]], spec: Any) -> None:
+    """Collect a spec that a hook registers, under the kind that its type says."""
+    for kind, expected in kinds.items():
+        if type(spec) is expected:
+            handed.append((kind, spec))
+            return
+    wanted = next(iter(kinds.values())).__name__ if len(kinds) == 1 else "spec of `qrlsuite.specs`"
+    raise PluginError(f"register() needs a {wanted}, got {type(spec).__name__}")
 
 
 def _duplicate(kind: str, name: str, owners: list[str]) -> str:

@@ -48,7 +48,9 @@ def load(module: types.ModuleType) -> registry.Registry:
 def test_the_example_in_the_manual_works(hook: str, tmp_path: Path) -> None:
     found = load(example(hook, tmp_path))
     kind = hook.removeprefix("register_")
-    if kind in registry.KINDS:
+    if hook == "register":
+        assert found.plugins[0].registered == {"ansatzes": ["ring"], "tasks": ["short"]}
+    elif kind in registry.KINDS:
         [plugin] = found.plugins
         [name] = plugin.registered[kind]
         assert found.get(kind, name).distribution == "example-dist"
@@ -67,8 +69,19 @@ def test_the_example_in_the_manual_works(hook: str, tmp_path: Path) -> None:
         assert (tmp_path / "notes.txt").read_text().strip()
 
 
+def test_one_hook_takes_every_kind_of_spec_and_nothing_else() -> None:
+    module = types.ModuleType("example_one_hook")
+    module.register = registry.hookspecs.hookimpl(lambda register: register("ring"))  # type: ignore[attr-defined]
+    with pytest.raises(registry.PluginError, match=r"hook 'register': register\(\) needs a spec of"):
+        load(module)
+
+
 def test_every_kind_and_event_has_a_hook() -> None:
-    expected = {f"register_{kind}" for kind in registry.KINDS} | {"register_commands", *trackers.EVENTS}
+    expected = {f"register_{kind}" for kind in registry.KINDS} | {
+        "register",
+        "register_commands",
+        *trackers.EVENTS,
+    }
     assert set(NAMES) == expected
 
 
