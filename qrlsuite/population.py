@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 NARROW = 16
@@ -230,6 +233,12 @@ class Adam:
         for name in self.mean:
             self.mean[name].copy_(state[f"mean.{name}"])
             self.square[name].copy_(state[f"square.{name}"])
+
+
+def by_seed(lanes: NDArray[Any], seeds: int, device: torch.device) -> Tensor:
+    """Return values of seed-major lanes, (S * E, ...) of any type, as float32 of shape (S, E, features)."""
+    values = np.ascontiguousarray(lanes, np.float32)
+    return torch.from_numpy(values).view(seeds, len(values) // seeds, -1).to(device)
 
 
 def prefixed(**parts: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
-from qrlsuite.population import Adam, part, prefixed
+from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
 
 
@@ -82,7 +82,7 @@ class DDQN:
     def start(self) -> None:
         """Reset the environments."""
         first, _ = self.envs.reset()
-        self.observations = self._tensor(first)
+        self.observations = by_seed(first, self.S, self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
@@ -115,8 +115,8 @@ class DDQN:
         """Step every environment once and store the S x E transitions."""
         lanes = actions.reshape(-1).cpu().numpy()
         after, rewards, terminated, _, infos = self.envs.step(lanes)
-        following = self._tensor(after)
-        arrived = self._tensor(infos["final_obs"]) if "final_obs" in infos else following
+        following = by_seed(after, self.S, self.device)
+        arrived = by_seed(infos["final_obs"], self.S, self.device) if "final_obs" in infos else following
         done = infos.get("_final_obs")
         if done is not None:
             mask = torch.from_numpy(np.asarray(done, dtype=bool)).view(self.S, self.E, 1).to(self.device)
@@ -126,8 +126,8 @@ class DDQN:
                 self.observations,
                 arrived,
                 actions[..., None].to(torch.float32),
-                self._scalars(rewards),
-                1.0 - self._scalars(terminated),
+                by_seed(rewards, self.S, self.device),
+                1.0 - by_seed(terminated, self.S, self.device),
             ],
             dim=2,
         )
@@ -169,15 +169,6 @@ class DDQN:
         """Return the greedy actions (S, B) for observations (S, B, obs)."""
         result: NDArray[np.int64] = self._greedy(torch.from_numpy(observations).to(self.device)).cpu().numpy()
         return result
-
-    def _tensor(self, lanes: NDArray[np.float32]) -> Tensor:
-        """Reshape lane-major observations (S * E, ...) to (S, E, obs)."""
-        return (
-            torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
-        )
-
-    def _scalars(self, lanes: NDArray[np.float64] | NDArray[np.bool_]) -> Tensor:
-        return torch.from_numpy(np.asarray(lanes, np.float32)).view(self.S, self.E, 1).to(self.device)
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the online network's parameters and buffers."""

@@ -42,7 +42,7 @@ from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
-from qrlsuite.population import Adam, part, prefixed
+from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
 
 FloatArray = NDArray[np.float64]
@@ -150,7 +150,7 @@ class PPO:
     def start(self) -> None:
         """Reset the environments."""
         first, _ = self.envs.reset()
-        self.observations = self._tensor(first)
+        self.observations = by_seed(first, self.S, self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Collect `rounds` steps of every environment and learn from them.
@@ -211,11 +211,11 @@ class PPO:
             actions[:, k] = (logits[:, k] + gumbel[:, k]).argmax(2)
             lanes = actions[:, k].reshape(-1).cpu().numpy()
             after, reward, terminal, limit, infos = self.envs.step(lanes)
-            self.observations = self._tensor(after)
+            self.observations = by_seed(after, self.S, self.device)
             arrived[:, k] = self.observations
             if "final_obs" in infos:
                 done = torch.from_numpy(np.asarray(infos["_final_obs"], dtype=bool)).view(self.S, self.E, 1)
-                final = self._tensor(infos["final_obs"])
+                final = by_seed(infos["final_obs"], self.S, self.device)
                 arrived[:, k] = torch.where(done.to(self.device), final, self.observations)
             rewards[:, k] = np.reshape(reward, (self.S, self.E))
             terminated[:, k] = np.reshape(terminal, (self.S, self.E))
@@ -306,12 +306,6 @@ class PPO:
             logits = logits + torch.from_numpy(np.stack(noise).astype(np.float32)).to(self.device)
         result: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
         return result
-
-    def _tensor(self, lanes: NDArray[np.float32]) -> Tensor:
-        """Reshape lane-major observations (S * E, ...) to (S, E, obs)."""
-        return (
-            torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
-        )
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the actor's parameters and buffers."""

@@ -41,7 +41,7 @@ from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
-from qrlsuite.population import Adam, part, prefixed
+from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
 
 FloatArray = NDArray[np.float64]
@@ -111,7 +111,7 @@ class Reinforce:
     def start(self) -> None:
         """Reset the environments."""
         first, _ = self.envs.reset()
-        self.observations = self._tensor(first)
+        self.observations = by_seed(first, self.S, self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Collect `rounds` steps of every environment and make one update.
@@ -165,10 +165,10 @@ class Reinforce:
             ended[:, :, slot] = np.reshape(terminated | truncated, (self.S, self.E))
             cut[:, :, slot] = np.reshape(truncated & ~terminated, (self.S, self.E))
             if self.value is not None and truncated.any():
-                arrived = self._tensor(infos["final_obs"])
+                arrived = by_seed(infos["final_obs"], self.S, self.device)
                 mask = torch.from_numpy(cut[:, :, slot, None]).to(self.device)
                 final[:, :, k] = torch.where(mask, arrived, final[:, :, k])
-            self.observations = self._tensor(after)
+            self.observations = by_seed(after, self.S, self.device)
         return rows, ended, cut, final
 
     @torch.no_grad()
@@ -258,12 +258,6 @@ class Reinforce:
             logits: Tensor = self.policy(torch.from_numpy(observations).to(self.device))
         result: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
         return result
-
-    def _tensor(self, lanes: NDArray[np.float32]) -> Tensor:
-        """Reshape lane-major observations (S * E, ...) to (S, E, obs)."""
-        return (
-            torch.from_numpy(np.ascontiguousarray(lanes, np.float32)).view(self.S, self.E, -1).to(self.device)
-        )
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the policy network's parameters and buffers."""
