@@ -6,7 +6,6 @@ record of that, so that a reader of a leaderboard knows how much was spent on th
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
+import tomli_w
 from pydantic import BaseModel, ConfigDict, Field
 
 from qrlsuite import options
@@ -21,8 +21,6 @@ from qrlsuite.errors import OptionError, TaskError, nearest
 
 TUNING_SEEDS = 1_000_000
 """Seeds from here on are for tuning; protocol seeds lie below."""
-
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 class _Table(BaseModel):
@@ -145,46 +143,10 @@ def dumps(preset: PresetFile, comment: str = "") -> str:
     """Return a preset file's text; options that are not set (None) are left out."""
     content = _without_none(preset.model_dump(mode="json"))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
-    lines += _table(content)
-    text = "\n".join(lines) + "\n"
-    if tomllib.loads(text) != content:
-        raise OptionError("these settings cannot be written as TOML; report this as a bug")
-    return text
+    return "".join(f"{line}\n" for line in lines) + tomli_w.dumps(content)
 
 
 def _without_none(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_none(item) for key, item in value.items() if item is not None}
     return value
-
-
-def _table(content: Mapping[str, Any], name: str = "") -> list[str]:
-    """Return the lines of a table: its plain values, then its tables."""
-    lines = [
-        f"{_key(key)} = {_value(value)}" for key, value in content.items() if not isinstance(value, dict)
-    ]
-    for key, value in content.items():
-        if isinstance(value, dict):
-            inner = f"{name}.{_key(key)}" if name else _key(key)
-            lines += ["", f"[{inner}]", *_table(value, inner)]
-    return lines
-
-
-def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else _text(name)
-
-
-def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, list):
-        return f"[{', '.join(_value(item) for item in value)}]"
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + " }"
-    return repr(value)
