@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.leaderboard import origin
 from qrlsuite.results import lookup
-from qrlsuite.results.store import EntryStore, SeedCurve, entries
+from qrlsuite.results.store import EntryStore, SeedRun, entries
 
 
 @dataclass(frozen=True)
@@ -208,26 +208,22 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         If a file is damaged, or a score is outside [0, 1].
     """
     record = store.record()
-    runs = [store.seed(seed) for seed in store.seeds() if seed < TUNING_SEEDS]
-    curves = [run.curve() for run in runs]
-    curves = [curve for curve in curves if len(curve.scores)]
-    if not curves:
+    runs = [store.seed(seed).read() for seed in store.seeds() if seed < TUNING_SEEDS]
+    runs = [run for run in runs if len(run.scores)]
+    if not runs:
         return None
-    length = _common_length(curves)
-    kept = [curve for curve in curves if len(curve.scores) >= length]
-    stores = [store.seed(curve.seed) for curve in curves]
-    records = [seed.record() or {} for seed in stores]
-    provenance = [made for run in records for made in run.get("provenance", [])]
-    first = records[0]
-    parameters = first.get("parameters", {})
+    length = _common_length(runs)
+    kept = [run for run in runs if len(run.scores) >= length]
+    provenance = [made for run in runs for made in run.record.get("provenance", [])]
+    parameters = runs[0].record.get("parameters", {})
     identity = record["identity"]
     task_file = current(
         TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
     )
     preset = record["preset"]
-    own = {curve.seed: curve.curve for curve in curves}
+    own = {run.seed: run.curve for run in runs}
     require_scores(np.concatenate(list(own.values())), task_file, store.path)
-    values = np.stack([own[curve.seed][:length] for curve in kept])
+    values = np.stack([own[run.seed][:length] for run in kept])
     return EntryCurves(
         name=record["name"],
         label=record["label"],
@@ -238,9 +234,9 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         model=identity["model"],
         parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
         curves=values,
-        seeds=tuple(curve.seed for curve in kept),
-        left_out=tuple(curve.seed for curve in curves if len(curve.scores) < length),
-        hours=sum(seed.seconds() for seed in stores) / 3600,
+        seeds=tuple(run.seed for run in kept),
+        left_out=tuple(run.seed for run in runs if len(run.scores) < length),
+        hours=sum(run.seconds for run in runs) / 3600,
         folder=store.path,
         identity=identity,
         options={
@@ -253,7 +249,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         commits=origin.texts(provenance, "commit"),
         processors=origin.texts(provenance, "processor"),
         tuning=record["tuning"],
-        executions=sum(origin.executions(seed) for seed in stores),
+        executions=sum(run.executions for run in runs),
         runs=own if any(len(curve) != length for curve in own.values()) else {},
     )
 
@@ -300,7 +296,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _common_length(curves: Iterable[SeedCurve]) -> int:
+def _common_length(runs: Sequence[SeedRun]) -> int:
     """Return the epochs that half of the finished runs or more have; before any finished, the fewest of any run."""
-    lengths = sorted((len(curve.scores) for curve in curves if curve.finished), reverse=True)
-    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(curve.scores) for curve in curves)
+    lengths = sorted((len(run.scores) for run in runs if run.finished), reverse=True)
+    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(run.scores) for run in runs)

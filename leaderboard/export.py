@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.leaderboard import origin, published
+from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard.collect import EntryCurves
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.results.store import EntryStore
@@ -38,20 +38,20 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
     built = store.entry()
     folder = out / entry.task / entry.name
     _refuse_smaller(folder, entry, force)
-    records = [store.seed(seed).record() or {} for seed in entry.seeds]
-    unfinished = [seed for seed, record in zip(entry.seeds, records) if record.get("status") != "finished"]
+    runs = [store.seed(seed).read() for seed in entry.seeds]
+    unfinished = [run.seed for run in runs if not run.finished]
     if unfinished:
         raise QrlSuiteError(
-            f"'{entry.label}' is not complete: {len(unfinished)} of {len(records)} seeds are still training; "
+            f"'{entry.label}' is not complete: {len(unfinished)} of {len(runs)} seeds are still training; "
             "repeat the `qrlsuite run` that made it"
         )
     content = published.files(
         {name: value for name, value in store.record().items() if name != "published"},
         entry.seeds,
         entry.curves,
-        [store.seed(seed).seconds() / 3600 for seed in entry.seeds],
-        [origin.executions(store.seed(seed)) for seed in entry.seeds],
-        [record["provenance"][-1] if record.get("provenance") else {} for record in records],
+        [run.seconds / 3600 for run in runs],
+        [run.executions for run in runs],
+        [run.record["provenance"][-1] if run.record.get("provenance") else {} for run in runs],
         entry.parameters,
         fingerprint(built, entry.seeds),
     )

@@ -172,12 +172,32 @@ def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class SeedCurve:
-    """What one seed's run holds so far: `scores` (T, validation episodes) float32, one row per epoch."""
+class SeedRun:
+    """What one seed's run holds so far.
+
+    Attributes
+    ----------
+    record:
+        `run.json`; empty where the run never began.
+    scores:
+        (T, validation episodes), one row per epoch.
+    seconds:
+        Core-seconds spent on it, see `SeedStore.seconds`.
+    executions:
+        Circuit executions of training, gradients and validation together. A circuit that is sampled with many shots
+        is executed once.
+    """
 
     seed: int
+    record: Mapping[str, Any]
     scores: NDArray[np.float32]
-    finished: bool
+    seconds: float
+    executions: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run reached the epochs that were asked for."""
+        return self.record.get("status") == "finished"
 
     @property
     def curve(self) -> NDArray[np.float64]:
@@ -298,13 +318,13 @@ class SeedStore:
                 total += value
         return total
 
-    def curve(self) -> SeedCurve:
-        """Return the validation scores so far.
+    def read(self) -> SeedRun:
+        """Return what the run holds so far.
 
         Raises
         ------
         StoreError
-            If scores are missing, not finite, or differ in number between epochs.
+            If a file is damaged, or scores are missing, not finite, or differ in number between epochs.
         """
         rows = self.epochs(decimals=False)
         try:
@@ -315,14 +335,25 @@ class SeedStore:
         if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):
             raise StoreError(f"{self.path}: validation scores must be finite and equally many in every epoch")
         record = self.record() or {}
-        finished = record.get("status") == "finished"
-        if finished and len(rows) < int(record["epochs"]):
+        if record.get("status") == "finished" and len(rows) < int(record["epochs"]):
             raise StoreError(
                 f"{self.path} finished {record['epochs']} epochs and holds {len(rows)}: restore the file or delete "
                 "the seed's folder"
             )
         shaped = scores if rows else np.empty((0, 0), np.float32)
-        return SeedCurve(self.seed, shaped, finished)
+        return SeedRun(self.seed, record, shaped, self.seconds(), self._executions(rows))
+
+    def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
+        total = 0
+        for row in rows:
+            counts = row.get("executions")
+            for name, count in counts.items() if isinstance(counts, Mapping) else ():
+                if count is None or name == "shots":
+                    continue
+                if not _is_count(count) or count >= 2**63:
+                    raise StoreError(f"{self.path}: {count!r} is not a number of circuit executions")
+                total += count
+        return total
 
 
 def _is_count(value: Any) -> bool:
@@ -512,10 +543,6 @@ class EntryStore:
         """Return the seeds that have a folder, sorted."""
         found = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
         return sorted(int(match.group(1)) for match in found if match)
-
-    def curves(self) -> list[SeedCurve]:
-        """Return the curves of all seeds, sorted by seed."""
-        return [self.seed(seed).curve() for seed in self.seeds()]
 
     def finished(self, seeds: Iterable[int], epochs: int) -> set[int]:
         """Return which of the seeds have completed that many epochs."""

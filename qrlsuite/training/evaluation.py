@@ -121,7 +121,7 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
     longest = max(lengths.values(), default=0)
     last: dict[int, float] = {}
     for seed in sorted(seed for seed, epochs in lengths.items() if epochs == longest):
-        curve = store.seed(seed).curve().curve
+        curve = store.seed(seed).read().curve
         if len(curve):
             last[seed] = float(curve[-1])
     if not last:

@@ -186,7 +186,7 @@ class Search:
         """Return the learning curves (N, T) of the tuning seeds; None while some are missing."""
         if store.finished(self.request.seeds, self.epochs) != set(self.request.seeds):
             return None
-        return np.stack([store.seed(seed).curve().curve[: self.epochs] for seed in self.request.seeds])
+        return np.stack([store.seed(seed).read().curve[: self.epochs] for seed in self.request.seeds])
 
     @property
     def core_seconds(self) -> float:

@@ -122,13 +122,13 @@ def test_loaded_agents_are_the_trained_ones(train: Callable[..., Path]) -> None:
         observations, *_ = envs.step(agents.act(observations))
     _, _, scores = envs.take_finished()
     for s in (0, 1):
-        stored = store.seed(s).curve().scores[-1]
+        stored = store.seed(s).read().scores[-1]
         assert np.array_equal(stored, scores.reshape(2, 5)[s].astype(np.float32))
 
 
 def test_the_best_runs_are_those_with_the_best_last_validation(train: Callable[..., Path]) -> None:
     store = EntryStore(train("runs", [0, 1, 2], 2))
-    last = {seed: store.seed(seed).curve().curve[-1] for seed in range(3)}
+    last = {seed: store.seed(seed).read().curve[-1] for seed in range(3)}
     seeds, scores, runs = evaluation.best_runs(store, 2)
     assert seeds == sorted(last, key=lambda seed: (-last[seed], seed))[:2]
     assert scores == [last[seed] for seed in seeds]

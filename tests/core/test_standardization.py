@@ -269,7 +269,7 @@ def test_with_other_statistics_an_agent_is_another(train: Callable[..., Path]) -
 
 
 def last_scores(store: EntryStore) -> NDArray[np.float32]:
-    return np.stack([store.seed(seed).curve().scores[-1] for seed in (0, 1)])
+    return np.stack([store.seed(seed).read().scores[-1] for seed in (0, 1)])
 
 
 def play(entry: Entry, player: Trainer) -> NDArray[np.float32]:

@@ -69,7 +69,7 @@ def test_a_missing_epoch_is_an_error(train: Callable[..., Path]) -> None:
     folder.table.unlink()
     folder.lines.write_bytes(b"".join(store.json_line(row) for row in (rows[0], rows[2])))
     with pytest.raises(StoreError, match="epoch 2 is missing"):
-        folder.curve()
+        folder.read()
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"not parquet at all", b"\0" * 100])
@@ -77,7 +77,7 @@ def test_a_truncated_table_is_named(train: Callable[..., Path], content: bytes) 
     folder = store.EntryStore(train("runs", [0])).seed(0)
     folder.table.write_bytes(content)
     with pytest.raises(StoreError, match=r"epochs\.parquet is not a readable parquet file"):
-        folder.curve()
+        folder.read()
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 20, b"\x10\0\0\0\0\0\0\0{}              "])
@@ -198,7 +198,7 @@ def test_a_finished_seed_without_its_epochs_is_no_curve(train: Callable[..., Pat
     seed = store.EntryStore(train("runs", [0], 2)).seed(0)
     seed.table.unlink()
     with pytest.raises(StoreError, match="finished 2 epochs and holds 0: restore the file or delete"):
-        seed.curve()
+        seed.read()
 
 
 def test_a_checkpoint_does_not_stand_for_epochs_that_are_gone(train: Callable[..., Path]) -> None:
@@ -209,7 +209,7 @@ def test_a_checkpoint_does_not_stand_for_epochs_that_are_gone(train: Callable[..
 
 
 def test_means_of_float32_scores_reach_what_the_scores_reach() -> None:
-    curve = store.SeedCurve(0, np.full((1, 100), 0.95, np.float32), True).curve
+    curve = store.SeedRun(0, {}, np.full((1, 100), 0.95, np.float32), 0.0, 0).curve
     assert np.asarray(curve).tolist() == [0.95]
 
 

@@ -18,11 +18,11 @@ def test_executions_are_summed_over_table_and_newer_lines(tmp_path: Path) -> Non
     ]
     seed = SeedStore(tmp_path, 0)
     seed.lines.write_bytes(b"".join(json_line(row) for row in rows))
-    assert origin.executions(seed) == 36
+    assert seed.read().executions == 36
     seed.table.write_bytes(table_bytes(rows[:2]))
-    assert origin.executions(seed) == 36
+    assert seed.read().executions == 36
     seed.lines.unlink()
-    assert origin.executions(seed) == 23
+    assert seed.read().executions == 23
 
 
 @pytest.mark.parametrize("count", [-1, 1.5, "many", True])
@@ -30,7 +30,7 @@ def test_counts_that_are_no_counts_are_refused(tmp_path: Path, count: object) ->
     seed = SeedStore(tmp_path, 0)
     seed.lines.write_bytes(json_line({"epoch": 1, "scores": [0.5], "executions": {"forward": count}}))
     with pytest.raises(StoreError, match="circuit executions"):
-        origin.executions(seed)
+        seed.read().executions
 
 
 def test_every_version_is_told_once() -> None:

@@ -35,7 +35,7 @@ def test_every_seed_has_its_curves(train: Train, monkeypatch: pytest.MonkeyPatch
         assert [step for step, _ in curves["validation/score"]] == [1, 2, 3]
         from qrlsuite.results.store import EntryStore
 
-        expected = EntryStore(entry).seed(seed).curve().curve
+        expected = EntryStore(entry).seed(seed).read().curve
         assert [value for _, value in curves["validation/score"]] == pytest.approx(list(expected), abs=1e-6)
 
 

@@ -125,7 +125,7 @@ def summarize(entry: Entry, store: EntryStore, seeds: list[int], epochs: int) ->
     """Return what a finished (or partly finished) run amounts to, as plain values."""
     import numpy as np
 
-    curves = {seed: store.seed(seed).curve() for seed in seeds if store.seed(seed).record()}
+    curves = {seed: store.seed(seed).read() for seed in seeds if store.seed(seed).record()}
     complete = {seed: curve.curve[:epochs] for seed, curve in curves.items() if len(curve.scores) >= epochs}
     summary: dict[str, Any] = {
         "task": entry.task.name,
