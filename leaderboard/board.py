@@ -109,7 +109,10 @@ def learning_curves(entry: EntryCurves) -> LearningCurves:
 
 
 def build(
-    entries: Sequence[EntryCurves], refused: Sequence[str] = (), rule: SignificanceRule | None = None
+    entries: Sequence[EntryCurves],
+    refused: Sequence[str] = (),
+    rule: SignificanceRule | None = None,
+    horizon: int | None = None,
 ) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
@@ -123,6 +126,8 @@ def build(
         Lines about what could not be read, passed on.
     rule:
         What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means the paper's.
+    horizon:
+        Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
 
     Raises
     ------
@@ -142,25 +147,29 @@ def build(
             for entry in members
             if entry.task_hash != definition
         ]
-        for horizon, provisional, group in _by_horizon(good):
+        for steps, provisional, group in _by_horizon(good, horizon):
             try:
-                sections.append(_section(task, horizon, provisional, group, chosen))
+                sections.append(_section(task, steps, provisional, group, chosen))
             except PluginError:
                 raise
             except QrlSuiteError as error:
-                problems.append(f"task '{task}' at {horizon} steps: {error}")
+                problems.append(f"task '{task}' at {steps} steps: {error}")
     return Leaderboard(tuple(sections), tuple(problems), chosen.name, chosen.promise)
 
 
-def _by_horizon(entries: Sequence[EntryCurves]) -> list[tuple[int, bool, list[EntryCurves]]]:
+def _by_horizon(
+    entries: Sequence[EntryCurves], wanted: int | None
+) -> list[tuple[int, bool, list[EntryCurves]]]:
     """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
     horizons = sorted(ranking_of(entries).horizons)
     groups = []
-    for horizon in horizons:
+    for horizon in horizons if wanted is None else [wanted]:
         reached = [entry.reaching(horizon // entry.steps_per_epoch) for entry in entries]
         members = [entry for entry in reached if entry is not None]
         if members:
-            groups.append((horizon, False, members))
+            groups.append((horizon, horizon < horizons[0], members))
+    if wanted is not None:
+        return groups
     short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
     lengths = sorted({_length(entry) for entry in short}, reverse=True)
     return groups + [

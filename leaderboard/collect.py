@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite import registry
-from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
@@ -89,6 +89,11 @@ class EntryCurves:
         out = tuple(sorted(set(self.runs) - set(kept)))
         return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
 
+    def cut(self, epochs: int) -> EntryCurves | None:
+        """Return the first epochs of every run that has reached a number of them; None for none."""
+        reached = self.reaching(epochs)
+        return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
+
     @property
     def longest(self) -> int:
         """The epochs of the longest run."""
@@ -114,15 +119,15 @@ def collect(
     ----------
     shipped:
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
-        both is shown once, the one that gets further towards the task's shortest horizon, else the one with more
-        seeds: equal seeds are the same runs, not further evidence.
+        both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
+        own copy gets less far towards the task's shortest horizon, both are shown.
 
     Returns
     -------
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    good: dict[tuple[str, str, str], EntryCurves] = {}
+    good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
     for store in _folders(runs, shipped, task):
         try:
@@ -132,36 +137,158 @@ def collect(
             continue
         if entry is None:
             continue
-        key = (entry.task, entry.task_hash, entry.name)
-        if shipped and key in good:
-            one, other = sorted((good[key], entry), key=_weight, reverse=True)
-            size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
-            refused.append(f"{other.folder}: {size}; shown once, from {one.folder}")
-            good[key] = one
+        good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
+    found = []
+    for copies in good.values():
+        shown = _shown(copies) if shipped else copies[-1:]
+        found += shown
+        for other in copies if shipped and len(shown) < len(copies) else ():
+            if other is not shown[0]:
+                size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
+                refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
+    return found, refused
+
+
+def select(
+    runs: Path,
+    tasks: Collection[str] = (),
+    names: Iterable[str] = (),
+    shipped: bool = False,
+    horizon: int | None = None,
+    min_seeds: int = 1,
+) -> tuple[list[EntryCurves], list[str]]:
+    """Read the entries for a board or a picture.
+
+    Parameters
+    ----------
+    tasks, names:
+        The tasks and the entries (see `find`) to read; all where empty.
+    shipped:
+        As for `collect`.
+    horizon:
+        Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
+    min_seeds:
+        Entries with fewer seeds are left out.
+
+    Returns
+    -------
+    tuple
+        The entries, in the order named; and one line for each that was left out and why.
+
+    Raises
+    ------
+    OptionError
+        If the horizon is no whole number of epochs of a task.
+    UnknownNameError
+        If none or several entries match a name, or none is left.
+    """
+    named = {
+        (copy.task_hash, copy.name): copy
+        for name in names
+        for copy in _shown(_read_copies(runs, name, shipped, tasks))
+    }
+    found, left_out = list(named.values()), list[str]()
+    if not named:
+        found, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, shipped)
+        found = [entry for entry in found if not tasks or entry.task in tasks]
+    there = len(found)
+    kept = []
+    for entry in found:
+        if horizon is not None and (horizon < 1 or horizon % entry.steps_per_epoch):
+            epochs = max(1, round(horizon / entry.steps_per_epoch))
+            raise OptionError(
+                f"--horizon {horizon}: an epoch of task '{entry.task}' has {entry.steps_per_epoch} steps; write a "
+                f"multiple of it, such as --horizon {epochs * entry.steps_per_epoch}"
+            )
+        reached = entry if horizon is None else entry.cut(horizon // entry.steps_per_epoch)
+        if reached is None:
+            left_out.append(
+                f"{entry.label}: ends at {entry.longest * entry.steps_per_epoch} of {horizon} steps"
+            )
+        elif len(reached.seeds) < min_seeds:
+            count = len(reached.seeds)
+            left_out.append(f"{entry.label}: {count} seed{'s' * (count != 1)}, fewer than {min_seeds}")
         else:
-            good[key] = entry
-    return list(good.values()), refused
+            kept.append(reached)
+    if there and not kept:
+        raise UnknownNameError(f"no entry is left: {'; '.join(left_out[-there:])}")
+    return kept, left_out
 
 
-def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
+def equally_long(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], list[str]]:
+    """Leave out entries that would cut a picture: those shorter than half of the others, task by task.
+
+    Where any entry of a task reaches the task's shortest horizon, those that do not are left out first.
+
+    Returns
+    -------
+    tuple
+        The entries that stay, in their order; and one line for each that was left out.
+    """
+    enough: dict[str, int] = {}
+    for task in {entry.task_hash for entry in entries}:
+        members = [entry for entry in entries if entry.task_hash == task]
+        lengths = sorted((int(entry.curves.shape[1]) for entry in members), reverse=True)
+        least = min(members[0].task_file.ranking.horizons) // members[0].steps_per_epoch
+        reaching = [length for length in lengths if length >= least] or lengths
+        enough[task] = reaching[(len(reaching) - 1) // 2]
+    kept, lines = [], []
+    for entry in entries:
+        if entry.curves.shape[1] >= enough[entry.task_hash]:
+            kept.append(entry)
+            continue
+        steps = int(entry.curves.shape[1]) * entry.steps_per_epoch
+        lines.append(f"{entry.label}: ends at {steps} steps; --horizon {steps} shows it")
+    return kept, lines
+
+
+def find(runs: Path, name: str, shipped: bool = False, tasks: Collection[str] = ()) -> EntryCurves:
     """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is.
+
+    Parameters
+    ----------
+    shipped:
+        Look among the published entries that come with the suite, too.
+    tasks:
+        Look among the entries of these tasks only; of all where empty.
 
     Raises
     ------
     UnknownNameError
         If none or several match; the message says what to type.
     """
+    return max(_read_copies(runs, name, shipped, tasks), key=_weight)
+
+
+def _read_copies(runs: Path, name: str, shipped: bool, tasks: Collection[str]) -> list[EntryCurves]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = lookup.stored(_folders(runs, shipped))
+        everything = [e for e in lookup.stored(_folders(runs, shipped)) if not tasks or e.task in tasks]
         unique = list({entry.key: entry for entry in everything}.values())
-        key = lookup.choose(unique, name, runs).key
+        key = lookup.choose(unique, name, _place(runs, tasks)).key
         folders = [entry.store for entry in everything if entry.key == key]
     found = [entry for entry in map(read, folders) if entry is not None]
     if not found:
         raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
-    return max(found, key=_weight)
+    if tasks and found[0].task not in tasks:
+        raise UnknownNameError(
+            f"{name} is an entry of task {found[0].task}, not of {' or '.join(sorted(tasks))}"
+        )
+    return found
+
+
+def _shown(copies: Sequence[EntryCurves]) -> list[EntryCurves]:
+    """Return what is shown of an entry's copies: the better one; or both where the own one gets less far."""
+    own, best = copies[0], max(copies, key=_weight)
+    if own.source == "runs" and _weight(own)[0] < _weight(best)[0]:
+        return [own, replace(best, name=f"{best.name}-published", label=f"{best.label} (published)")]
+    return [best]
+
+
+def _place(runs: Path, tasks: Collection[str]) -> str:
+    """Say where an entry was looked for."""
+    return f"{runs}, task {' or '.join(sorted(tasks))}" if tasks else str(runs)
 
 
 def _weight(entry: EntryCurves) -> tuple[int, int, int]:

@@ -1,8 +1,8 @@
 """Honest and fast benchmarks of quantum and classical reinforcement learning.
 
-Importing this package is cheap: torch, PennyLane and Qiskit are imported only by what needs them. Where
-Gymnasium was imported before it, every environment of the suite and its plugins becomes known to
-`gymnasium.make`; `register_environments()` does the same at any time.
+Importing this package is cheap: torch, PennyLane and Qiskit are imported only by what needs them. Once
+this package and Gymnasium are both imported, in either order, `gymnasium.make` knows every environment of the suite
+and its plugins.
 """
 
 from __future__ import annotations
@@ -12,7 +12,12 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
     from qrlsuite.hookspecs import hookimpl as hookimpl
+    from qrlsuite.registry import Registry
 
 __version__ = "0.1.0"
 
@@ -38,11 +43,18 @@ def __getattr__(name: str) -> object:
 
 def register_environments() -> None:
     """Make every registered environment known to `gymnasium.make` under its Gymnasium id; again does nothing."""
+    from qrlsuite import registry
+
+    if not registry.is_loading():  # by a plugin that imports Gymnasium: `registry.load` registers at its end
+        _register(registry.load())
+
+
+def _register(known: Registry) -> None:
     import gymnasium
 
-    from qrlsuite import registry, specs
+    from qrlsuite import specs
 
-    for registered in registry.load().entries["environments"].values():
+    for registered in known.entries["environments"].values():
         spec = registered.spec
         if not isinstance(spec, specs.EnvironmentSpec) or spec.entry_point is None:
             continue
@@ -50,5 +62,33 @@ def register_environments() -> None:
             gymnasium.register(spec.gymnasium_id, entry_point=spec.entry_point)
 
 
+class _AfterGymnasium:
+    """Finder that waits for the import of Gymnasium, registers the environments after it, and removes itself."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return Gymnasium's own spec with a loader that registers the environments too, None for any other module."""
+        if name != "gymnasium":
+            return None
+        from importlib.util import find_spec
+
+        sys.meta_path.remove(self)
+        spec = find_spec(name)  # of the finders that are left
+        if spec is None or spec.loader is None:
+            sys.meta_path.insert(0, self)  # it may be installed later
+            return spec
+        execute = spec.loader.exec_module
+
+        def execute_and_register(module: ModuleType) -> None:
+            execute(module)
+            register_environments()
+
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        return spec
+
+
 if "gymnasium" in sys.modules:
     register_environments()
+else:
+    sys.meta_path.insert(0, _AfterGymnasium())

@@ -187,7 +187,7 @@ class Setting:
 
 
 def parse_setting(word: str) -> Setting:
-    """Parse `[environment.|model.|algorithm.]name=value`; the value is read as TOML, else as text.
+    """Parse `[environment.|model.|ansatz.|algorithm.]name=value`; the value is read as TOML, else as text.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def parse_value(text: str) -> Any:
 
 
 def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[str, Values]:
-    """Distribute settings over the sides (`environment`, `model`, `algorithm`) that have options of that name.
+    """Distribute settings over the sides (`model`, `ansatz`, ...) that have options of that name.
 
     Raises
     ------
@@ -226,7 +226,9 @@ def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[
         owners = [side for side, cls in sides.items() if setting.name in field_names(cls)]
         if setting.side is not None:
             if setting.side not in sides:
-                raise OptionError(f"{setting.written}: sides are {', '.join(sides)}")
+                close = nearest(setting.side, sides)
+                meant = close if "did you mean" in close else ""
+                raise OptionError(f"{setting.written}: sides are {', '.join(sides)}{meant}")
             owners = [setting.side]
         if not owners:
             bare = {name.partition(".")[2] for name in every}

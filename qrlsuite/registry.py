@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -285,10 +286,26 @@ def is_strict() -> bool:
     return os.environ.get(STRICT, "").strip().lower() not in ("", "0", "false", "no", "off")
 
 
+_loading = False
+
+
+def is_loading() -> bool:
+    """Return whether `load` is discovering plugins at this moment, which may import anything."""
+    return _loading
+
+
 @functools.cache
 def load() -> Registry:
-    """Return the registry of this process, discovered once."""
-    return create(is_strict())
+    """Return the registry of this process, discovered once; an imported Gymnasium learns its environments."""
+    global _loading
+    _loading = True
+    try:
+        found = create(is_strict())
+    finally:
+        _loading = False
+    if "gymnasium" in sys.modules:
+        qrlsuite._register(found)
+    return found
 
 
 def environment(name: str) -> specs.EnvironmentSpec:

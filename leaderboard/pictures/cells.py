@@ -123,6 +123,7 @@ def cut_note(entries: Sequence[EntryCurves], horizon: int) -> str:
     """Say that the picture ends before the task's horizon, where it does."""
     if horizon in entries[0].task_file.ranking.horizons:
         return ""
-    short = min(entries, key=lambda entry: int(entry.curves.shape[1]) * entry.steps_per_epoch)
-    why = f", the length of {style.plain(short.label)}" if len(entries) > 1 else ""
+    lengths = {entry.label: int(entry.curves.shape[1]) * entry.steps_per_epoch for entry in entries}
+    short = min(lengths, key=lambda label: lengths[label])
+    why = f", the length of {style.plain(short)}" if len(set(lengths.values())) > 1 else ""
     return f"all cut to {style.thousands(horizon)} steps{why}"

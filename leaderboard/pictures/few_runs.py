@@ -34,6 +34,10 @@ class Options:
     seed: Annotated[int, Field(ge=0, description="of the random samples")] = 0
     epsilon: Annotated[float | None, Field(description="by default the reference cell's")] = None
     delta: Annotated[float | None, Field(description="by default the reference cell's")] = None
+    horizon: Annotated[
+        int | None,
+        Field(ge=1, description="environment steps at which S_hat is capped; by default the task's"),
+    ] = None
 
 
 @plain_dataclass(frozen=True, eq=False)
@@ -69,7 +73,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     for entry in entries:
         if len(entry.seeds) < need:
             raise OptionError(f"'{entry.label}' has {len(entry.seeds)} seeds; this picture needs {need}")
-    ranking, horizon = entries[0].task_file.ranking, cells.choose_horizon(entries)
+    ranking, horizon = entries[0].task_file.ranking, cells.choose_horizon(entries, chosen.horizon)
     reference = ranking.reference
     epsilon = reference.epsilon if chosen.epsilon is None else chosen.epsilon
     grid = cells.choose_grid(

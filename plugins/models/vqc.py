@@ -40,6 +40,8 @@ class VQCOptions:
     """Options of every hybrid circuit model."""
 
     backend: ClassVar[str]
+    passes_on: ClassVar[tuple[str, ...]] = ("gate",)
+    """Options that are handed to an ansatz which has them: `--set gate=xyz` means this model's, and the ansatz's."""
 
     qubits: Annotated[int, Field(ge=1, le=20, description="qubits of the circuit")] = 10
     layers: Annotated[int, Field(ge=1, le=256, description="layers of the circuit")] = 4
@@ -48,7 +50,10 @@ class VQCOptions:
         Literal["rot", "xyz", "u3"], Field(description="variational gate, for the ansaetze that offer it")
     ] = "rot"
     ansatz_options: Annotated[
-        dict[str, OptionValue], Field(description="further options of the ansatz, as a TOML table")
+        dict[str, OptionValue],
+        Field(
+            description="further options of the ansatz; --set NAME=VALUE or --set ansatz.NAME=VALUE puts one here"
+        ),
     ] = field(default_factory=dict)
     activation_in: Annotated[Activation, Field(description="between linear layer and circuit")] = "none"
     activation_out: Annotated[Activation, Field(description="between circuit and linear layer")] = "none"

@@ -8,6 +8,29 @@ from typing import Annotated
 import typer
 
 TaskOption = Annotated[str | None, typer.Option("--task", help="Only this task.")]
+AmongOption = Annotated[
+    str | None, typer.Option("--task", help="Look for ENTRY among the entries of this task only.")
+]
+EntryOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--entry",
+        metavar="ENTRY",
+        help="Only this entry (name or label, [TASK/] before it, or the beginning); for several, repeat --entry.",
+    ),
+]
+HorizonOption = Annotated[
+    int | None,
+    typer.Option(
+        "--horizon",
+        metavar="STEPS",
+        min=1,
+        help="Cut all entries to their first STEPS environment steps; leave out those that are shorter.",
+    ),
+]
+MinSeedsOption = Annotated[
+    int, typer.Option("--min-seeds", metavar="N", min=1, help="Leave out entries with fewer seeds.")
+]
 RunsOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")
 ]

@@ -7,7 +7,7 @@ engine, workers or versions. More epochs extend an entry, more seeds widen it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -118,25 +118,18 @@ def resolve(
     wanted = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
     algorithm = registry.algorithm(wanted)
     model = registry.model(model_name)
-    sides = {
-        "environment": specs.resolve(task.environment.options),
-        "model": specs.resolve(model.options),
-        "algorithm": specs.resolve(algorithm.options),
-    }
+    model_defaults: Mapping[str, Any] = {} if file is None else file.model_options
+    sides = option_sides(task, algorithm, model, settings, model_defaults)
     task.check_presets(algorithm.name, sides["algorithm"])
     values = options.assign(settings, sides)
+    _hand_to_ansatz(values, sides, model_defaults)
     task = task.with_environment(values["environment"])
     chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
-    model_defaults: Mapping[str, Any] = {}
     if file is not None and preset is not None:
         presets.require(file, preset, algorithm.name, model.name)
         for side, given in (("algorithm", file.algorithm_options), ("model", file.model_options)):
             options.build(sides[side], given, f"preset file {preset}: {side} '{getattr(file, side)}'")
-        chosen, defaults, model_defaults = (
-            Path(preset).name,
-            {**defaults, **file.algorithm_options},
-            file.model_options,
-        )
+        chosen, defaults = Path(preset).name, {**defaults, **file.algorithm_options}
     model_options = options.build(
         sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
     )
@@ -153,6 +146,64 @@ def resolve(
         preset=chosen,
         tuning=None if file is None or chosen is None else presets.record_of(file, chosen, values),
     )
+
+
+def option_sides(
+    task: Task,
+    algorithm: specs.AlgorithmSpec,
+    model: specs.ModelSpec,
+    settings: Sequence[Setting] = (),
+    defaults: Mapping[str, Any] | None = None,
+) -> dict[str, type[Any]]:
+    """Return the options classes among which `--set` finds a name, by side.
+
+    These are `environment`, `model` and `algorithm`; and `ansatz` for a model whose options are `ansatz`, the name of
+    one, and `ansatz_options`, a table of that ansatz's own options. An option that such a model has itself and
+    hands to its ansatz (class variable `passes_on`) is found at the model only.
+
+    Parameters
+    ----------
+    settings:
+        What was set; `ansatz=NAME` among it chooses the ansatz.
+    defaults:
+        The model's options where nothing was set, by name; absent ones have the class's defaults.
+
+    Raises
+    ------
+    UnknownNameError
+        If no ansatz has the name that was chosen.
+    """
+    own = specs.resolve(model.options)
+    sides = {
+        "environment": specs.resolve(task.environment.options),
+        "model": own,
+        "algorithm": specs.resolve(algorithm.options),
+    }
+    if not {"ansatz", "ansatz_options"} <= set(options.field_names(own)):
+        return sides
+    chosen = {**options.plain(own()), **(defaults or {})}["ansatz"]
+    for setting in settings:
+        if setting.name == "ansatz" and setting.side in (None, "model"):
+            chosen = setting.value
+    if isinstance(chosen, str):  # what is none is refused where the model's options are built
+        theirs = specs.resolve(registry.ansatz(chosen).options)
+        left = [name for name in options.field_names(theirs) if name not in getattr(own, "passes_on", ())]
+        sides["ansatz"] = make_dataclass(theirs.__name__, left)
+    return sides
+
+
+def _hand_to_ansatz(
+    values: dict[str, options.Values], sides: Mapping[str, type[Any]], defaults: Mapping[str, Any]
+) -> None:
+    """Move options that were set for an ansatz to the model: into its table `ansatz_options`, or to its own option."""
+    given = values.pop("ansatz", {})
+    for name in [name for name in given if name in getattr(sides["model"], "passes_on", ())]:
+        values["model"][name] = given.pop(name)
+    table = values["model"].get("ansatz_options", defaults.get("ansatz_options", {}))
+    if given and isinstance(
+        table, Mapping
+    ):  # what is no table is refused where the model's options are built
+        values["model"]["ansatz_options"] = {**table, **given}
 
 
 def from_record(record: Mapping[str, Any], source: str) -> Entry:

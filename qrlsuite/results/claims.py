@@ -220,6 +220,26 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
     return claim
 
 
+def move_away(store: EntryStore, target: Path) -> None:
+    """Rename an entry's folder while nobody trains it; who comes for its seeds later finds no entry.
+
+    Raises
+    ------
+    SeedsClaimedError
+        If a living worker holds any of its seeds; the message says who.
+    StoreError
+        If the folder cannot be renamed.
+    """
+    try:
+        store.claims.mkdir(exist_ok=True)
+        with _locked(store.claims):
+            for holder in living(store):
+                raise SeedsClaimedError(_refusal(holder, holder.seeds or (0,)))
+            store.path.rename(target)
+    except OSError as error:
+        raise StoreError(f"cannot move {store.path}: {error.strerror or error}") from None
+
+
 def _refusal(holder: Claim, shared: Sequence[int]) -> str:
     if holder.local:
         advice = "wait for it, or stop it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
-from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living
+from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, move_away
 from qrlsuite.results.progress import read_progress
 from qrlsuite.results.store import EntryStore, entries, read_json, read_lines
 
@@ -297,3 +298,40 @@ def remove(items: Sequence[Garbage]) -> int:
             claim.release()
         freed += item.size
     return freed
+
+
+def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None) -> int:
+    """Delete an entry with all its seeds; returns the bytes freed.
+
+    Parameters
+    ----------
+    runs:
+        The results folder. What links out of it is not touched.
+    queued:
+        As for `look`.
+
+    Raises
+    ------
+    StoreError
+        If somebody trains the entry or a queue has some of its seeds, if its folder is a link or lies beyond one, or
+        if it cannot be removed.
+    """
+    path = store.path
+    if path.is_symlink() or path.parent.is_symlink() or path.resolve().parents[1] != runs.resolve():
+        raise StoreError(
+            f"{path} is, or lies in, a link to {path.resolve()}: links are not followed; remove it there"
+        )
+    waits = [group for group in groups(store, queued) if group.state == "submitted"]
+    if waits:
+        raise StoreError(
+            f"{path} waits in a queue ({waits[0].where}): cancel that first; nothing was deleted"
+        )
+    size, _ = _usage(path)
+    gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
+    move_away(store, gone)
+    try:
+        (gone / "entry.json").unlink()  # so that what is left, if this is interrupted, is no entry
+        shutil.rmtree(gone)
+    except OSError as error:
+        raise StoreError(f"cannot remove {gone}: {error.strerror or error}") from None
+    return size

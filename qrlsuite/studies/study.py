@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
-from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting
 
@@ -223,7 +223,11 @@ def _entry(
     used: set[tuple[str | None, str]],
 ) -> Entry:
     model = models.get(draft.model, draft.model)
-    applicable = [s for s in settings if _has(draft.task, model, group.algorithm, s)]
+    loaded = load_task(draft.task)
+    algorithm = registry.algorithm(group.algorithm or loaded.file.default_algorithm)
+    every = [*draft.settings, *settings]
+    sides = option_sides(loaded, algorithm, registry.model(model), every)
+    applicable = [s for s in settings if _has(sides, s)]
     used |= {(s.side, s.name) for s in applicable}
     words = [*draft.settings, *applicable]
     if target is not None and group.match is not None:
@@ -241,18 +245,15 @@ def _entry(
     return resolve(draft.task, model, group.algorithm, words, group.preset)
 
 
-def _has(task: str, model: str, algorithm: str | None, setting: Setting) -> bool:
-    """Whether an entry of these names has the option that a setting is for."""
-    loaded = load_task(task)
-    sides = {
-        "environment": loaded.environment.options,
-        "model": registry.model(model).options,
-        "algorithm": registry.algorithm(algorithm or loaded.file.default_algorithm).options,
-    }
+def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:
+    """Whether an entry with these options classes has the option that a setting is for."""
+    if setting.side == "ansatz":  # a study may have models without one, too
+        names = options.field_names(sides["ansatz"]) if "ansatz" in sides else []
+        return setting.name in (*names, *getattr(sides["model"], "passes_on", ()))
     if setting.side is not None and setting.side not in sides:
         raise OptionError(f"{setting.written}: sides are {', '.join(sides)}")
     chosen = [sides[setting.side]] if setting.side is not None else list(sides.values())
-    return any(setting.name in options.field_names(specs.resolve(reference)) for reference in chosen)
+    return any(setting.name in options.field_names(cls) for cls in chosen)
 
 
 def parse(text: str, source: str) -> Study:

@@ -168,7 +168,9 @@ def space(
         _forget(found, name)
         found[name] = _values(name, setting.value)
     for setting in fixed:
-        if setting.side != "environment" and (setting.side or _owned(setting.name, sides)):
+        if setting.side == "ansatz" and setting.name in getattr(sides["model"], "passes_on", ()):
+            _forget(found, f"model.{setting.name}")
+        elif setting.side not in ("environment", "ansatz") and (setting.side or _owned(setting.name, sides)):
             _forget(found, _full_name(_word(setting), sides, setting.prefix))
     if not found:
         raise OptionError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,11 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
     """Three entries in place of a results folder."""
     found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
 
-    def find(runs: Path, name: str, shipped: bool = False) -> EntryCurves:
-        return next(entry for entry in found if name in entry.label)
+    def read(runs: Path, name: str, shipped: bool, tasks: Sequence[str]) -> list[EntryCurves]:
+        return [next(entry for entry in found if name in entry.label)]
 
     monkeypatch.setattr(collect, "collect", lambda runs, task=None, shipped=False: (found, []))
-    monkeypatch.setattr(collect, "find", find)
+    monkeypatch.setattr(collect, "_read_copies", read)
     return found
 
 

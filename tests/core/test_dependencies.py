@@ -125,8 +125,7 @@ def test_python_started_in_a_checkout_finds_every_folder() -> None:
         f"found = [importlib.import_module(name).__file__ for name in {sorted(FOLDERS)}];"
         f"expected = [f'{{folder}}/__init__.py' for folder in {[str(FOLDERS[name]) for name in sorted(FOLDERS)]}];"
         "assert found == expected, found;"
-        "import gymnasium, qrlsuite;"
-        "qrlsuite.register_environments();"
+        "import qrlsuite, gymnasium;"
         "gymnasium.make('qrlsuite/BeamManagement6G-v1').reset(seed=0)"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

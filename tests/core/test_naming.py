@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from typer.testing import CliRunner
 
+from qrlsuite.cli.app import build
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.results import lookup
 from qrlsuite.results.store import entries
+from tests.conftest import TINY
 
 
 class Entry(NamedTuple):
@@ -103,3 +107,41 @@ def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
     assert lookup.choose([found], "ddqn-mlp-8", tmp_path).store.path == folder
     with pytest.raises(UnknownNameError, match="known: ddqn-mlp-88888888"):
         lookup.choose([found], "x", tmp_path)
+
+
+@pytest.fixture
+def two_tasks(tiny_task: str, train: Callable[..., Path], tmp_path: Path) -> Path:
+    """Results of two tasks with entries of the same labels."""
+    for name in ("tiny", "other"):
+        changed = TINY.replace('"tiny"', f'"{name}"').replace("degree = 3", f"degree = {len(name)}")
+        Path(tiny_task).write_text(changed)
+        for width in (8, 16):
+            train("runs", [0, 1], 1, settings=(f"width={width}",))
+    return tmp_path / "runs"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compare", "mlp width=8", "mlp width=16"),
+        ("evaluate", "mlp width=8", "mlp width=16", "--episodes", "2"),
+        ("export", "mlp width=8", "--out", "out"),
+        ("plot", "curves", "--entry", "mlp width=8", "--out", "p.png"),
+        ("calibrate", "mlp width=8", "--draws", "4", "--part", "halves"),
+    ],
+)
+def test_a_task_narrows_the_search(
+    words: tuple[str, ...], two_tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    several = CliRunner().invoke(build(), [*words, "--runs", "runs"])
+    assert isinstance(several.exception, UnknownNameError)
+    assert "may be any of 'other/ddqn mlp width=8', 'tiny/ddqn mlp width=8'" in str(several.exception)
+    for task in ("tiny", "other"):
+        done = CliRunner().invoke(build(), [*words, "--runs", "runs", "--task", task])
+        assert done.exit_code == 0, done.output + str(done.exception)
+    unknown = CliRunner().invoke(build(), [*words, "--runs", "runs", "--task", "tny"])
+    assert "did you mean 'tiny'" in str(unknown.exception)
+    absent = [word.replace("mlp width=8", "ddqn vqc") for word in words]
+    nowhere = CliRunner().invoke(build(), [*absent, "--runs", "runs", "--task", "tiny"])
+    assert "no entry 'ddqn vqc' in runs, task tiny" in str(nowhere.exception)

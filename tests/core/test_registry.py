@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import types
@@ -202,8 +203,44 @@ def test_every_registered_reference_resolves(kind: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "order", ["import gymnasium, qrlsuite", "import qrlsuite, gymnasium; qrlsuite.register_environments()"]
+    "order",
+    [
+        "import gymnasium, qrlsuite",
+        "import qrlsuite, gymnasium",
+        "import qrlsuite; from gymnasium.envs import registration; import gymnasium",
+        "import qrlsuite, qrlsuite.registry; qrlsuite.registry.load(); import gymnasium",
+    ],
 )
 def test_environments_are_known_to_gymnasium(order: str) -> None:
-    program = f"{order}; env = gymnasium.make('qrlsuite/BeamManagement6G-v1', degree=4); env.reset(seed=0)"
+    program = (
+        f"import sys; finders = list(sys.meta_path); {order}; assert sys.meta_path == finders, sys.meta_path; "
+        "env = gymnasium.make('qrlsuite/BeamManagement6G-v1', degree=4); env.reset(seed=0)"
+    )
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)
+
+
+def test_who_imports_no_gymnasium_loads_no_plugin() -> None:
+    program = (
+        "import sys, qrlsuite, json, argparse; "
+        "assert not {'gymnasium', 'qrlsuite.registry', 'pluggy', 'importlib.metadata'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_plugin_may_import_gymnasium_while_it_is_loaded(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    (site / "heavy-1.dist-info").mkdir(parents=True)
+    (site / "heavy-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: heavy\nVersion: 1\n")
+    (site / "heavy-1.dist-info" / "entry_points.txt").write_text("[qrlsuite]\nheavy = heavy\n")
+    (site / "heavy.py").write_text(
+        "import gymnasium\nfrom qrlsuite import hookimpl, specs\n\n\n@hookimpl\n"
+        "def register_environments(register):\n"
+        "    register(specs.EnvironmentSpec('mine', 'a pole', 'qrlsuite.plugins.circuits.ansatz:NoOptions', "
+        "gymnasium_id='heavy/Pole-v0', entry_point='gymnasium.envs.classic_control.cartpole:CartPoleEnv'))\n"
+    )
+    program = (
+        "import qrlsuite.registry as registry; assert not registry.load().problems, registry.load().problems; "
+        "import gymnasium; gymnasium.make('heavy/Pole-v0'); gymnasium.make('qrlsuite/BeamManagement6G-v1')"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, env=env)

@@ -102,3 +102,90 @@ def test_versions_that_mix_are_pointed_out(train: Callable[..., Path], tmp_path:
     shown = CliRunner().invoke(build(), ["show", path.name, "--runs", str(tmp_path / "runs")]).output
     assert '"torch": "2.0"' in shown
     assert np.__version__ in shown
+
+
+@pytest.fixture
+def with_smoke(tmp_path: Path) -> Path:
+    """A results folder with runs of a published entry: one epoch of three seeds, as a smoke test leaves them."""
+    from qrlsuite.engine.worker import train_group
+    from qrlsuite.experiment.entry import resolve
+    from qrlsuite.options import parse_setting
+
+    entry = resolve("beam6g", "mlp", settings=[parse_setting("width=16")])
+    train_group(EntryStore.create(tmp_path / "runs", entry).path, range(3), 1)
+    return tmp_path / "runs"
+
+
+def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
+    words = ("--task", "beam6g", "--runs", str(with_smoke), "--out", str(tmp_path / "p.svg"))
+
+    def plot(kind: str, *more: str) -> tuple[str, str]:
+        done = CliRunner().invoke(build(), ["plot", kind, *words, *more])
+        assert done.exit_code == 0, done.output + str(done.exception)
+        return done.output, (tmp_path / "p.svg").read_text()
+
+    for kind in ("bars", "surface", "tiers"):
+        output, picture = plot(kind, "--published")
+        assert "left out: ddqn mlp width=16: ends at 2000 steps; --horizon 2000 shows it" in output
+        assert "all cut to" not in picture
+    output, picture = plot("bars", "--published", "--horizon", "2000")
+    assert "left out" not in output
+    output, _ = plot("curves", "--published")  # which cuts nothing
+    assert "left out" not in output
+    output, _ = plot("bars", "--published", "--min-seeds", "20", "--set", "epsilons=[0.2]")
+    assert "left out: ddqn mlp width=16: 3 seeds, fewer than 20" in output
+    output, _ = plot("bars")  # alone it cuts nobody
+    assert "left out" not in output
+
+
+def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -> None:
+    def rows(*words: str) -> dict[int, list[tuple[str, int]]]:
+        done = CliRunner().invoke(
+            build(), ["leaderboard", "--runs", str(with_smoke), "--format", "json", "--published", *words]
+        )
+        assert done.exit_code == 0, str(done.exception)
+        content = json.loads(done.stdout)
+        return {
+            section["horizon"]: [(row["label"], row["seeds"]) for row in section["rows"]]
+            for section in content["sections"]
+            if section["task"] == "beam6g"
+        }
+
+    own, other = ("ddqn mlp width=16", 3), ("ddqn mlp width=16 (published)", 100)
+    both = rows("--entry", "beam6g/mlp width=16")
+    assert both == {2000: [own], 200_000: [other]}
+    assert sorted(rows("--entry", "mlp width=16", "--task", "beam6g", "--horizon", "2000")[2000]) == [
+        own,
+        other,
+    ]
+    everything = rows("--horizon", "2000")
+    assert list(everything) == [2000]
+    assert {own, other} <= set(everything[2000])
+    assert own not in rows("--min-seeds", "20")[200_000]
+    assert 2000 not in rows("--min-seeds", "20")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("--horizon", "2500"),
+            "an epoch of task 'beam6g' has 2000 steps; write a multiple of it, such as --horizon 2000",
+        ),
+        (("--horizon", "4000"), "no entry is left: ddqn mlp width=16: ends at 2000 of 4000 steps"),
+        (("--min-seeds", "4"), "no entry is left: ddqn mlp width=16: 3 seeds, fewer than 4"),
+    ],
+)
+def test_what_leaves_nothing_says_why(words: tuple[str, ...], message: str, with_smoke: Path) -> None:
+    for command in (("leaderboard",), ("plot", "bars")):
+        done = CliRunner().invoke(build(), [*command, "--runs", str(with_smoke), *words])
+        assert message in str(done.exception)
+
+
+def test_of_entries_below_every_horizon_the_length_of_half_of_them_counts() -> None:
+    lengths = {"mlp a": 30, "mlp b": 20, "mlp c": 20, "mlp d": 5}
+    kept, lines = collect.equally_long([drawn(label, epochs=epochs) for label, epochs in lengths.items()])
+    assert [entry.label for entry in kept] == ["mlp a", "mlp b", "mlp c"]
+    assert lines == ["mlp d: ends at 10000 steps; --horizon 10000 shows it"]
+    kept, lines = collect.equally_long([drawn("mlp a"), *(drawn(f"mlp {i}", epochs=20) for i in range(3))])
+    assert [entry.label for entry in kept] == ["mlp a"], "the others do not reach the task's horizon"

@@ -120,7 +120,8 @@ def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None
 
     lookup.check_tasks(runs, task)
     if names:
-        found = [collect.find(runs, name, published) for name in dict.fromkeys(names)]
+        tasks = [task] if task else []
+        found = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
     else:
         found, refused = collect.collect(runs, task, shipped=published)
         for line in refused:

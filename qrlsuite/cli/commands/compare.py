@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RuleOption, RunsOption
+from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RuleOption, RunsOption
 from qrlsuite.leaderboard import rules
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ def compare(
         typer.Argument(metavar="ENTRY", help="An entry: name or label, [TASK/] before it, or the beginning."),
     ],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
+    task: AmongOption = None,
     rule: RuleOption = rules.DEFAULT,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
@@ -38,13 +39,16 @@ def compare(
 
     Both are compared at equal numbers of seeds and equal horizons.
 
-    Example: qrlsuite compare "mlp width=64" "mlp width=16"
+    Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
     import json
 
     from qrlsuite.leaderboard import board, collect
+    from qrlsuite.results import lookup
 
-    one, other = (collect.find(runs, name, published) for name in (first, second))
+    lookup.check_tasks(runs, task)
+    tasks = [task] if task else []
+    one, other = (collect.find(runs, name, published, tasks) for name in (first, second))
     comparison = board.compare_entries(one, other, rules.load(rule))
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))

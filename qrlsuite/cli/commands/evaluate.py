@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
 from qrlsuite.cli.terminal import table_console
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def evaluate(
             help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder.",
         ),
     ],
+    task: AmongOption = None,
     best: Annotated[
         int, typer.Option("--best", min=1, help="Evaluate the runs with the best last validation score.")
     ] = 10,
@@ -56,11 +57,14 @@ def evaluate(
     from dataclasses import replace
 
     from qrlsuite.leaderboard import collect
+    from qrlsuite.results import lookup
     from qrlsuite.results.store import EntryStore
     from qrlsuite.training import evaluation
 
     format_ = _format(out)
-    folders = dict.fromkeys(collect.find(runs, name).folder.resolve() for name in entries)
+    lookup.check_tasks(runs, task)
+    tasks = [task] if task else []
+    folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in entries)
     stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
     with _progress(json_output) as report:

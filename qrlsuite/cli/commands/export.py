@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.arguments import RunsOption
+from qrlsuite.cli.arguments import RunsOption, TaskOption
 
 
 def export(
@@ -15,6 +15,7 @@ def export(
         list[str] | None,
         typer.Argument(metavar="[ENTRY]...", help="Names or labels, [TASK/] before them, or the beginnings."),
     ] = None,
+    task: TaskOption = None,
     everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/TASK/ENTRY/.")] = Path(
         "leaderboard/entries"
@@ -34,15 +35,19 @@ def export(
     from qrlsuite.errors import OptionError, QrlSuiteError
     from qrlsuite.leaderboard import collect
     from qrlsuite.leaderboard.export import export as write
+    from qrlsuite.results import lookup
 
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
+    lookup.check_tasks(runs, task)
     if everything:
-        found, refused = collect.collect(runs)
+        found, refused = collect.collect(runs, task)
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
     else:
-        found = [collect.find(runs, name) for name in dict.fromkeys(entries or [])]
+        found = [
+            collect.find(runs, name, tasks=[task] if task else []) for name in dict.fromkeys(entries or [])
+        ]
     failed = 0
     for entry in found:
         try:

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qrlsuite.cli.arguments import PublishedOption, RuleOption, RunsOption, TaskOption
+from qrlsuite.cli.arguments import (
+    EntryOption,
+    HorizonOption,
+    MinSeedsOption,
+    PublishedOption,
+    RuleOption,
+    RunsOption,
+    TaskOption,
+)
 from qrlsuite.cli.commands import verify
 from qrlsuite.cli.terminal import table_console
 from qrlsuite.leaderboard import rules
@@ -36,6 +44,9 @@ app.command("verify")(verify.verify)
 def leaderboard(
     context: typer.Context,
     task: TaskOption = None,
+    entry: EntryOption = None,
+    horizon: HorizonOption = None,
+    min_seeds: MinSeedsOption = 1,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
     output: Annotated[
         Path | None,
@@ -52,6 +63,7 @@ def leaderboard(
     A tier is 1 + the longest chain of entries that outperform one another above it. Entries are compared at
     equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: environment steps
     until (and whenever) fewer than delta of the runs score 1 - epsilon, with its 5th to 95th percentile.
+    With --published, an entry that you trained less far than the published one is shown beside it.
 
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """
@@ -67,8 +79,9 @@ def leaderboard(
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     lookup.check_tasks(runs, task)
-    found, refused = collect.collect(runs, task, published)
-    board = boards.build(found, refused, rules.load(rule))
+    tasks = [task] if task else []
+    found, refused = collect.select(runs, tasks, entry or [], published, horizon, min_seeds)
+    board = boards.build(found, refused, rules.load(rule), horizon)
     if format_ is Format.json:
         typer.echo(json.dumps(boards.as_dict(board)))
         return

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
+from qrlsuite.cli.arguments import (
+    EntryOption,
+    HorizonOption,
+    JsonOption,
+    MinSeedsOption,
+    PublishedOption,
+    RunsOption,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,14 +41,9 @@ def plot(
             "--task", help="Which task, where there are several; more than one where a picture can."
         ),
     ] = None,
-    entry: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--entry",
-            metavar="ENTRY",
-            help="Only this entry (name or label, [TASK/] before it, or the beginning); for several, repeat --entry.",
-        ),
-    ] = None,
+    entry: EntryOption = None,
+    horizon: HorizonOption = None,
+    min_seeds: MinSeedsOption = 1,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,6 +65,8 @@ def plot(
     json_output: JsonOption = False,
 ) -> None:
     """Draw a picture from the results, or of a task's environment.
+
+    Entries that would cut the others to their own length are left out and named, unless --entry names them.
 
     Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface --set style=3d;
     qrlsuite plot trajectories --task beam6g --set environment.degree=5
@@ -98,12 +102,15 @@ def plot(
         of = pictures.KINDS[kind].of
         if of == "episodes":
             raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
-        if of == "nothing" and (task or entry):
-            raise OptionError(
-                f"picture '{kind}' shows no results: leave {'--task' if task else '--entry'} out"
-            )
+        given = {"--task": task, "--entry": entry, "--horizon": horizon, "--min-seeds": min_seeds > 1}
+        if of == "nothing" and any(given.values()):
+            name = next(name for name, value in given.items() if value)
+            raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
         if of == "entries":
-            found = _entries(runs, published, task or [], entry or [])
+            cuts = "horizon" in options.field_names(specs.resolve(reference))
+            if cuts and horizon is not None:
+                own.setdefault("horizon", horizon)
+            found = _entries(runs, published, task or [], entry or [], horizon, min_seeds, cuts)
         figure = pictures.draw(kind, found, **own)
         name, folder = ("-".join(dict.fromkeys(e.task for e in found)), runs) if found else ("", Path())
     path = output or folder / f"{name}-{kind}.png".removeprefix("-")
@@ -206,22 +213,35 @@ def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     return own, world
 
 
-def _entries(runs: Path, shipped: bool, tasks: list[str], names: list[str]) -> list[EntryCurves]:
-    """Return the entries to draw: those named, in that order, else all of the task, the smallest model first."""
+def _entries(
+    runs: Path,
+    shipped: bool,
+    tasks: list[str],
+    names: list[str],
+    horizon: int | None,
+    min_seeds: int,
+    cuts: bool,
+) -> list[EntryCurves]:
+    """Return the entries to draw: those named, in that order, else all of the task, the smallest model first.
+
+    Parameters
+    ----------
+    cuts:
+        Whether the picture cuts all entries to one length.
+    """
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
     from qrlsuite.results import lookup
 
     lookup.check_tasks(runs, *tasks)
-    if names:
-        found = [collect.find(runs, name, shipped) for name in dict.fromkeys(names)]
-        found = [e for e in found if not tasks or e.task in tasks]
-    else:
-        found, refused = collect.collect(runs, shipped=shipped)
-        for line in refused:
-            typer.echo(f"left out: {line}", err=True)
-        found = [e for e in found if not tasks or e.task in tasks]
+    found, left_out = collect.select(runs, tasks, names, shipped, horizon, min_seeds)
+    if not names:
         found.sort(key=lambda e: (e.model, sum(e.parameters), e.label))
+        if cuts:
+            found, short = collect.equally_long(found)
+            left_out += short
+    for line in left_out:
+        typer.echo(f"left out: {line}", err=True)
     held = sorted({e.task for e in found})
     if not found:
         wanted = f" of task {' or '.join(tasks)}" if tasks else ""

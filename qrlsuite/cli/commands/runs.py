@@ -1,4 +1,4 @@
-"""`qrlsuite runs`: what the results folder holds; `qrlsuite runs gc`: remove checkpoints that are done with."""
+"""`qrlsuite runs`: what the results folder holds; `runs gc` removes checkpoints that are done with, `rm` entries."""
 
 from __future__ import annotations
 
@@ -16,30 +16,46 @@ if TYPE_CHECKING:
 
 def runs(
     action: Annotated[
-        str | None, typer.Argument(metavar="[gc]", help="gc: remove the checkpoints of finished groups.")
+        str | None,
+        typer.Argument(
+            metavar="[gc|rm]", help="gc: remove the checkpoints of finished groups. rm: delete entries."
+        ),
+    ] = None,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENTRY]...", help="For rm: name or label, [TASK/] before it, or the beginning."
+        ),
     ] = None,
     task: TaskOption = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="With gc: do it; without, it says what it would do.")
+        bool,
+        typer.Option("--yes", help="With gc: do it; without, it says what it would do. With rm: do not ask."),
     ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """List what is there: task, entry, seeds by status, epochs, size on disk, last activity.
 
-    Example: qrlsuite runs --task beam6g
+    `rm` asks before it deletes, and deletes no entry that is being trained.
+
+    Examples: qrlsuite runs --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
     """
     from qrlsuite.errors import OptionError, nearest
-    from qrlsuite.results import lookup
 
-    lookup.check_tasks(runs, task)
+    naming.check_tasks(runs, task)
+    if action == "rm":
+        _delete(runs, task, names or [], yes, json_output)
+        return
+    if names:
+        raise OptionError(f"`qrlsuite runs {action}` takes no entry: leave '{names[0]}' out")
     if action == "gc":
         _collect_garbage(runs, task, yes, json_output)
         return
     if action is not None:
-        raise OptionError(f"`qrlsuite runs` has no action '{action}'{nearest(action, ['gc'])}")
+        raise OptionError(f"`qrlsuite runs` has no action '{action}'{nearest(action, ['gc', 'rm'])}")
     if yes:
-        raise OptionError("--yes belongs to `qrlsuite runs gc`")
+        raise OptionError("--yes belongs to `qrlsuite runs gc` and `qrlsuite runs rm`")
     _list(runs, task, json_output)
 
 
@@ -125,3 +141,36 @@ def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: boo
         f"would remove {len(items)} checkpoint{'s' * (len(items) > 1)}, {size_text(total)}. Curves and trained agents "
         "stay, but these seeds can then not be extended by more epochs. To do it: qrlsuite runs gc --yes"
     )
+
+
+def _delete(folder: Path, task: str | None, names: list[str], yes: bool, json_output: bool) -> None:
+    import json
+
+    from qrlsuite.engine.api import Queues
+    from qrlsuite.errors import OptionError
+    from qrlsuite.results import lookup
+    from qrlsuite.results.store import entries
+    from qrlsuite.results.survey import delete, look
+
+    if not names:
+        raise OptionError("name the entries to delete: qrlsuite runs lists them")
+    stored = lookup.stored(entries(folder, task))
+    where = f"{folder}, task {task}" if task else folder
+    chosen = list(dict.fromkeys(lookup.choose(stored, name, where).store for name in names))
+    found = [look(store) for store in chosen]
+    for entry in found:
+        count = sum(entry.seeds.values())
+        what = f"{entry.task}/{entry.name} ({entry.label}, {count} seed{'s' * (count != 1)})"
+        typer.echo(f"{size_text(entry.size):>7}  {printable(what)}", err=json_output)
+    if not yes and not typer.confirm("Delete this for good?", err=json_output):
+        typer.echo("nothing was deleted", err=json_output)
+        raise typer.Exit(1)
+    queues, freed = Queues(), 0
+    for store, entry in zip(chosen, found):
+        queued = queues.waiting(store) if entry.seeds.get("submitted") else None
+        freed += delete(folder, store, queued)
+    if json_output:
+        rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in found]
+        typer.echo(json.dumps({"deleted": rows, "freed": freed}))
+    else:
+        typer.echo(f"deleted, {size_text(freed)} freed")

@@ -181,7 +181,22 @@ def _content(kind: str, name: str) -> dict[str, Any]:
     reference = getattr(spec, "options", None)
     if reference:
         content["options"] = options.describe(specs.resolve(reference))
+        content["set_with"] = _set_with(kind, name)
     return content
+
+
+def _set_with(kind: str, name: str) -> str:
+    """Return what to type to change an option of a thing."""
+    from qrlsuite import options, registry, specs
+
+    if kind != "ansatzes":
+        return "--set NAME=VALUE"
+    for model, registered in registry.load().entries["models"].items():
+        if isinstance(registered.spec, specs.ModelSpec):
+            names = options.field_names(specs.resolve(registered.spec.options))
+            if {"ansatz", "ansatz_options"} <= set(names):
+                return f"qrlsuite run --model {model} --set ansatz={name} --set NAME=VALUE"
+    return "no installed model takes an ansatz"
 
 
 def _draw(
@@ -211,8 +226,12 @@ def _text(content: dict[str, Any], indent: str = "") -> str:
     """Lay nested content out as indented lines; option tables with their descriptions."""
     lines = []
     for key, value in content.items():
+        if key == "set_with":
+            continue
         if key == "options" and isinstance(value, list):
-            lines.append(f"{indent}options (change with --set NAME=VALUE)")
+            lines.append(
+                f"{indent}options (change with {content['set_with']})" if value else f"{indent}options: none"
+            )
             for row in value:
                 lines.append(f"{indent}  {row['name']} = {_value(row['default'])}    {row['values']}")
                 lines.append(f"{indent}      {row['description']}")

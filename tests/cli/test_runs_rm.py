@@ -1,0 +1,93 @@
+"""`qrlsuite runs rm` deletes what it was asked for, after a question, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.results.claims import acquire
+from qrlsuite.results.store import EntryStore, write_json
+
+
+def call(runs: Path, *words: str, typed: str | None = None) -> Result:
+    return CliRunner().invoke(build(), ["runs", *words, "--runs", str(runs)], input=typed)
+
+
+@pytest.fixture
+def two(train: Callable[..., Path]) -> tuple[Path, Path]:
+    """Two entries of the folder `runs`."""
+    first, second = (train("runs", [0, 1], 1, settings=(f"width={width}",)) for width in (8, 16))
+    return first, second
+
+
+def test_it_asks_first(two: tuple[Path, Path], tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for typed in ("n\n", "\n", ""):
+        said = call(runs, "rm", "mlp width=8", typed=typed)
+        assert said.exit_code == 1
+        assert f"tiny/{two[0].name} (ddqn mlp width=8, 2 seeds)" in said.output
+        assert two[0].is_dir()
+    said = call(runs, "rm", "mlp width=8", "--task", "tiny", typed="y\n")
+    assert said.exit_code == 0, said.output
+    assert "freed" in said.output
+    assert [path.name for path in two[0].parent.iterdir()] == [two[1].name]
+    assert call(runs, "rm", two[1].name, "--yes", "--json").exit_code == 0
+    assert not two[1].exists()
+
+
+def test_an_entry_that_is_being_trained_stays(two: tuple[Path, Path], tmp_path: Path) -> None:
+    claim = acquire(EntryStore(two[0]), [7])  # a seed that has no folder yet
+    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
+    assert isinstance(said.exception, StoreError)
+    assert "are being trained by process" in str(said.exception)
+    assert (two[0] / "entry.json").exists()
+    claim.release()
+    assert call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exit_code == 0
+
+
+def test_an_entry_that_waits_in_a_queue_stays(two: tuple[Path, Path], tmp_path: Path) -> None:
+    task = {"job": "7", "seeds": [5], "epochs": 1}
+    write_json(two[0] / "slurm" / "submitted.json", {"tasks": [task]})  # of which no queue can be asked here
+    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
+    assert isinstance(said.exception, QrlSuiteError)
+    assert (two[0] / "entry.json").exists()
+
+
+def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (tmp_path / "runs" / "tiny").rename(elsewhere)
+    (tmp_path / "runs" / "tiny").symlink_to(elsewhere)
+    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
+    assert isinstance(said.exception, StoreError)
+    assert "links are not followed" in str(said.exception)
+    (tmp_path / "runs" / "tiny").unlink()
+    (tmp_path / "runs" / "tiny").mkdir()
+    link = tmp_path / "runs" / "tiny" / two[0].name
+    link.symlink_to(elsewhere / two[0].name)
+    assert isinstance(call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exception, StoreError)
+    link.unlink()
+    (elsewhere / two[0].name).rename(link)
+    (link / "data").symlink_to(elsewhere)
+    assert call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exit_code == 0
+    assert (elsewhere / two[1].name / "entry.json").exists()
+
+
+def test_mistakes_say_what_to_type(two: tuple[Path, Path], tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for words, kind, message in (
+        (("rm",), OptionError, "name the entries to delete"),
+        (("rm", "mpl width=8", "--yes"), UnknownNameError, "did you mean 'mlp width=8'"),
+        (("rm", "mlp", "--yes"), UnknownNameError, "may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"),
+        (("rm", "mlp width=8", "mlp", "--yes"), UnknownNameError, "may be any of"),
+        (("gc", "mlp"), OptionError, "takes no entry"),
+        (("mr",), OptionError, "did you mean 'rm'"),
+    ):
+        said = call(runs, *words)
+        assert isinstance(said.exception, kind), words
+        assert message in str(said.exception)
+    assert all(path.exists() for path in two)
