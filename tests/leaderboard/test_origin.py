@@ -30,7 +30,7 @@ def test_counts_that_are_no_counts_are_refused(tmp_path: Path, count: object) ->
     seed = SeedStore(tmp_path, 0)
     seed.lines.write_bytes(json_line({"epoch": 1, "scores": [0.5], "executions": {"forward": count}}))
     with pytest.raises(StoreError, match="circuit executions"):
-        seed.read().executions
+        _ = seed.read().executions
 
 
 def test_every_version_is_told_once() -> None:

@@ -42,8 +42,9 @@ def runs(
     Examples: qrlsuite runs --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
     """
     from qrlsuite.errors import OptionError, nearest
+    from qrlsuite.results import lookup
 
-    naming.check_tasks(runs, task)
+    lookup.check_tasks(runs, task)
     if action == "rm":
         _delete(runs, task, names or [], yes, json_output)
         return
