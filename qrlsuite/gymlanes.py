@@ -328,7 +328,10 @@ def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     try:
         return gymnasium.make(env_id, disable_env_checker=True, **arguments)
     except DependencyNotInstalled as error:
-        raise OptionError(f"environment '{env_id}': {error}") from error
+        box2d = "box2d" in str(error).lower()
+        advice = "pip install 'qrlsuite[box2d]'" if box2d else str(error)
+        lacks = " needs Box2D, which is not installed" if box2d else ""
+        raise OptionError(f"environment '{env_id}'{lacks}: {advice}") from error
     except ModuleNotFoundError as error:
         package = str(error.name).partition(".")[0]
         raise OptionError(

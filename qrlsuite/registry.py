@@ -4,13 +4,15 @@
 fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
 reported by the name of its distribution and skipped as a whole; everything else works. A name registered twice is
 an error that names both distributions when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
-first of these problems ends the command.
+first of these problems ends the command. `QRLSUITE_LOAD_PLUGINS=acme-qrl,other` loads the plugins of these
+distributions only, and an empty value those of the suite only.
 """
 
 from __future__ import annotations
 
 import functools
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +28,9 @@ from qrlsuite.errors import PluginError, UnknownNameError, nearest
 
 STRICT = "QRLSUITE_STRICT"
 """Environment variable: problems of plugins are fatal, in workers too."""
+
+LOAD_PLUGINS = "QRLSUITE_LOAD_PLUGINS"
+"""Environment variable: the only distributions, separated by commas, whose plugins are loaded beside the suite's own."""
 
 KINDS: dict[str, type[specs.Spec]] = {
     "environments": specs.EnvironmentSpec,
@@ -226,14 +231,36 @@ def words(error: BaseException) -> str:
 
 
 def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
-    """Entry points of the group with their distribution's name, the suite's own first."""
+    """Entry points of the group with their distribution's name, the suite's own first.
+
+    Raises
+    ------
+    PluginError
+        If `QRLSUITE_LOAD_PLUGINS` names a distribution that has none.
+    """
     found: dict[tuple[str, str], metadata.EntryPoint] = {}
     for point in metadata.entry_points(group=hookspecs.PROJECT):
         owner = point.dist.name if point.dist is not None else "unknown"
         found.setdefault((owner, point.value), point)
+    chosen = os.environ.get(LOAD_PLUGINS)
+    if chosen is not None:
+        wanted = [word.strip() for word in chosen.split(",") if word.strip()]
+        owners = {_canonical(owner): owner for owner, _ in found}
+        for word in wanted:
+            if _canonical(word) not in owners:
+                raise PluginError(
+                    f"{LOAD_PLUGINS}: no installed distribution '{word}' has plugins{nearest(word, owners)}"
+                )
+        kept = {"qrlsuite", *(owners[_canonical(word)] for word in wanted)}
+        found = {key: point for key, point in found.items() if key[0] in kept}
     return sorted(
         ((key[0], point) for key, point in found.items()), key=lambda p: (p[0] != "qrlsuite", p[0], p[1].name)
     )
+
+
+def _canonical(distribution: str) -> str:
+    """Return a distribution's name as package indexes compare it (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def create(

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import signal
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +18,22 @@ import pytest
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored,
 # and so would every command that a test interrupts
+
+for variable in [name for name in os.environ if name.startswith("QRLSUITE_") and name != "QRLSUITE_CACHE"]:
+    del os.environ[variable]  # a user's results folder, trackers, strictness
+os.environ["PATH"] = (
+    f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # as in an active environment
+)
+os.environ["QRLSUITE_LOAD_PLUGINS"] = ""  # whatever is installed; tests name the packages that they install
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Run everything in an empty folder: the checkout's `runs/` is the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("elsewhere"))
+        yield
+
 
 LONGEST = (
     "third_party/test_stranger.py",
@@ -86,6 +107,92 @@ horizons = [180]
 """Episodes that end at different times."""
 
 
+def install(site: Path, name: str, code: str, requires: str = "qrlsuite>=0.1") -> None:
+    """Leave a distribution with one plugin module as pip would."""
+    (site / f"{name}.py").write_text(code)
+    info = site / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\nRequires-Dist: {requires}\n"
+    )
+    (info / "entry_points.txt").write_text(f"[qrlsuite]\nmain = {name}\n")
+
+
+def installed(site: Path) -> dict[str, str]:
+    """Return the environment in which the distributions of a folder are found, and no others."""
+    names = [distribution.name for distribution in metadata.distributions(path=[str(site)])]
+    own = ",".join(name for name in names if name != "qrlsuite")
+    return {**os.environ, "PYTHONPATH": str(site), "QRLSUITE_LOAD_PLUGINS": own}
+
+
+HOLDING = """
+import os
+import signal
+import time
+from pathlib import Path
+
+from qrlsuite import hookimpl
+
+SITE = Path(__file__).parent
+
+
+@hookimpl
+def epoch_finished(run, record):
+    mark = SITE / f"held-{os.getpid()}"
+    if mark.exists():
+        return
+    asked = []
+    before = signal.signal(signal.SIGTERM, lambda *given: asked.append(given))
+    mark.touch()
+    while not asked and not (SITE / "released").exists():
+        time.sleep(0.01)
+    signal.signal(signal.SIGTERM, before)
+    if asked:
+        before(*asked[0])
+"""
+
+
+class Hold:
+    """A plugin that holds each worker at the end of its first epoch, until it is stopped or all are released.
+
+    However fast or slow a machine is, what is to be interrupted has begun and has not ended.
+
+    Attributes
+    ----------
+    environment:
+        For the commands whose workers are to be held.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.site = folder / "holding"
+        self.site.mkdir()
+        install(self.site, "holding", HOLDING)
+        self.environment = installed(self.site)
+        self._seen = 0
+
+    def wait(self, *processes: subprocess.Popen[str]) -> None:
+        """Return when one more worker of these commands is held."""
+        while len(list(self.site.glob("held-*"))) <= self._seen:
+            assert all(process.poll() is None for process in processes), "it ended before a worker was held"
+            time.sleep(0.02)
+        self._seen = len(list(self.site.glob("held-*")))
+
+    def release(self) -> None:
+        """Let all workers go on."""
+        (self.site / "released").touch()
+
+
+@pytest.fixture
+def hold(tmp_path: Path) -> Iterator[Hold]:
+    held = Hold(tmp_path)
+    yield held
+    held.release()
+
+
+HANGS = 3600
+"""Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
+
+
 @pytest.fixture
 def tiny_task(tmp_path: Path) -> str:
     """The path of a task file whose episodes (20 steps) do not end with its epochs (15 steps per environment)."""
@@ -122,6 +229,14 @@ def results(entry: Path, seed: int) -> tuple[bytes, bytes]:
     """The bytes that must not depend on anything but the seed: its curve and its trained agent."""
     folder = entry / f"seed-{seed:04d}"
     return (folder / "epochs.parquet").read_bytes(), (folder / "final.safetensors").read_bytes()
+
+
+def most_epochs(entry: Path) -> int:
+    """How far the farthest seed of an entry has come."""
+    from qrlsuite.results.store import EntryStore
+
+    store = EntryStore(entry)
+    return max(len(store.seed(seed).epochs()) for seed in store.seeds())
 
 
 def golden(name: str) -> Any:

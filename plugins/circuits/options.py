@@ -38,7 +38,8 @@ class QiskitOptions:
     gradient: Annotated[
         Literal["auto", "reverse", "parameter-shift", "lin-comb", "spsa"],
         Field(
-            description="auto: reverse where exact and qiskit-algorithms is installed, else parameter-shift"
+            description="auto: where exact, reverse if qiskit-algorithms is installed, else lin-comb (linear "
+            "combination of unitaries); with shots or aer, parameter-shift"
         ),
     ] = "auto"
     shots: Annotated[

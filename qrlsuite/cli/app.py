@@ -102,6 +102,7 @@ def build() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
     for command in BUILT_IN.values():
         app.command(command.name, help=command.summary)(lambda: None)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+from qrlsuite.cli.terminal import command, counted
 
 if TYPE_CHECKING:
     from qrlsuite.experiment.entry import Entry
@@ -18,6 +20,17 @@ if TYPE_CHECKING:
 
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
+
+WINDOW_SECONDS = 2.0
+"""Seconds of training over which the speed of the first epoch is measured."""
+
+VALIDATION = 1.25
+"""By what an epoch is longer than its training, before a whole one was measured."""
+
+SILENCE_SECONDS = 20.0
+"""Seconds of training without a finished epoch after which is said what it will take."""
+
+DAY = 86400.0
 
 FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
 
@@ -38,17 +51,60 @@ def duration(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days"
 
 
+class _Clock:
+    """What one group's progress said, and when: how long its epochs, and the rounds of its first one, take."""
+
+    def __init__(self) -> None:
+        self.epoch, self.epoch_began = -1, 0.0
+        self.round, self.round_began = (-1, ""), 0.0
+        self.window: tuple[float, int] | None = None
+        self.rate: float | None = None
+        """Seconds per round, measured over the last few seconds of training: the first rounds only fill a memory."""
+
+    def look(self, state: Mapping[str, Any], now: float) -> None:
+        """Take in where the group stands."""
+        epoch, done, phase = (
+            int(state.get("epoch") or 0),
+            int(state.get("done") or 0),
+            str(state.get("phase")),
+        )
+        if epoch != self.epoch:
+            self.epoch, self.epoch_began, self.window = epoch, now, None
+        if (done, phase) != self.round:
+            self.round, self.round_began = (done, phase), now
+        if phase != "training" or not done:
+            return
+        began, before = self.window = self.window or (now, done)
+        if done - before >= 2 and now - began >= WINDOW_SECONDS:
+            self.rate, self.window = (now - began) / (done - before), (now, done)
+
+    def seconds_per_round(self, now: float) -> float | None:
+        """Return what a round takes by now, at least what the current one has taken; None before training begins."""
+        if self.round[1] != "training":
+            return self.rate
+        waited = now - self.round_began
+        return (
+            max(self.rate, waited) if self.rate is not None else waited if waited >= WINDOW_SECONDS else None
+        )
+
+
+def _short(seconds: float) -> str:
+    return duration(seconds) if seconds >= 10 else f"{seconds:.2g} s"
+
+
 class CostEstimate:
-    """What is left, measured: from the rounds of the first epoch at first, then from whole epochs."""
+    """What is left, measured: from the rounds of the first epoch at first, then from whole epochs.
+
+    An epoch is never taken to be shorter than what the current one has taken so far.
+    """
 
     def __init__(self, groups: Sequence[Group], epochs: int, workers: int) -> None:
         self.groups = {group.id: group for group in groups}
         self.epochs = epochs
         self.workers = min(workers, max(1, len(groups)))
-        self._first: dict[str, tuple[float, int]] = {}
-        self._measured: dict[str, float] = {}
+        self._clocks = {name: _Clock() for name in self.groups}
 
-    def remaining(self, snapshot: dict[str, dict[str, Any]], now: float) -> float | None:
+    def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:
         """Return the seconds left on these workers, None before anything was measured."""
         per_epoch = {name: self._epoch_seconds(name, state, now) for name, state in snapshot.items()}
         known = [
@@ -64,24 +120,31 @@ class CostEstimate:
             state = snapshot.get(name, {})
             measured = per_epoch.get(name)
             seconds = measured if measured is not None else mean * len(group.seeds)
-            left = self.epochs - float(state.get("epoch") or group.epoch)
-            if state.get("phase") == "training" and state.get("total"):
-                left -= (
-                    0.8 * float(state["done"]) / float(state["total"])
-                )  # the rest of an epoch is validation
-            total += max(0.0, left) * seconds
-            longest = max(longest, max(0.0, left) * seconds)
+            left = (self.epochs - float(state.get("epoch") or group.epoch)) * seconds
+            if measured is not None and state.get("phase") in ("training", "validating"):
+                left -= now - self._clocks[name].epoch_began
+            total += max(0.0, left)
+            longest = max(longest, left)
         return max(total / self.workers, longest)
 
-    def _epoch_seconds(self, name: str, state: dict[str, Any], now: float) -> float | None:
+    def slowest_round(self, now: float) -> float | None:
+        """Return what one round takes in the group where it takes longest, in seconds; None before it is known."""
+        known = [clock.seconds_per_round(now) for clock in self._clocks.values()]
+        return max((seconds for seconds in known if seconds is not None), default=None)
+
+    def _epoch_seconds(self, name: str, state: Mapping[str, Any], now: float) -> float | None:
+        clock = self._clocks[name]
+        clock.look(state, now)
+        elapsed = now - clock.epoch_began if state.get("phase") in ("training", "validating") else 0.0
         if state.get("epoch_seconds"):
-            return float(state["epoch_seconds"])
-        done, total = int(state.get("done") or 0), int(state.get("total") or 0)
-        if state.get("phase") == "training" and total and done:
-            began, before = self._first.setdefault(name, (now, done))
-            if done - before >= 2 and now - began >= 2.0:
-                self._measured[name] = 1.25 * total * (now - began) / (done - before)
-        return self._measured.get(name)  # the first epoch's validation adds nothing: what was measured stays
+            return max(float(state["epoch_seconds"]), elapsed)
+        a_round, total = clock.seconds_per_round(now), int(state.get("total") or 0)
+        if state.get("phase") == "training" and a_round is not None and total:
+            rest = (total - int(state.get("done") or 0)) * a_round
+            return VALIDATION * (elapsed + rest)
+        if state.get("phase") == "validating":
+            return VALIDATION * elapsed if clock.rate is not None else None
+        return None
 
 
 class RunDisplay:
@@ -103,33 +166,50 @@ class RunDisplay:
         self.workers = min(workers, max(1, len(groups)))
         self.live: Progress | None = None
         self.bar: Any = None
+        self.deadline: float | None = None
+        """The moment, by `time.monotonic`, at which training is stopped."""
+        self.endless = False
+        """Whether more than a day is left, by what was measured."""
         self._announced = False
+        self._began = time.monotonic()
         self._last_line = time.monotonic()
+        self._last: dict[str, dict[str, Any]] = {}
 
-    def begin(self, busy: Collection[int], submits: bool = False) -> None:
-        """Say what will be done, here or by tasks that are submitted and left."""
+    def begin(self, busy: Collection[int], submits: bool = False, holders: Sequence[str] = ()) -> None:
+        """Say what will be done, here or by tasks that are submitted and left.
+
+        Parameters
+        ----------
+        busy:
+            Seeds that others train, or that wait in a queue.
+        holders:
+            Who trains them: `process 12 on HOST`.
+        """
         task = self.entry.task
         self.console.print(
             f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  ({escape(str(self.store.path))})"
         )
-        if busy:
-            self.console.print(
-                f"{len(busy)} of the seeds "
-                + (
-                    "wait in the queue or are being trained"
-                    if submits
-                    else "are being trained by another process"
-                )
-                + " and are left to it; repeat this command when it has ended to see the whole"
-            )
         todo = sum(len(group.seeds) for group in self.groups)
+        if busy:
+            are = "is" if len(busy) == 1 else "are"
+            waits = "waits in the queue or is" if len(busy) == 1 else "wait in the queue or are"
+            who = f" by {', '.join(holders)}" if holders else ""
+            nothing = "" if todo else ": nothing is left to do here"
+            self.console.print(
+                f"{counted(len(busy), 'seed')} {waits if submits else are} being trained{who}{nothing}; repeat this "
+                "command when that has ended to see the whole",
+                markup=False,
+                soft_wrap=True,
+            )
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
         there = len(self.seeds) - len(busy) - todo
         places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
-        parts = [f"{todo} seeds to epoch {self.epochs}, {self.workers} {places}"]
-        parts += [f"{there} seeds are already there"] * bool(there) + [f"{resumed} resume"] * bool(resumed)
+        parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
+        parts += [f"{counted(there, 'seed')} already there"] * bool(there) + [f"{resumed} resume"] * bool(
+            resumed
+        )
         end = "" if submits else " Ctrl-C saves; the same command continues."
         self.console.print("; ".join(parts) + "." + end)
         if submits:
@@ -149,9 +229,13 @@ class RunDisplay:
     def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
         """Show where every group stands."""
         now = time.monotonic()
+        self._last = snapshot
         left = self.estimate.remaining(snapshot, now)
-        if left is not None and not self._announced:
-            self._announce(left)
+        epoch_done = any(state.get("epoch_seconds") for state in snapshot.values())
+        if left is not None and not self._announced and (epoch_done or now - self._began >= SILENCE_SECONDS):
+            self._announce(left, now, epoch_done)
+        if left is not None and self.deadline is not None:
+            left = min(left, max(0.0, self.deadline - now))
         done, completed, epochs = 0.0, 0, []
         scores: list[float] = []
         for group in self.groups:
@@ -177,19 +261,32 @@ class RunDisplay:
             self._last_line = now
             self.console.print(text)
 
-    def _announce(self, left: float) -> None:
+    def _announce(self, left: float, now: float, epoch_done: bool) -> None:
+        """Say once what it will take, after the first epoch or after some seconds without one."""
         self._announced = True
+        self.endless = left > DAY
         if left < 10:
             return
-        self.console.print(
-            f"this will take about {duration(left)} here (measured on the first rounds; refined as it goes)"
-        )
-        faster = FASTER.get(self.entry.model.name)
-        if left > 3600 and faster is not None:
-            from qrlsuite import registry
+        a_round = self.estimate.slowest_round(now)
+        if epoch_done or a_round is None:
+            self.console.print(f"this will take about {duration(left)} here (measured on the first epoch)")
+        else:
+            self.console.print(
+                f"no epoch is done yet: one round of steps and updates of a group takes {_short(a_round)}, all of it "
+                f"about {duration(left)} or more",
+                soft_wrap=True,
+            )
+        if left > 3600:
+            for advice in self._faster():
+                self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
 
-            if faster in registry.load().names("models"):
-                self.console.print(f"[bold]--model {faster}[/bold] trains the same circuit many times faster")
+    def _faster(self) -> list[str]:
+        from qrlsuite import registry
+
+        faster = FASTER.get(self.entry.model.name)
+        if faster in registry.load().names("models"):
+            return [f"--model {faster} trains the same circuit many times faster"]
+        return ["fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"]
 
     def close(self) -> None:
         """Take the live bar away."""
@@ -202,19 +299,27 @@ class RunDisplay:
         self.close()
         self.console.print("stopped; every finished epoch is saved. The same command continues from there.")
 
+    def out_of_time(self, minutes: float) -> None:
+        """Say that training stopped as it was asked to, how far it is, and how to go on."""
+        self.close()
+        reached = [int(state.get("epoch") or 0) for state in self._last.values()] or [0]
+        epochs = f"{min(reached)}" if min(reached) == max(reached) else f"{min(reached)} to {max(reached)}"
+        self.console.print(
+            f"stopped after {minutes:g} min, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "
+            "same command continues from there, and without --minutes to the end.",
+            soft_wrap=True,
+        )
+
     def finished(self, summary: dict[str, Any]) -> None:
         """Sum the run up, and say what to type next."""
         self.close()
         score = summary["median_score"]
         shown = f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
-        self.console.print(f"{summary['seeds']} seeds complete{shown}")
+        self.console.print(f"{counted(summary['seeds'], 'seed')} complete{shown}")
         wanted = self.entry.task.file.protocol.seeds
         if summary["seeds"] < wanted:
             self.console.print(f"provisional: the task's protocol asks for {wanted} seeds")
         runs = self.store.path.parent.parent
-        where = "" if str(runs) == "runs" else f" --runs {runs}"
         name = self.entry.task.name
-        self.console.print(
-            f"next: qrlsuite leaderboard --task {name}{where}    qrlsuite plot curves --task {name}{where}",
-            soft_wrap=True,
-        )
+        for words in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
+            self.console.print(f"next: {command(*words, runs=runs)}", markup=False, soft_wrap=True)

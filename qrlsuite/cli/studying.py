@@ -11,19 +11,11 @@ from typing import TYPE_CHECKING, Any
 from qrlsuite.cli.display import RunDisplay, duration
 from qrlsuite.cli.training import Place, Plan, plan, train
 from qrlsuite.errors import OptionError
-from qrlsuite.results.speed import Estimate, Speeds
+from qrlsuite.results.speed import BASES, Estimate, Speeds
 
 if TYPE_CHECKING:
     from qrlsuite.engine.api import Outcome
     from qrlsuite.studies.study import Member
-
-BASES = {
-    "measured": "measured on its own epochs",
-    "scaled": "measured on a similar entry, scaled by reference speeds",
-    "alike": "measured on a similar entry, not scaled",
-    "reference": "reference speeds of another machine",
-    "unknown": "not known before a first epoch is trained",
-}
 
 
 @dataclass(frozen=True)

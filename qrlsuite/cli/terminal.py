@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -14,6 +19,38 @@ def table_console(least: int = 130) -> Console:
 
     console = Console(highlight=False)
     return console if console.is_terminal else Console(width=max(console.width, least), highlight=False)
+
+
+def command(*words: str, runs: Path | None = None) -> str:
+    """Return a `qrlsuite` command line that works where it is pasted: quoted, with the results folder that it needs.
+
+    Where the shell does not find this installation's `qrlsuite`, for its virtual environment is not active, the line
+    begins with the program's path.
+
+    Parameters
+    ----------
+    runs:
+        The results folder of a command that takes `--runs`; it is left out where it is the default.
+    """
+    default = Path(os.environ.get("QRLSUITE_RUNS") or "runs")
+    where = [] if runs is None or runs == default else ["--runs", str(runs)]
+    return f"{_program()} {shlex.join([*words, *where])}"
+
+
+def _program() -> str:
+    own = Path(sys.executable).parent / "qrlsuite"  # not resolved: a virtual environment's python is a link
+    found = shutil.which("qrlsuite")
+    if found is not None and own.exists() and os.path.samefile(found, own):
+        return "qrlsuite"
+    if not own.exists():
+        return f"{shlex.quote(sys.executable)} -m qrlsuite"
+    here = Path.cwd()
+    return shlex.quote(str(own.relative_to(here) if own.is_relative_to(here) else own))
+
+
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Return a number of things: `1 seed`, `2 seeds`, `2 processes`."""
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def printable(text: object) -> str:

@@ -34,6 +34,14 @@ EngineOptionsOption = Annotated[
     list[str] | None,
     typer.Option("--engine-set", metavar="NAME=VALUE", help="A further option of the engine."),
 ]
+MinutesOption = Annotated[
+    float | None,
+    typer.Option(
+        "--minutes",
+        metavar="MINUTES",
+        help="Stop after this time with what is there, saved as by Ctrl-C; the same command continues.",
+    ),
+]
 TrackOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -138,8 +146,21 @@ def plan(runs: Path, entry: Entry, seeds: Sequence[int], epochs: int, where: Pla
     return Plan(entry, store, seeds, epochs, frozenset(busy), missing)
 
 
-def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
+class _TimeIsUp(Exception):
+    """Ends an engine's work as Ctrl-C does."""
+
+
+def train(
+    work: Plan, where: Place, display: RunDisplay, minutes: float | None = None, confirmed: bool = True
+) -> Outcome:
     """Train what is planned, showing progress; returns how it ended.
+
+    Parameters
+    ----------
+    minutes:
+        After which training stops, with every finished epoch saved. None for no limit.
+    confirmed:
+        Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
 
     Raises
     ------
@@ -148,18 +169,39 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
     QrlSuiteError
         If a group failed; finished epochs are kept.
     """
+    import time
+
     from qrlsuite.cli.terminal import printable
     from qrlsuite.engine import api
+    from qrlsuite.errors import QrlSuiteError
+    from qrlsuite.results.claims import living
     from qrlsuite.results.store import EntryStore
 
+    began = time.monotonic()
+
+    def show(snapshot: api.Snapshot) -> None:
+        display.update(snapshot)
+        if display.endless and not confirmed and minutes is None and display.console.is_terminal:
+            raise QrlSuiteError("stopped, for this takes more than a day: --yes starts it all the same")
+        if minutes is not None and time.monotonic() - began >= 60 * minutes:
+            raise _TimeIsUp
+
+    display.deadline = None if minutes is None else began + 60 * minutes
+    if not where.submits and work.groups:
+        _check_device(where.device)
+    fresh = not work.store.path.exists()
     EntryStore.create(work.store.path.parent.parent, work.entry)
-    display.begin(work.busy, where.submits)
+    holders = sorted({f"process {claim.pid} on {claim.host}" for claim in living(work.store)})
+    display.begin(work.busy, where.submits, holders)
     if not work.groups:
         return api.Outcome()
     try:
         outcome = where.engine.run(
-            api.Work(work.store, work.groups, work.epochs, where.workers, where.device), display.update
+            api.Work(work.store, work.groups, work.epochs, where.workers, where.device), show
         )
+    except _TimeIsUp:
+        display.out_of_time(minutes or 0.0)
+        return api.Outcome()
     except KeyboardInterrupt:
         display.interrupted()
         raise typer.Exit(130) from None
@@ -167,10 +209,38 @@ def train(work: Plan, where: Place, display: RunDisplay) -> Outcome:
         display.close()
     for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
         display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
+    if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
+        _remove(work.store.path)
+        raise QrlSuiteError("; ".join(sorted(set(outcome.failed.values()))))
     api.raise_failures(outcome)
     for message in outcome.taken.values():
         display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
     return outcome
+
+
+def _check_device(name: str) -> None:
+    """Look whether there is such a device; torch is imported for a GPU only.
+
+    Raises
+    ------
+    OptionError
+        If this machine or this build of torch has none.
+    """
+    if name != "cpu":
+        from qrlsuite.training import device
+
+        device.find(name)
+
+
+def _remove(folder: Path) -> None:
+    """Remove the folder of an entry of which nothing could be built, and those above it that are then empty."""
+    import contextlib
+    import shutil
+
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
 
 
 def _warnings(store: EntryStore, group: Group) -> list[str]:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from qrlsuite.cli.display import duration, hours_text
-from qrlsuite.cli.terminal import table_console
+from qrlsuite.cli.terminal import command, counted, table_console
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -57,6 +57,7 @@ class TuneDisplay:
         from qrlsuite.tuning.samplers import NAMES
 
         total: float | None = 0.0
+        bases: dict[str, None] = {}
         for search in self.searches:
             request, base = search.request, search.base
             seeds = len(request.seeds)
@@ -68,24 +69,27 @@ class TuneDisplay:
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
             ]
             self.console.print("\n".join(lines), markup=False)
-            hours = self._hours(search)
+            hours, basis = self._hours(search)
+            bases.setdefault(basis)
             total = None if total is None or hours is None else total + hours
         cores = self.where.workers
         if total is None:
             self.console.print("what it costs will be known after the first trial")
         else:
             self.console.print(
-                f"about {hours_text(total)} core-hours, {duration(total * 3600 / cores)} with {cores} processes, by "
-                "what such runs have taken here; finished trials cost nothing again"
+                f"about {hours_text(total)} core-hours, {duration(total * 3600 / cores)} with "
+                f"{counted(cores, 'process', 'processes')} ({'; '.join(bases)}); finished trials cost nothing again"
             )
 
-    def _hours(self, search: Search) -> float | None:
-        from qrlsuite.tuning.search import pace
+    def _hours(self, search: Search) -> tuple[float | None, str]:
+        """Return the core-hours of a whole search, None where unknown, and what that rests on."""
+        from qrlsuite.results import speed
 
-        seconds = pace([search.runs, self.runs], search.base)
-        if seconds is None:
-            return None
-        return seconds * search.planned * len(search.request.seeds) * search.epochs / 3600
+        found = speed.known(search.runs, self.runs).estimate(search.base)
+        basis = speed.BASES[found.basis]
+        if found.seconds is None:
+            return None, basis
+        return found.seconds * search.planned * len(search.request.seeds) * search.epochs / 3600, basis
 
     def trial(self, entry: Entry, work: Plan) -> None:
         """Show that a trial begins."""
@@ -201,14 +205,13 @@ def report(searches: Sequence[Search], written: Mapping[int, Path], runs: Path, 
     elif not complete:
         left = sum(search.planned - search.asked for search in searches)
         wide.print(f"the budget is spent, {left} trials are left: the same command continues")
-    where = "" if str(runs) == "runs" else f" --runs {runs}"
     for i, path in written.items():
         base = searches[i].base
-        wide.print(
-            f"next: qrlsuite run --task {searches[i].request.task} --model {base.model.name} --preset {path}{where}",
-            markup=False,
-            soft_wrap=True,
-        )
+        words = ["run", "--task", searches[i].request.task, "--model", base.model.name]
+        if base.algorithm.name != base.task.file.default_algorithm:
+            words += ["--algorithm", base.algorithm.name]
+        line = command(*words, "--preset", str(path), runs=runs)
+        wide.print(f"next: {line}", markup=False, soft_wrap=True)
 
 
 def _table(search: Search) -> Any:

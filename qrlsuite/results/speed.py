@@ -23,13 +23,21 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field
 
-from qrlsuite import options
+from qrlsuite import options, registry, specs
 from qrlsuite.errors import StoreError, TaskError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.store import EntryStore, entries, read_lines
 
 SAMPLED_SEEDS = 8
 """Seeds of an entry whose timings are read; those of a group hardly differ."""
+
+BASES = {
+    "measured": "measured on its own epochs",
+    "scaled": "measured on a similar entry, scaled by reference speeds",
+    "alike": "measured on a similar entry, not scaled",
+    "reference": "reference speeds of another machine",
+    "unknown": "not known before a first epoch is trained",
+}
 
 Basis = Literal["measured", "scaled", "alike", "reference", "unknown"]
 
@@ -109,6 +117,25 @@ class Speeds:
         found = measure(store)
         if found is not None:
             self.measured = [*(speed for speed in self.measured if speed.hash != found.hash), found]
+
+
+def known(*folders: Path) -> Speeds:
+    """Read the speeds of results folders, and the reference speeds of all studies: the evidence of every estimate.
+
+    Raises
+    ------
+    TaskError
+        If a file of reference speeds is malformed.
+    """
+    references = [
+        registered.spec.speeds
+        for kind, registered in registry.load()
+        if kind == "studies" and isinstance(registered.spec, specs.StudySpec)
+    ]
+    speeds = gather(folders[0], dict.fromkeys(references))
+    for folder in folders[1:]:
+        speeds.measured += gather(folder).measured
+    return speeds
 
 
 def gather(runs: Path, references: Iterable[str | None] = ()) -> Speeds:

@@ -7,10 +7,12 @@ with the same curves and parameters, byte for byte, as one never stopped.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +21,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 import qrlsuite
-from qrlsuite import population, specs
+from qrlsuite import population, registry, specs
 from qrlsuite.environment import LaneEnv
-from qrlsuite.errors import EnvironmentFailure, StoreError
+from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
@@ -41,16 +43,39 @@ Policy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
 Report = Callable[[Progress], None]
 
 
+@contextlib.contextmanager
+def _building(kind: str, name: str) -> Iterator[None]:
+    """Turn whatever a plugin raises while something of it is built into one message with the place in its code.
+
+    Raises
+    ------
+    PluginError
+        Naming what could not be built, and its distribution.
+    """
+    try:
+        yield
+    except QrlSuiteError:
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        owner = registry.load().get(kind, name).distribution
+        raise PluginError(
+            f"{registry.SINGULAR[kind]} '{name}' of {owner} cannot be built: {registry.words(error)} "
+            f"({last.filename}, line {last.lineno})"
+        ) from error
+
+
 def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
     """Build the task's environment with a number of lanes."""
     spec = entry.task.environment
     given = entry.task.environment_options
     inner: LaneEnv
-    if spec.vector is not None:
-        inner = specs.resolve(spec.vector)(given, lanes)
-    else:
-        qrlsuite.register_environments()
-        inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(given))
+    with _building("environments", spec.name):
+        if spec.vector is not None:
+            inner = specs.resolve(spec.vector)(given, lanes)
+        else:
+            qrlsuite.register_environments()
+            inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(given))
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 
@@ -135,17 +160,18 @@ class ModelBuilder:
     def __call__(self, out_dim: int) -> nn.Module:
         """Return a population of freshly initialized agents."""
         spec, given = self.entry.model, self.entry.model_options
-        build = specs.resolve(spec.build)
         call = len(self.built)
-        agents = [
-            build(self.observation_size, out_dim, given, streams.torch("init", call))
-            for streams in self.streams
-        ]
-        self.parameters.append(population.count_parameters(agents[0]))
-        if spec.population is None:
-            together = population.stack(agents)
-        else:
-            together = specs.resolve(spec.population)(agents, given)
+        with _building("models", spec.name):
+            build = specs.resolve(spec.build)
+            agents = [
+                build(self.observation_size, out_dim, given, streams.torch("init", call))
+                for streams in self.streams
+            ]
+            self.parameters.append(population.count_parameters(agents[0]))
+            if spec.population is None:
+                together = population.stack(agents)
+            else:
+                together = specs.resolve(spec.population)(agents, given)
         if self.statistics is not None:
             self.statistics.attach(together)
         self.built.append(together)
@@ -239,8 +265,9 @@ class Trainer:
             self.statistics = RunningStatistics(self.S, self.E, size, found)
             self.envs.observe = self.statistics.observe
         self.models = ModelBuilder(entry, size, self.streams, self.statistics)
-        factory = specs.resolve(entry.algorithm.factory)
-        self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, found)
+        with _building("algorithms", entry.algorithm.name):
+            factory = specs.resolve(entry.algorithm.factory)
+            self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, found)
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:

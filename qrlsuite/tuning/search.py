@@ -6,7 +6,6 @@ finished on the disk, and ends with the same preset (but for the measured hours)
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from qrlsuite.experiment.task import digest
 from qrlsuite.options import Setting
 from qrlsuite.results import provenance
 from qrlsuite.results.seeds import format_seeds, parse_seeds
-from qrlsuite.results.store import EntryStore, entries, write_atomically
+from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.tuning import samplers, space
 from qrlsuite.tuning.objective import Merit, Objective, cell_text, merit
 
@@ -295,33 +294,3 @@ def as_dict(search: Search) -> dict[str, Any]:
             for trial in ordered
         ],
     }
-
-
-def pace(folders: Sequence[Path], entry: Entry) -> float | None:
-    """Return the core-seconds per epoch and seed that runs like an entry's have taken here; None where there are none.
-
-    Runs with the same model options count, else all with the same model and algorithm on the task.
-    """
-    like: list[float] = []
-    same: list[float] = []
-    for folder in folders:
-        for store in entries(folder, entry.task.name) if folder.is_dir() else []:
-            identity = store.record()["identity"]
-            if [identity["algorithm"], identity["model"]] != [entry.algorithm.name, entry.model.name]:
-                continue
-            measured = _measured(store)
-            like += measured
-            if identity.get("model_options") == options.plain(entry.model_options):
-                same += measured
-    found = same or like
-    return statistics.median(found) if found else None
-
-
-def _measured(store: EntryStore) -> list[float]:
-    """Return seconds per epoch of a few of an entry's runs."""
-    found = []
-    for seed in store.seeds()[:5]:
-        epochs = int((store.seed(seed).record() or {}).get("epochs", 0))
-        if epochs:
-            found.append(store.seed(seed).seconds() / epochs)
-    return found

@@ -20,7 +20,7 @@ from qrlsuite.circuit.description import GATES
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import NativeBackend, dense
 from qrlsuite.plugins.circuits.native.program import HADAMARD, PERMUTE, ROTATE, SIGN, compile_circuit
-from tests.conftest import golden
+from tests.conftest import HANGS, golden
 
 GOLDEN = golden("vqc")
 PATHS = ["kernels", "torch", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -357,7 +357,7 @@ def test_two_processes_may_compile_at_once_and_later_ones_start_from_the_cache(t
         )
         for _ in range(2)
     ]
-    printed = [process.communicate(timeout=300) for process in both]
+    printed = [process.communicate(timeout=HANGS) for process in both]
     assert [process.returncode for process in both] == [0, 0], printed
     assert printed[0][0] == printed[1][0]
     assert "compiling the circuit simulator" in printed[0][1] + printed[1][1]

@@ -78,6 +78,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         install(folder, name, code)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
+        patch.setenv(registry.LOAD_PLUGINS, ",".join(DISTRIBUTIONS))
         registry.load.cache_clear()
         yield folder
     registry.load.cache_clear()

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
+import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from qrlsuite.cli import main
+from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
-from tests.conftest import TINY, results
+from tests.conftest import HANGS, TINY, Hold, install, installed, most_epochs, results
 
 
 def qrlsuite(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=HANGS, check=False)
 
 
 @pytest.fixture
@@ -60,58 +62,145 @@ def test_more_seeds_widen_an_entry(task: str, tmp_path: Path) -> None:
     entry = next((tmp_path / "runs" / "tiny").iterdir())
     before = results(entry, 0)
     wider = qrlsuite(*words, "--seeds", "3")
-    assert "1 seeds to epoch 3" in wider.stderr
-    assert "2 seeds are already there" in wider.stderr
+    assert "1 seed to epoch 3" in wider.stderr
+    assert "2 seeds already there" in wider.stderr
     assert results(entry, 0) == before
     assert EntryStore(entry).seeds() == [0, 1, 2]
 
 
-def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, hold: Hold) -> None:
     def words(runs: str) -> list[str]:
-        run = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "3", "--epochs", "60"]
+        run = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "3", "--epochs", "8"]
         return [*run, "--runs", str(tmp_path / runs), "--workers", "2"]
 
     assert qrlsuite(*words("straight")).returncode == 0
     straight = next((tmp_path / "straight" / "tiny").iterdir())
     stopped = tmp_path / "stopped" / "tiny" / straight.name
     process = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words("stopped")], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "qrlsuite", *words("stopped")],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=hold.environment,
     )
-    while not (stopped / "seed-0000" / "epochs.jsonl").exists():
-        assert process.poll() is None
-        time.sleep(0.02)
+    hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
-    _, message = process.communicate(timeout=60)
+    _, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130
     assert "every finished epoch is saved. The same command continues" in message
-    assert not (stopped / "seed-0000" / "epochs.parquet").exists(), "it was too fast to be interrupted"
+    assert not list(stopped.glob("seed-*/epochs.parquet"))
     assert qrlsuite(*words("stopped")).returncode == 0
     for seed in range(3):
         assert results(straight, seed) == results(stopped, seed)
 
 
-def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: Path) -> None:
+def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: Path, hold: Hold) -> None:
     runs = str(tmp_path / "runs")
     words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs]
-    endless = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words, "--seeds", "0:2", "--epochs", "100000", "--workers", "1"],
+    first = subprocess.Popen(
+        [sys.executable, "-m", "qrlsuite", *words, "--seeds", "0:2", "--workers", "1"],
         stderr=subprocess.DEVNULL,
+        text=True,
+        env=hold.environment,
     )
-    try:
-        while not list((tmp_path / "runs").glob("*/*/claims/*.json")):
-            assert endless.poll() is None
-            time.sleep(0.05)
-        other = qrlsuite(*words, "--seeds", "3", "--epochs", "2")
-        assert other.returncode == 0, other.stderr
-        assert "2 of the seeds are being trained by another process and are left to it" in other.stderr
-    finally:
-        endless.send_signal(signal.SIGINT)
-        assert endless.wait(60) == 130
+    hold.wait(first)
+    other = qrlsuite(*words, "--seeds", "3", "--epochs", "2")
+    assert other.returncode == 0, other.stderr
+    assert "2 seeds are being trained by process" in other.stderr
+    assert f" on {socket.gethostname()}; repeat this command" in other.stderr
+    same = qrlsuite(*words, "--seeds", "0:2")
+    assert (same.returncode, "nothing is left to do here" in same.stderr) == (0, True), same.stderr
+    hold.release()
+    assert first.wait(HANGS) == 0
+
+
+def test_minutes_stop_a_run_as_ctrl_c_does(task: str, tmp_path: Path) -> None:
+    words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "1", "--workers", "1"]
+    runs = ["--runs", str(tmp_path / "runs")]
+    done = qrlsuite(*words, *runs, "--epochs", "1000000", "--minutes", "0.1")
+    assert done.returncode == 0, done.stderr
+    assert "stopped after 0.1 min, at epoch " in done.stderr
+    assert "The same command continues from there" in " ".join(done.stderr.split())
+    (entry,) = (tmp_path / "runs" / "tiny").iterdir()
+    assert EntryStore(entry).finished([0], 1_000_000) == set()
+    assert {header.epoch for header in checkpoint.headers(EntryStore(entry))} <= {most_epochs(entry)}
+    epochs = most_epochs(entry) + 1
+    for folder in (tmp_path / "runs", tmp_path / "straight"):
+        assert qrlsuite(*words, "--runs", str(folder), "--epochs", str(epochs)).returncode == 0
+    assert results(entry, 0) == results(tmp_path / "straight" / "tiny" / entry.name, 0)
+
+
+def test_what_comes_next_works_as_it_is_printed(task: str, tmp_path: Path) -> None:
+    """In a folder whose name needs quoting, with the environment active and without."""
+    folder = tmp_path / "my results"
+    folder.mkdir()
+    words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "1", "--epochs", "1"]
+    own = Path(sys.executable).parent
+    without = os.pathsep.join(p for p in os.environ["PATH"].split(os.pathsep) if p != str(own))
+    for path, program in ((os.environ["PATH"], "qrlsuite"), (without, str(own / "qrlsuite"))):
+        env = {**os.environ, "PATH": path}
+        done = subprocess.run(
+            [sys.executable, "-m", "qrlsuite", *words, "--runs", str(folder)],
+            capture_output=True, text=True, check=True, env=env, cwd=tmp_path,
+        )  # fmt: skip
+        lines = [
+            line.removeprefix("next: ") for line in done.stderr.splitlines() if line.startswith("next: ")
+        ]
+        assert [shlex.split(line)[0] for line in lines] == [program, program]
+        for line in lines:
+            subprocess.run(line, shell=True, check=True, env=env, cwd=tmp_path, capture_output=True)
+    assert list(folder.glob("*.png"))
+
+
+def test_two_of_help_and_one_of_many(task: str) -> None:
+    for words in (["-h"], ["run", "-h"], ["study", "run", "-h"]):
+        done = qrlsuite(*words)
+        assert (done.returncode, "Usage: qrlsuite" in done.stdout) == (0, True), done.stderr
+    assert "linear combination" in qrlsuite("show", "vqc-qiskit").stdout
+
+
+BROKEN = """
+from qrlsuite import hookimpl
+from qrlsuite.specs import ModelSpec
+
+def build(observations, actions, options, generator):
+    raise ZeroDivisionError("no width")
+
+@hookimpl
+def register_models(register):
+    options = "qrlsuite.plugins.models.mlp:Options"
+    register(ModelSpec("breaks", "Cannot be built", options, "broken_model:build", family="classical"))
+"""
+
+
+def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    site.mkdir()
+    install(site, "broken_model", BROKEN)
+    runs = ["--runs", str(tmp_path / "runs")]
+    for words, message in (
+        (
+            ["--model", "breaks"],
+            "model 'breaks' of broken_model cannot be built: ZeroDivisionError: no width (",
+        ),
+        (["--model", "mlp", "--device", "cuda:99"], "device = 'cuda:99'"),
+        (["--model", "vqc-pennylane", "--set", "device=default.qubitt"], "did you mean 'default.qubit'?"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "qrlsuite", "run", "--task", task, *words, *runs, "--seeds", "2"],
+            capture_output=True, text=True, check=False, env=installed(site),
+        )  # fmt: skip
+        assert done.returncode == 2, done.stderr
+        (line,) = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+        assert message in line
+        assert "Traceback" not in done.stderr
+        assert "times" not in line
+        assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["run", "--task", "beam6g", "--model", "mlp", "--minutes", "-1"], "--minutes 2"),
         (["run", "--task", "beam6h", "--model", "mlp"], "unknown task 'beam6h'; did you mean 'beam6g'"),
         (["run", "--task", "beam6g", "--model", "mpl"], "unknown model 'mpl'; did you mean 'mlp'"),
         (["run", "--task", "beam6g", "--model", "mlp", "--algorithm", "dqn"], "did you mean 'ddqn'"),

@@ -51,15 +51,47 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
     assert len({state["median_score"] for state in snapshot.values()}) == 2, "the groups must differ"
 
 
-def test_an_estimate_outlives_the_first_epoch_s_validation() -> None:
+def test_the_first_epoch_s_estimate_follows_its_slow_rounds() -> None:
     estimate = CostEstimate(PAIR[:1], epochs=10, workers=1)
     name = PAIR[0].id
     training = {"phase": "training", "epoch": 0, "total": 100}
     assert estimate.remaining({name: {**training, "done": 10}}, now=0.0) is None
-    # 20 rounds in 10 seconds: 50 seconds for an epoch's training, and a quarter more for its validation.
-    assert estimate.remaining({name: {**training, "done": 30}}, now=10.0) == pytest.approx(62.5 * 9.76)
-    validating = {"phase": "validation", "epoch": 0, "done": 1, "total": 20}
-    assert estimate.remaining({name: validating}, now=60.0) == pytest.approx(62.5 * 10)
+    # 20 rounds in 10 seconds: 10 seconds so far, 35 for the other 70, and a quarter more for validation.
+    first = estimate.remaining({name: {**training, "done": 30}}, now=10.0)
+    assert first == pytest.approx(10 * 1.25 * 45 - 10)
+    # now learning has begun, and a round takes 5 seconds
+    slow = estimate.remaining({name: {**training, "done": 32}}, now=20.0)
+    assert slow == pytest.approx(10 * 1.25 * (20 + 68 * 5) - 20)
+    validating = {"phase": "validating", "epoch": 0, "done": 1, "total": 20}
+    assert estimate.remaining({name: validating}, now=360.0) == pytest.approx(10 * 1.25 * 360 - 360)
+
+
+def test_an_epoch_is_not_shorter_than_it_has_taken_so_far() -> None:
+    estimate = CostEstimate(PAIR[:1], epochs=10, workers=1)
+    state = {"phase": "training", "epoch": 1, "done": 1, "total": 100, "epoch_seconds": 30.0}
+    assert estimate.remaining({PAIR[0].id: state}, now=0.0) == 9 * 30
+    assert estimate.remaining({PAIR[0].id: state}, now=20.0) == 9 * 30 - 20
+    assert estimate.remaining({PAIR[0].id: state}, now=100.0) == 9 * 100 - 100
+
+
+def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsys, monkeypatch) -> None:
+    """Its first update takes 100 seconds: after 20 what that means is said, with what is faster."""
+    clock = [1000.0]
+    monkeypatch.setattr("qrlsuite.cli.display.time.monotonic", lambda: clock[0])
+    display = RunDisplay(entry, EntryStore(tmp_path), range(3), 10, PAIR[:1], 1, quiet=False)
+    state = {"phase": "training", "epoch": 0, "done": 16, "total": 200}
+    for _ in range(25):
+        display.update({PAIR[0].id: state})
+        clock[0] += 1.0
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it" in shown
+    assert "faster: " in shown
+    assert not display.endless
+    late = RunDisplay(entry, EntryStore(tmp_path), range(3), 10_000, PAIR[:1], 1, quiet=False)
+    for _ in range(25):
+        late.update({PAIR[0].id: state})
+        clock[0] += 1.0
+    assert late.endless, "20 s a round, 200 rounds an epoch, 10,000 epochs"
 
 
 @pytest.mark.parametrize("submits", [False, True])
@@ -70,4 +102,4 @@ def test_what_is_submitted_cannot_be_stopped_by_ctrl_c(entry, tmp_path, capsys, 
     shown = " ".join(capsys.readouterr().err.split())
     assert ("Ctrl-C saves" in shown) is not submits
     assert ("5 seeds to epoch 3, 2 tasks" in shown) is submits
-    assert ("2 of the seeds wait in the queue" in shown) is submits
+    assert ("2 seeds wait in the queue" in shown) is submits

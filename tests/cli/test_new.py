@@ -14,6 +14,7 @@ from qrlsuite import __version__, scaffold
 from qrlsuite.cli import main
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.scaffold import Kind
+from tests.conftest import HANGS, installed
 
 ROOT = Path(__file__).parents[2]
 MYPY = """
@@ -39,7 +40,7 @@ def qrlsuite(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str,
 
 
 def run(*words: str, **more: object) -> str:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=600, **more)  # type: ignore[call-overload]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=HANGS, **more)  # type: ignore[call-overload]
     assert done.returncode == 0, done.stdout + done.stderr
     return str(done.stdout)
 
@@ -65,7 +66,6 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_new_packages_pass_their_own_tests(packages: Path) -> None:
-    path = os.pathsep.join([str(packages / "site"), os.environ.get("PYTHONPATH", "")])
     words = [
         sys.executable,
         "-m",
@@ -78,14 +78,13 @@ def test_new_packages_pass_their_own_tests(packages: Path) -> None:
         "no:cacheprovider",
     ]
     out = run(*words, "acme-ansatz", "acme-model", "acme-environment", "acme-algorithm", "acme-task",
-              "acme-tracker", cwd=packages, env={**os.environ, "PYTHONPATH": path})  # fmt: skip
+              "acme-tracker", cwd=packages, env=installed(packages / "site"))  # fmt: skip
     assert "9 passed" in out
 
 
 def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> None:
-    path = os.pathsep.join([str(packages / "site"), os.environ.get("PYTHONPATH", "")])
-    env = {**os.environ, "PYTHONPATH": path}
-    rows = json.loads(run(sys.executable, "-m", "qrlsuite", "list", "--json", env=env, cwd=packages))
+    words = (sys.executable, "-m", "qrlsuite", "list", "--json")
+    rows = json.loads(run(*words, env=installed(packages / "site"), cwd=packages))
     found = {(row["kind"], row["name"]) for row in rows if row["distribution"].startswith("acme-")}
     assert found == {
         ("ansatzes", "acme-ansatz"),

@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.study import parse
-from tests.conftest import TINY, results
+from tests.conftest import HANGS, TINY, Hold, results
 
 STUDY = """
 format_version = 1
@@ -230,6 +229,8 @@ def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
         assert result.exit_code == 0
         assert "vqc-native" in result.stdout
     assert not runs.exists()
+    said = say("run", widths, "--dry-run", "--engine", "here", "--runs", str(runs)).stdout
+    assert "ddqn mlp width=4: 0 of 4 seeds there, would train 4 of 4 missing (" in said
     steps = answer("run", widths, "--dry-run", "--engine", "here", "--runs", str(runs))["steps"]
     assert [step["would_train"] for step in steps] == [4, 4, 4]
     assert not runs.exists()
@@ -363,21 +364,25 @@ def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_pat
     assert [entry["busy"] for entry in again["entries"]] == [4, 4, 4]
 
 
-def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_path: Path, hold: Hold) -> None:
     runs = tmp_path / "runs"
     words = [sys.executable, "-m", "qrlsuite", "study", "run", widths, "--only", "width=16"]
-    words += ["--epochs", "60", "--seeds", "2", "--workers", "1", "--runs"]
-    process = subprocess.Popen([*words, str(runs)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not list(runs.glob("tiny/*/seed-0000/epochs.jsonl")):
-        assert process.poll() is None
-        time.sleep(0.02)
+    words += ["--epochs", "8", "--seeds", "2", "--workers", "1", "--runs"]
+    process = subprocess.Popen(
+        [*words, str(runs)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=hold.environment,
+    )
+    hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
-    out, message = process.communicate(timeout=120)
+    out, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130, message
     assert "every finished epoch is saved. The same command continues" in message
     assert "study-widths-curves.png" in out
     (folder,) = (runs / "tiny").iterdir()
-    assert not (folder / "seed-0000" / "epochs.parquet").exists(), "it was too fast to be interrupted"
+    assert not list(folder.glob("seed-*/epochs.parquet"))
     subprocess.run([*words, str(runs)], check=True, capture_output=True)
     subprocess.run([*words, str(tmp_path / "straight")], check=True, capture_output=True)
     (straight,) = (tmp_path / "straight" / "tiny").iterdir()

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
 from tests.cli.test_cli import qrlsuite
-from tests.conftest import TINY
+from tests.conftest import HANGS, TINY, Hold
 from tests.core.test_tuning import SETTINGS, finish, varied, without_hours
 
 
@@ -28,21 +27,22 @@ def task(tmp_path: Path) -> str:
     return str(path)
 
 
-def stop(words: list[str], folder: Path, sign: signal.Signals) -> tuple[int, str]:
+def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
     """Start a command in a session of its own and send it a signal once some seed has begun to learn."""
-    before = len(list(folder.glob("*/*/*/epochs.*")))
     process = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words], stderr=subprocess.PIPE, text=True, start_new_session=True
+        [sys.executable, "-m", "qrlsuite", *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=hold.environment,
     )
-    while len(list(folder.glob("*/*/*/epochs.*"))) <= before:
-        assert process.poll() is None, "it ended before it could be stopped"
-        time.sleep(0.02)
+    hold.wait(process)
     os.kill(process.pid, sign)
-    _, message = process.communicate(timeout=120)
+    _, message = process.communicate(timeout=HANGS)
     return process.returncode, message
 
 
-def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path: Path) -> None:
+def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path: Path, hold: Hold) -> None:
     from qrlsuite.tuning import search
 
     wanted = search.Request(
@@ -51,19 +51,19 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
         settings=SETTINGS,
         varied=varied("lr=1e-2,1e-3"),
         seeds=search.tuning_seeds("1"),
-        epochs=80,
+        epochs=8,
     )
     straight = search.Search(wanted, tmp_path / "straight")
     finish(straight)
     straight.write(straight.path)
 
     words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--set", "depth=1"]
-    words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "80", "--workers", "1"]
+    words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "8", "--workers", "1"]
     words += ["--runs", str(tmp_path / "stopped")]
     trials = tmp_path / "stopped" / "tuning"
-    code, _ = stop(words, trials, signal.SIGKILL)
+    code, _ = stop(words, hold, signal.SIGKILL)
     assert code == -signal.SIGKILL
-    code, message = stop(words, trials, signal.SIGINT)
+    code, message = stop(words, hold, signal.SIGINT)
     assert code == 130, message
     assert "The same command continues from there" in " ".join(message.split())
     assert not list(trials.glob("*.toml")), "no preset before all trials have ended"
@@ -146,3 +146,16 @@ def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> N
     assert rest.exit_code == 0
     assert "the budget is spent" not in rest.stdout
     assert "wrote " in rest.stdout
+
+
+def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(task: str, tmp_path: Path) -> None:
+    """By the one estimator: what was measured here, past an entry that cannot be read."""
+    runs = tmp_path / "runs"
+    trained = qrlsuite("run", "--task", task, "--model", "mlp", "--seeds", "1", "--runs", str(runs))
+    assert trained.returncode == 0, trained.stderr
+    (runs / "tiny" / "damaged").mkdir()
+    (runs / "tiny" / "damaged" / "entry.json").write_text("{")
+    words = ["tune", "--task", task, "--model", "mlp", "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
+    done = qrlsuite(*words, "--seeds", "1", "--runs", str(runs))
+    assert done.returncode == 0, done.stderr
+    assert "measured on" in done.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import subprocess
 import sys
 import textwrap
@@ -21,6 +20,7 @@ from qrlsuite.cli.commands.listing import hooks
 from qrlsuite.cli.extensions import add_commands
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
+from tests.conftest import install, installed
 
 NAMES = [row["name"] for row in hooks()]
 
@@ -95,21 +95,10 @@ def register_commands(app):
 """
 
 
-def install(site: Path, name: str, code: str, requires: str = "qrlsuite>=0.1") -> None:
-    """Leave a distribution with one plugin module as pip would."""
-    (site / f"{name}.py").write_text(code)
-    info = site / f"{name}-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\nRequires-Dist: {requires}\n"
-    )
-    (info / "entry_points.txt").write_text(f"[qrlsuite]\nmain = {name}\n")
-
-
 def suite(site: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-P", "-m", "qrlsuite", *words],
-        env={**os.environ, "PYTHONPATH": str(site), **environment},
+        env=installed(site) | environment,
         capture_output=True,
         text=True,
         check=False,
@@ -137,3 +126,19 @@ def test_broken_distributions_are_named_and_the_rest_works(tmp_path: Path) -> No
     for done in (suite(tmp_path, "--strict", "greet"), suite(tmp_path, "greet", QRLSUITE_STRICT="1")):
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_only_the_plugins_that_are_named_are_loaded(tmp_path: Path) -> None:
+    install(tmp_path, "acme_ok", COMMANDS.format(body="app.command('greet')(lambda: typer.echo('good day'))"))
+    install(tmp_path, "acme_import", "import no_such_package")
+    chosen = suite(tmp_path, "greet", QRLSUITE_LOAD_PLUGINS="Acme-OK")
+    assert (chosen.stdout, chosen.stderr) == ("good day\n", "")
+    none = suite(tmp_path, "list", "plugins", QRLSUITE_LOAD_PLUGINS="")
+    assert "acme" not in none.stdout + none.stderr
+    assert "mlp" in none.stdout
+    slip = suite(tmp_path, "list", QRLSUITE_LOAD_PLUGINS="acme-okay")
+    assert (slip.returncode, slip.stdout) == (2, "")
+    assert slip.stderr == (
+        "qrlsuite: QRLSUITE_LOAD_PLUGINS: no installed distribution 'acme-okay' has plugins; "
+        "did you mean 'acme-ok'?\n"
+    )

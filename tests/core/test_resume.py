@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.results import checkpoint
+from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from qrlsuite.training.trainer import Trainer
-from tests.conftest import results
+from tests.conftest import HANGS, most_epochs, results
 
 EPOCHS = 6
 
@@ -99,30 +100,30 @@ def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
 
 def test_sigkill_at_random_moments(train: Callable[..., Path], tmp_path: Path) -> None:
     """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
-    straight = train("straight", [0, 1, 2], 12)
     entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
     command = [sys.executable, "-c", "from qrlsuite.training import group; group.CHECKPOINT_SECONDS = 0.0\n"]
     command[-1] += "from qrlsuite.engine import worker; raise SystemExit(worker.main())"
-    command += [str(entry), "--seeds", "0:3", "--epochs", "12"]
+    command += [str(entry), "--seeds", "0:3", "--epochs"]
     dice = random.Random(1)
-    kills = 0
-    for _ in range(40):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for _ in range(6):
+        process = subprocess.Popen(
+            [*command, "1000000"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         _wait_for_claim(entry, process)
         time.sleep(dice.uniform(0.0, 0.6))
-        if process.poll() is None:
-            os.kill(process.pid, signal.SIGKILL)
-            kills += 1
-        if process.wait() == 0 or kills >= 6:
-            break
-    subprocess.run(command, check=True)
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    epochs = 1 + most_epochs(entry)
+    subprocess.run([*command, str(epochs)], check=True)
+    straight = train("straight", [0, 1, 2], epochs)
     for seed in range(3):
         assert results(straight, seed) == results(entry, seed)
-        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 13))
+        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))
 
 
 def _wait_for_claim(entry: Path, process: subprocess.Popen[bytes]) -> None:
-    while process.poll() is None and not any((entry / "claims").glob("*.json")):
+    while not any(claim.pid == process.pid for claim in claims(EntryStore(entry))):
+        assert process.poll() is None
         time.sleep(0.02)
 
 
@@ -143,6 +144,6 @@ def test_sigterm_saves_and_exits_130(train: Callable[..., Path]) -> None:
         assert process.poll() is None
         time.sleep(0.1)
     process.terminate()
-    assert process.wait(30) == 130
+    assert process.wait(HANGS) == 130
     assert checkpoint.headers(EntryStore(entry))[0].epoch >= 3
     assert not list((entry / "claims").glob("*.json"))

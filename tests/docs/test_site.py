@@ -12,6 +12,7 @@ import pytest
 
 from qrlsuite import statistics, testing
 from qrlsuite.specs import Spec
+from tests.conftest import HANGS
 from tests.docs.test_plugins import HOOKS
 
 ROOT = Path(__file__).parents[2]
@@ -40,7 +41,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         str(folder / "html"),
     ]
     # not --quiet: it hides warnings from --strict too
-    done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(
+        words, cwd=ROOT, env=env, capture_output=True, text=True, check=False, timeout=HANGS
+    )
     assert done.returncode == 0, done.stderr
     return folder / "html"
 

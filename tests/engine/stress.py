@@ -146,18 +146,13 @@ def disturbed(
     workers: int,
     pause: float,
     start: Callable[[list[str]], Any] = start,
-) -> tuple[Path, Counter[str]]:
-    """Run the command until everything has finished, killing it or a worker up to `kills` times on the way."""
+) -> Counter[str]:
+    """Start the command again and again, killing it or a worker, until `kills` have hit or everything has finished."""
     killed: Counter[str] = Counter()
-    deadline = time.monotonic() + 60 + 60 * kills
-    while (entry := finished(runs, seeds, epochs)) is None:
-        assert time.monotonic() < deadline, "no progress between the kills"
+    while finished(runs, seeds, epochs) is None and killed["supervisor"] + killed["worker"] < kills:
         run = start(words(task, runs, seeds, epochs, workers))
         killed["starts"] += 1
-        while run.poll() is None:
-            if killed["supervisor"] + killed["worker"] >= kills:
-                run.wait()
-                break
+        while run.poll() is None and killed["supervisor"] + killed["worker"] < kills:
             while run.poll() is None and not training(runs) & set(children(run.pid)):
                 time.sleep(0.01)
             time.sleep(dice.uniform(0, pause))
@@ -171,8 +166,19 @@ def disturbed(
                     os.kill(victim, signal.SIGKILL)
                     killed["at work"] += at_work
                     killed["supervisor" if victim == run.pid else "worker"] += 1
+        if run.poll() is None:
+            run.send_signal(signal.SIGTERM)  # its workers save and end with it
         run.wait()
-    return entry, killed
+    return killed
+
+
+def undisturbed(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> Path:
+    """Run the command to its end; returns the entry's folder."""
+    while True:
+        subprocess.run(words(task, runs, seeds, epochs, workers), check=True, stdout=subprocess.DEVNULL)
+        entry = finished(runs, seeds, epochs)
+        if entry is not None:  # else a worker of a killed command was still saving
+            return entry
 
 
 def compare(straight: Path, entry: Path, seeds: int, epochs: int) -> None:
@@ -199,15 +205,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         task = Path(folder) / "tiny.toml"
         task.write_text(TINY)
-        subprocess.run(
-            words(task, Path(folder) / "straight", given.seeds, given.epochs, given.workers), check=True
-        )
-        straight = finished(Path(folder) / "straight", given.seeds, given.epochs)
-        assert straight is not None
+        straight = undisturbed(task, Path(folder) / "straight", given.seeds, given.epochs, given.workers)
         while (done := total["supervisor"] + total["worker"]) < given.kills:
-            entry, killed = disturbed(
+            runs = Path(folder) / f"disturbed-{total['runs']}"
+            killed = disturbed(
                 task,
-                Path(folder) / f"disturbed-{total['runs']}",
+                runs,
                 given.kills - done,
                 dice,
                 given.seeds,
@@ -216,6 +219,7 @@ def main() -> None:
                 given.pause,
                 start_forked if given.forked else start,
             )
+            entry = undisturbed(task, runs, given.seeds, given.epochs, given.workers)
             compare(straight, entry, given.seeds, given.epochs)
             again = trained_again(entry, given.seeds, given.epochs)
             total += killed + Counter({"runs": 1, "epochs trained again": again})

@@ -20,14 +20,14 @@ from qrlsuite.errors import StoreError
 from qrlsuite.results import claims
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.store import EntryStore
-from tests.conftest import TINY, results
+from tests.conftest import HANGS, TINY, Hold, results
 from tests.engine.stress import finished
 
 
 def qrlsuite(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
     every = {**os.environ, **environment}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=every)
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=False, env=every)
 
 
 @pytest.fixture
@@ -114,24 +114,28 @@ def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
         answer("runs", "gc", "--yes", *runs)
 
 
-def test_two_commands_at_once(words: list[str], tmp_path: Path) -> None:
+def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> None:
     """Both begin before either has claimed anything; between them, every seed is trained once."""
-    command = [sys.executable, "-m", "qrlsuite", *words, "--epochs", "60", "--runs", str(tmp_path / "runs")]
+    command = [sys.executable, "-m", "qrlsuite", *words, "--epochs", "6", "--runs", str(tmp_path / "runs")]
     both = [
-        subprocess.Popen([*command, "--workers", w], stderr=subprocess.PIPE, text=True) for w in ("1", "2")
+        subprocess.Popen([*command, "--workers", w], stderr=subprocess.PIPE, text=True, env=hold.environment)
+        for w in ("1", "2")
     ]
-    said = [process.communicate(timeout=200)[1] for process in both]
+    while all(process.poll() is None for process in both):  # one ends, for the seeds are held by the other
+        time.sleep(0.02)
+    hold.release()
+    said = [process.communicate(timeout=HANGS)[1] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     text = "".join(said)
     assert "are being trained by" in text, text
     assert "Traceback" not in text
-    entry = finished(tmp_path / "runs", 2, 60)
+    entry = finished(tmp_path / "runs", 2, 6)
     if entry is None:  # one refused a group for a seed of it that the other trained
         assert subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode == 0
-        entry = finished(tmp_path / "runs", 2, 60)
+        entry = finished(tmp_path / "runs", 2, 6)
     assert entry is not None
     for seed in (0, 1):
-        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 61))
+        assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, 7))
 
 
 @pytest.fixture

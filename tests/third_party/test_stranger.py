@@ -10,10 +10,13 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.conftest import HANGS
 
 ROOT = Path(__file__).parents[2]
 SUITE = ("pyproject.toml", "README.md", "LICENSE", "qrlsuite", "plugins", "tasks", "leaderboard")
@@ -22,7 +25,7 @@ PIP = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
 
 
 def run(*words: str | Path, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "QRLSUITE_LOAD_PLUGINS")}
     done = subprocess.run(
         [str(word) for word in words],
         cwd=cwd,
@@ -30,7 +33,7 @@ def run(*words: str | Path, cwd: Path, code: int = 0) -> subprocess.CompletedPro
         capture_output=True,
         text=True,
         check=False,
-        timeout=600,
+        timeout=HANGS,
     )
     assert done.returncode == code, f"{words}\n{done.stdout}{done.stderr}"
     return done
@@ -72,9 +75,25 @@ class Installation:
                 self.python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder
             ).stdout.strip()
         )
-        borrowed = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
-        (site / "borrowed.pth").write_text("\n".join(borrowed) + "\n")
+        (site / "borrowed.pth").write_text(f"{self._borrowed()}\n")
         self.site = site
+
+    def _borrowed(self) -> Path:
+        """Make a folder of links to what is installed beside the suite, without other packages' plugins."""
+        borrowed = self.folder / "borrowed"
+        borrowed.mkdir()
+        for place in dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib")):
+            plugins = {
+                Path(str(found.locate_file(file))).relative_to(place).parts[0]
+                for found in metadata.distributions(path=[place])
+                if found.entry_points.select(group="qrlsuite")
+                for file in found.files or []
+                if Path(str(found.locate_file(file))).resolve().is_relative_to(place)
+            }
+            for path in Path(place).iterdir():
+                if path.name not in plugins:
+                    (borrowed / path.name).symlink_to(path)
+        return borrowed
 
     def pip(self, *words: str | Path) -> None:
         run(sys.executable, "-m", "pip", "--python", self.python, *words, cwd=self.folder)

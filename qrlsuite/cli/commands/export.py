@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite.cli.arguments import RunsOption, TaskOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
 
 
 def export(
@@ -24,6 +24,7 @@ def export(
         bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
     ] = False,
     runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
 ) -> None:
     """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
 
@@ -32,6 +33,9 @@ def export(
 
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """
+    import json
+
+    from qrlsuite.cli.terminal import command, counted
     from qrlsuite.errors import OptionError, QrlSuiteError
     from qrlsuite.leaderboard import collect
     from qrlsuite.leaderboard.export import export as write
@@ -48,7 +52,7 @@ def export(
         found = [
             collect.find(runs, name, tasks=[task] if task else []) for name in dict.fromkeys(entries or [])
         ]
-    failed = 0
+    written = []
     for entry in found:
         try:
             folder = write(entry, out, force)
@@ -56,12 +60,23 @@ def export(
             if not everything:
                 raise
             typer.echo(f"left out: {error}", err=True)
-            failed += 1
             continue
         size = sum(path.stat().st_size for path in folder.iterdir())
-        typer.echo(
-            f"wrote {folder} ({len(entry.seeds)} seed{'s' * (len(entry.seeds) != 1)}, {size / 1000:.0f} kB)"
+        written.append(
+            {
+                "task": entry.task,
+                "entry": entry.name,
+                "label": entry.label,
+                "folder": str(folder),
+                "seeds": len(entry.seeds),
+                "bytes": size,
+            }
         )
-    if len(found) == failed:
+        if not json_output:
+            typer.echo(f"wrote {folder} ({counted(len(entry.seeds), 'seed')}, {size / 1000:.0f} kB)")
+    if not written:
         raise QrlSuiteError(f"{runs} holds no complete entry: qrlsuite runs --runs {runs} says what is there")
-    typer.echo(f"next: qrlsuite leaderboard verify {out} --rerun 2")
+    if json_output:
+        typer.echo(json.dumps(written))
+    else:
+        typer.echo(f"next: {command('leaderboard', 'verify', str(out), '--rerun', '2')}")

@@ -39,6 +39,7 @@ def import_results(
     """
     import json
 
+    from qrlsuite.cli.terminal import command
     from qrlsuite.errors import OptionError
     from qrlsuite.experiment.task import load
     from qrlsuite.results.imports import import_files
@@ -67,5 +68,4 @@ def import_results(
             f"note: the runs differ in their arguments {', '.join(done.differing)}: are they one entry?",
             err=True,
         )
-    where = "" if str(runs) == "runs" else f" --runs {runs}"
-    typer.echo(f"next: qrlsuite leaderboard --task {loaded.name}{where}")
+    typer.echo(f"next: {command('leaderboard', '--task', loaded.name, runs=runs)}")

@@ -12,6 +12,7 @@ from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
+    MinutesOption,
     PartitionOption,
     TimeOption,
     TrackOption,
@@ -61,6 +62,7 @@ def run(
             help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
         ),
     ] = False,
+    minutes: MinutesOption = None,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
     partition: PartitionOption = None,
@@ -68,6 +70,9 @@ def run(
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
     track: TrackOption = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Go on where training would take more than a day.")
+    ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -83,6 +88,7 @@ def run(
     from qrlsuite import options
     from qrlsuite.cli.display import RunDisplay
     from qrlsuite.cli.training import place, plan, train
+    from qrlsuite.errors import OptionError
     from qrlsuite.experiment import entry as entries
     from qrlsuite.results.seeds import parse_seeds
     from qrlsuite.training import trackers
@@ -97,10 +103,14 @@ def run(
     wanted = parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
     last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))
     where = place(engine, workers, partition, time, engine_options, device)
+    if minutes is not None and not 0 < minutes < float("inf"):
+        raise OptionError(f"--minutes {minutes:g}: give a time, for example --minutes 2 or --minutes 0.5")
+    if minutes is not None and where.submits:
+        raise OptionError(f"--minutes: engine '{engine}' leaves its tasks in a queue; give --time instead")
 
     work = plan(runs, entry, wanted, last, where)
     display = RunDisplay(entry, work.store, wanted, last, work.groups, where.workers, quiet=json_output)
-    outcome = train(work, where, display)
+    outcome = train(work, where, display, minutes, confirmed=yes)
     if outcome.submitted is not None:
         typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
         return

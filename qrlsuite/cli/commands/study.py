@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.terminal import table_console
+from qrlsuite.cli.terminal import counted, table_console
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -198,7 +198,7 @@ def run(
         typer.echo(line)
     if left_over and not session.submitted:
         words = ", ".join(
-            f"{item.plan.entry.label} ({len(item.plan.missing)} seeds)" for item in left_over[:4]
+            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})" for item in left_over[:4]
         )
         more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
         typer.echo(f"the budget is used up; left: {words}{more}. The same command continues.")
@@ -288,18 +288,12 @@ def _survey(
     seeds: str | None,
     epochs: int | None,
 ) -> tuple[list[Item], Speeds]:
-    from qrlsuite import registry, specs
     from qrlsuite.cli.studying import survey
     from qrlsuite.results import speed
     from qrlsuite.results.seeds import parse_seeds
 
     wanted = parse_seeds(seeds) if seeds is not None else None
-    references = [
-        registered.spec.speeds
-        for kind, registered in registry.load()
-        if kind == "studies" and isinstance(registered.spec, specs.StudySpec)
-    ]
-    speeds = speed.gather(runs, dict.fromkeys(references))
+    speeds = speed.known(runs)
     return survey(members, runs, where, speeds, wanted, epochs), speeds
 
 
@@ -323,7 +317,7 @@ def _show(study: Study, items: Sequence[Item], where: Place) -> None:
     from rich.text import Text
 
     from qrlsuite.cli.display import duration, hours_text
-    from qrlsuite.cli.studying import BASES
+    from qrlsuite.results.speed import BASES
 
     file = study.file
     console = Console(highlight=False, soft_wrap=True)
@@ -400,7 +394,8 @@ def _dry_run(
             "of unknown cost" if cost is None else f"{duration(cost)} of core time for all, {step['basis']}"
         )
         typer.echo(
-            f"{step['would_train']}/{step['missing']} seeds  {step['task']}  {step['label']}  ({text})"
+            f"{step['task']}  {step['label']}: {step['finished']} of {counted(step['seeds'], 'seed')} there, would "
+            f"train {step['would_train']} of {step['missing']} missing ({text})"
         )
     if not steps:
         typer.echo("nothing is missing")
@@ -451,7 +446,7 @@ def _say(drawn: Drawn, path: Path) -> None:
     lines: dict[str, list[str]] = {}
     for task, label, count in sorted(drawn.seeds, key=lambda point: -point[2]):
         begun = epochs.get((task, label))
-        words = f"{count} seeds" if count else f"left out, at epoch {begun}" if begun else "nothing yet"
+        words = counted(count, "seed") if count else f"left out, at epoch {begun}" if begun else "nothing yet"
         lines.setdefault(words, []).append(names[task, label])
     for words, labels in lines.items():
         typer.echo(f"  {words}: {', '.join(labels)}")
