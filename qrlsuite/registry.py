@@ -30,7 +30,7 @@ STRICT = "QRLSUITE_STRICT"
 """Environment variable: problems of plugins are fatal, in workers too."""
 
 LOAD_PLUGINS = "QRLSUITE_LOAD_PLUGINS"
-"""Environment variable: the only distributions, separated by commas, whose plugins are loaded beside the suite's own."""
+"""Environment variable: load the plugins of these distributions only, separated by commas, beside the suite's own."""
 
 KINDS: dict[str, type[specs.Spec]] = {
     "environments": specs.EnvironmentSpec,
