@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from qrlsuite import registry
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 
 
 def absent(entry: EntryCurves) -> list[str]:

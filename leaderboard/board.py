@@ -14,7 +14,7 @@ import numpy as np
 
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.statistics import (
     MIN_RUNS,

@@ -2,112 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from qrlsuite import registry
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment.preset import TUNING_SEEDS
-from qrlsuite.experiment.task import Task, TaskFile
-from qrlsuite.experiment.task import load as load_task
-from qrlsuite.leaderboard import origin
+from qrlsuite.experiment.task import TaskFile
+from qrlsuite.leaderboard import origin, published
+from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, SeedRun, entries
-
-
-@dataclass(frozen=True)
-class EntryCurves:
-    """An entry with the learning curves of its complete runs.
-
-    Attributes
-    ----------
-    curves:
-        (N, T) float64: mean validation score per run and epoch. T is what half of the finished runs or more have.
-    seeds:
-        The N seeds.
-    left_out:
-        Seeds whose runs have fewer than T epochs yet.
-    runs:
-        Every run's own curve by seed, shorter ones and longer ones; empty where all have T epochs.
-    hours:
-        Core-hours spent on the runs, those that were left out too.
-    identity:
-        What the entry's hash covers: task, algorithm, model and their resolved options.
-    options:
-        The resolved options under "algorithm", "model" and "environment".
-    preset:
-        The preset that supplied defaults.
-    versions:
-        Every version that occurs among the seeds, by distribution; Python's under "python".
-    commits, processors:
-        Every code revision and processor that occurs among the seeds.
-    executions:
-        Circuit executions of these runs in all.
-    tuning:
-        How the settings were found, where a preset file says so.
-    source:
-        Whether the curves were read from a results folder or from a published entry.
-    """
-
-    name: str
-    label: str
-    task: str
-    task_hash: str
-    task_file: TaskFile
-    algorithm: str
-    model: str
-    parameters: tuple[int, int]
-    curves: NDArray[np.float64]
-    seeds: tuple[int, ...]
-    left_out: tuple[int, ...]
-    hours: float
-    folder: Path
-    identity: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    preset: str | None = None
-    versions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    commits: tuple[str, ...] = ()
-    processors: tuple[str, ...] = ()
-    executions: int = 0
-    tuning: Mapping[str, Any] | None = None
-    source: Literal["runs", "published"] = "runs"
-    runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-
-    def reaching(self, epochs: int) -> EntryCurves | None:
-        """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
-        if not self.runs:
-            return self if self.curves.shape[1] >= epochs else None
-        kept = {seed: curve[:epochs] for seed, curve in self.runs.items() if len(curve) >= epochs}
-        if not kept:
-            return None
-        out = tuple(sorted(set(self.runs) - set(kept)))
-        return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
-
-    def cut(self, epochs: int) -> EntryCurves | None:
-        """Return the first epochs of every run that has reached a number of them; None for none."""
-        reached = self.reaching(epochs)
-        return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
-
-    @property
-    def longest(self) -> int:
-        """The epochs of the longest run."""
-        return max((len(curve) for curve in self.runs.values()), default=int(self.curves.shape[1]))
-
-    @property
-    def mixed_versions(self) -> tuple[str, ...]:
-        """The distributions of which more than one version made the runs."""
-        return tuple(name for name, found in self.versions.items() if len(found) > 1)
-
-    @property
-    def steps_per_epoch(self) -> int:
-        """Environment steps per epoch of one run."""
-        return self.task_file.protocol.interactions
 
 
 def collect(
@@ -300,8 +208,6 @@ def _weight(entry: EntryCurves) -> tuple[int, int, int]:
 
 def _folders(runs: Path, shipped: bool, task: str | None = None) -> list[EntryStore]:
     """Return the entries' folders: those in the results folder, and with `shipped` the published ones."""
-    from qrlsuite.leaderboard import published
-
     if not runs.is_dir() and not shipped:
         raise StoreError(
             f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another, and `qrlsuite "
@@ -319,8 +225,6 @@ def read(store: EntryStore) -> EntryCurves | None:
     StoreError
         If a file is damaged, or a published entry is not what it says.
     """
-    from qrlsuite.leaderboard import published
-
     if published.is_published(store.path):
         return published.read(store.path).entry_curves()
     return read_entry(store)
@@ -379,44 +283,6 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         executions=sum(run.executions for run in runs),
         runs=own if any(len(curve) != length for curve in own.values()) else {},
     )
-
-
-def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
-    """Return a task's file as it is registered now, where its runs were made under the same definition of it.
-
-    Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
-    """
-    registered = _registered(registry.load(), name)
-    return registered.file if registered is not None and registered.hash == hash_ else stored
-
-
-@functools.lru_cache(maxsize=256)
-def _registered(known: registry.Registry, name: str) -> Task | None:
-    """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
-    if name not in known.entries["tasks"]:
-        return None
-    try:
-        return load_task(name)
-    except QrlSuiteError:
-        return None  # its environment is not installed
-
-
-def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:
-    """Refuse scores that a task cannot give.
-
-    Raises
-    ------
-    StoreError
-        If one is not finite, or outside [0, 1] where the task's scores are relative to the best possible.
-    """
-    if not np.isfinite(scores).all():
-        raise StoreError(f"{folder}: scores must be finite")
-    outside = (scores < -_TOLERANCE) | (scores > 1 + _TOLERANCE)
-    if task_file.ranking.thresholds is None and outside.any():
-        raise StoreError(f"{folder}: a score is {scores[outside][0]:g}, outside [0, 1]")
-
-
-_TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

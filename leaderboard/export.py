@@ -8,7 +8,7 @@ from pathlib import Path
 
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard import published
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.results.store import EntryStore
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.training.trainer import Trainer
 
 CHUNK = 25
 """Seeds at a time: memory stays that of a small group."""
@@ -56,6 +55,8 @@ def fingerprint(entry: Entry, seeds: Sequence[int]) -> Fingerprint:
 
 
 def _chunk(entry: Entry, seeds: list[int]) -> Fingerprint:
+    from qrlsuite.training.trainer import Trainer  # torch, which reading a published entry does without
+
     trainer = Trainer(entry, seeds)
     trainer.seed_environments()
     observations, _ = trainer.envs.reset()

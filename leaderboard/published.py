@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 from numpy.typing import NDArray
 
 from qrlsuite.errors import QrlSuiteError, StoreError
@@ -25,7 +27,7 @@ from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile, digest
 from qrlsuite.leaderboard import origin
-from qrlsuite.leaderboard.collect import EntryCurves, current, require_scores
+from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
 from qrlsuite.results.store import EntryStore, round_means
@@ -285,9 +287,6 @@ def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray
 
 def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:
     """Read a parquet file that must hold exactly these columns, without empty cells."""
-    import pyarrow
-    import pyarrow.parquet
-
     try:
         file = pyarrow.parquet.ParquetFile(path)
         found = {
@@ -374,8 +373,6 @@ def files(
 
 
 def _encode(columns: Mapping[str, Any]) -> bytes:
-    import pyarrow
-    import pyarrow.parquet
 
     sink = pyarrow.BufferOutputStream()
     table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})

@@ -7,14 +7,15 @@ the same door as anyone's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from qrlsuite import registry
+from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.specs import SignificanceTestSpec
-
-if TYPE_CHECKING:
-    from qrlsuite.statistics import Evidence, SignificanceRule
-    from qrlsuite.statistics.grid import IntArray
+from qrlsuite.specs import SignificanceTestSpec, resolve
+from qrlsuite.statistics import Evidence, SignificanceRule
+from qrlsuite.statistics.grid import IntArray
+from qrlsuite.statistics.significance import check_signs
 
 DEFAULT = "intervals"
 """The paper's rule."""
@@ -59,11 +60,6 @@ def load(name: str = DEFAULT) -> SignificanceRule:
         If a plugin's factory raises, or what it returns lacks what a rule must have; the message names the
         distribution. The rule's later answers are checked in the same way.
     """
-    from qrlsuite import registry
-    from qrlsuite.errors import PluginError
-    from qrlsuite.specs import resolve
-    from qrlsuite.statistics import SignificanceRule
-
     registered = registry.load().get("significance_tests", name)
     spec = cast(SignificanceTestSpec, registered.spec)
     where = f"significance test '{name}' of distribution '{registered.distribution}'"
@@ -115,8 +111,6 @@ class _Fenced:
         return self._checked(lambda: judge(first, others), (len(others), *first.grid.shape))
 
     def _checked(self, judge: Callable[[], Any], shape: tuple[int, ...]) -> IntArray:
-        from qrlsuite.errors import OptionError, PluginError
-        from qrlsuite.statistics.significance import check_signs
 
         try:
             return check_signs(judge(), shape, self)

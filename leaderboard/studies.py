@@ -6,20 +6,19 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.collect import EntryCurves, read_entry
+from qrlsuite.leaderboard.collect import read_entry
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies.study import Member, PictureSection, Study
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Report = Callable[[str, int, int], None]
 NOTHING = "nothing is trained yet"
@@ -164,11 +163,11 @@ def _attempt(
 
 def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
     """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
-    from qrlsuite.training import evaluation
-
     tasks = {entry.task_hash for entry in entries}
     if len(tasks) > 1 or picture.evaluation is None:
         raise OptionError(f"picture '{picture.kind}' shows entries of one task")
+    from qrlsuite.training import evaluation  # torch, which most pictures do without
+
     best, episodes = picture.evaluation.best, picture.evaluation.episodes
     stores = [EntryStore(entry.folder) for entry in entries]
     more: Mapping[str, Any] = {} if report is None else {"report": report}

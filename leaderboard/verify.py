@@ -18,7 +18,6 @@ from qrlsuite.leaderboard.published import Published
 from qrlsuite.results import provenance
 from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import learning_curve
-from qrlsuite.training.trainer import Trainer
 
 AGREEMENT = 1e-5
 """How closely the beginnings of runs agree between machines, relative to 1 or the value."""
@@ -147,6 +146,8 @@ def _train(
     made_by: Entry, seeds: Sequence[int], epochs: int, report: Callable[[Progress], None]
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Train seeds from nothing, in memory; returns their curves (seeds, epochs)."""
+    from qrlsuite.training.trainer import Trainer  # torch, which checking files does without
+
     trainer = Trainer(made_by, seeds, report=report)
     trainer.progress.epochs = epochs
     trainer.start()
@@ -199,7 +200,8 @@ def _plausible(
     again: np.ndarray[Any, Any],
     differs: str,
 ) -> Verdict:
-    from scipy.stats import mannwhitneyu
+
+    from scipy.stats import mannwhitneyu  # a second, which checking files does without
 
     others = np.delete(entry.curves[:, -1], list(places))
     begun = f"seeds {_list(seeds)} begin alike to {AGREEMENT:g}"

@@ -8,16 +8,17 @@ Pictures of an environment (a map, sample trajectories) come with the environmen
 
 from __future__ import annotations
 
+import io
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+from matplotlib.figure import Figure
 
 from qrlsuite.errors import UnknownNameError, nearest
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.specs import resolve
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,6 @@ def draw(kind: str, entries: Sequence[EntryCurves] = (), **settings: Any) -> Fig
     OptionError
         If a setting is unknown or has a bad value, or the picture cannot be made of these entries.
     """
-    from qrlsuite.specs import resolve
-
     if kind not in KINDS:
         raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, KINDS)}")
     figure: Figure = resolve(f"{KINDS[kind].module}:draw")(entries, **settings)
@@ -92,9 +91,6 @@ def draw(kind: str, entries: Sequence[EntryCurves] = (), **settings: Any) -> Fig
 
 def encode(figure: Figure, format_: str) -> bytes:
     """Return a figure as the bytes of a png, pdf or svg file."""
-    import io
-    import warnings
-
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")  # a box stands for it

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import grid_of, learning_curves
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled_at
 from qrlsuite.statistics.grid import BoolArray, FloatArray

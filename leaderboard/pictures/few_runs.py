@@ -19,7 +19,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.statistics import Grid
 from qrlsuite.statistics.estimator import complexity

@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
 from qrlsuite.leaderboard.report.words import counted, ranges
 

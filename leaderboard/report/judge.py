@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.statistics import (
     MIN_RUNS,
     Evidence,

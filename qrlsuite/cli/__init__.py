@@ -9,17 +9,16 @@ import sys
 import warnings
 from typing import Any
 
+from typer import Abort, BadParameter
+
+from qrlsuite.cli.app import build
+from qrlsuite.cli.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.registry import STRICT, PluginWarning
 
 
 def main() -> None:
     """Run `qrlsuite`; exits with 0 (done), 2 (wrong input) or 130 (interrupted, everything saved)."""
-    from typer import Abort, BadParameter
-
-    from qrlsuite.cli.app import build
-    from qrlsuite.cli.terminal import printable, printable_lines
-    from qrlsuite.registry import STRICT, PluginWarning
-
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show a character shows another

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from qrlsuite.errors import OptionError
+
 _PIECE = re.compile(r"(\d+(?:\.\d+)?)\s*(seconds|sec|s|minutes|min|m|hours|h|days|d)")
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 
@@ -19,8 +21,6 @@ def seconds(text: str) -> float:
     >>> seconds("1h 30min")
     5400.0
     """
-    from qrlsuite.errors import OptionError
-
     words = text.strip().lower()
     pieces = _PIECE.findall(words)
     if not pieces or _PIECE.sub("", words).strip():

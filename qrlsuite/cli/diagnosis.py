@@ -15,7 +15,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from packaging.specifiers import SpecifierSet
+
+import qrlsuite
+from qrlsuite import registry
 from qrlsuite.cli import installed
+from qrlsuite.registry import words
+from qrlsuite.results.provenance import collect, processor
+from qrlsuite.results.store import entries
 
 VARIABLES = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "CUDA_", "QRLSUITE_", "XDG_CACHE_HOME", "PYTHONPATH")
 """Environment variables, by how they begin, that change how fast or from where things run."""
@@ -53,8 +60,6 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
     announce:
         Called with what is being done, before every step that takes a while.
     """
-    from qrlsuite.registry import words
-
     found = Diagnosis()
     sections: dict[str, Callable[[Diagnosis], Facts]] = {
         "suite": _suite,
@@ -77,8 +82,6 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
 
 
 def _suite(found: Diagnosis) -> Facts:
-    import qrlsuite
-    from qrlsuite.results.provenance import collect
 
     location, stated = Path(qrlsuite.__file__).parent, installed.about()["version"]
     if not stated:
@@ -91,7 +94,6 @@ def _suite(found: Diagnosis) -> Facts:
 
 
 def _python(found: Diagnosis) -> Facts:
-    from packaging.specifiers import SpecifierSet
 
     needed = installed.about()["python"]
     if not SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
@@ -104,7 +106,6 @@ def _python(found: Diagnosis) -> Facts:
 
 
 def _machine(found: Diagnosis) -> Facts:
-    from qrlsuite.results.provenance import processor
 
     usable, quota = len(os.sched_getaffinity(0)), _quota()
     if quota is not None and quota < usable:
@@ -170,10 +171,6 @@ def _tried(announce: Callable[[str], None], found: Diagnosis) -> Facts:
 
 
 def _plugins(found: Diagnosis) -> Facts:
-    from packaging.specifiers import SpecifierSet
-
-    import qrlsuite
-    from qrlsuite import registry
 
     known = registry.load()
     facts: Facts = {"loaded": {}, "failed": {}, "incompatible": {}, "problems": list(known.problems)}
@@ -193,7 +190,6 @@ def _plugins(found: Diagnosis) -> Facts:
 
 
 def _runs(folder: Path, found: Diagnosis) -> Facts:
-    from qrlsuite.results.store import entries
 
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     facts: Facts = {"folder": str(folder), "exists": folder.exists(), "entries": 0, "seeds": 0}

@@ -5,18 +5,17 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
+from qrlsuite import registry
 from qrlsuite.cli.terminal import command, counted
-
-if TYPE_CHECKING:
-    from qrlsuite.experiment.entry import Entry
-    from qrlsuite.results.seeds import Group
-    from qrlsuite.results.store import EntryStore
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.seeds import Group
+from qrlsuite.results.store import EntryStore
 
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
@@ -281,7 +280,6 @@ class RunDisplay:
                 self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
 
     def _faster(self) -> list[str]:
-        from qrlsuite import registry
 
         faster = FASTER.get(self.entry.model.name)
         if faster in registry.load().names("models"):

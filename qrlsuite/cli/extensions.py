@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import typer
+from typer.main import get_command
 
 from qrlsuite.cli.terminal import printable
 from qrlsuite.errors import PluginError
@@ -49,8 +50,6 @@ def _added(
 
 def _names(commands: list[Any], groups: list[Any]) -> list[str]:
     """Build commands, which typer does late and for all at once, and return the names that they have."""
-    from typer.main import get_command
-
     names: list[str] = []
     for command, group in [*((info, None) for info in commands), *((None, info) for info in groups)]:
         alone = typer.Typer(rich_markup_mode=None)

@@ -10,10 +10,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from packaging.requirements import Requirement
+from packaging.requirements import InvalidRequirement, Requirement
 
 PATIENCE = 600
 """Seconds that importing everything and compiling the simulator may take."""
@@ -34,8 +33,6 @@ def about() -> dict[str, Any]:
 
 def requirements(distribution: str = "qrlsuite", extra: str = "") -> Iterator[Requirement]:
     """Yield what a distribution requires, or what an extra of it adds to that, with the extras of those."""
-    from packaging.requirements import InvalidRequirement, Requirement
-
     try:
         lines = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:

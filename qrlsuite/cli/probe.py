@@ -14,6 +14,12 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import numba
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from qrlsuite.circuit import Circuit, expectations
+
 
 def main(modules: list[str]) -> None:
     """Import modules one after another, look for a GPU, and compute a circuit."""
@@ -58,10 +64,6 @@ def torch() -> dict[str, Any]:
 
 def simulator() -> dict[str, Any]:
     """Compute <Z> after a rotation by 0 and by pi, and return where compiled kernels are kept, by which numba."""
-    import numpy as np
-
-    from qrlsuite.circuit import Circuit, expectations
-
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0))
     found = expectations(circuit, np.array([[0.0], [np.pi]]), {}).tolist()
@@ -71,7 +73,6 @@ def simulator() -> dict[str, Any]:
 
 
 def _numba() -> dict[str, Any]:
-    import numba
 
     config: Any = numba.config  # its attributes are made at run time
     layers = []
@@ -88,8 +89,6 @@ def _numba() -> dict[str, Any]:
 
 def _caches() -> set[str]:
     """Return the folders in which the suite's compiled functions are kept."""
-    from numba.core.dispatcher import Dispatcher
-
     found = set()
     for name, module in list(sys.modules.items()):
         if name.startswith("qrlsuite."):

@@ -6,16 +6,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from qrlsuite.cli.display import RunDisplay, duration
 from qrlsuite.cli.training import Place, Plan, plan, train
+from qrlsuite.engine.api import Outcome
 from qrlsuite.errors import OptionError
 from qrlsuite.results.speed import BASES, Estimate, Speeds
-
-if TYPE_CHECKING:
-    from qrlsuite.engine.api import Outcome
-    from qrlsuite.studies.study import Member
+from qrlsuite.studies.study import Member
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,12 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from rich.console import Console
 
 
 def table_console(least: int = 130) -> Console:
     """Return where tables are printed: as wide as the terminal, and in a pipe or a file `least` columns or more."""
-    from rich.console import Console
-
     console = Console(highlight=False)
     return console if console.is_terminal else Console(width=max(console.width, least), highlight=False)
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 import typer
 
-if TYPE_CHECKING:
-    from qrlsuite.cli.display import RunDisplay
-    from qrlsuite.engine.api import Engine, Outcome
-    from qrlsuite.experiment.entry import Entry
-    from qrlsuite.results.seeds import Group
-    from qrlsuite.results.store import EntryStore
+from qrlsuite import options, registry, specs
+from qrlsuite.cli.display import RunDisplay
+from qrlsuite.cli.terminal import printable
+from qrlsuite.engine import api
+from qrlsuite.engine.api import Engine, Outcome
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.claims import living
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import Group, plan_groups
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import device as devices
 
 WorkersOption = Annotated[
     int | None,
@@ -116,10 +124,6 @@ def place(
         If there is no such engine, it has no such option or value, a package is not installed, or there can be
         no such device.
     """
-    from qrlsuite import options, registry, specs
-    from qrlsuite.engine import api
-    from qrlsuite.training import device as devices
-
     devices.check(device)  # whether it is there is seen where the work is done
     given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
     built = api.create(engine, {"partition": partition, "time": time, **given})
@@ -135,10 +139,6 @@ def plan(runs: Path, entry: Entry, seeds: Sequence[int], epochs: int, where: Pla
     StoreError
         If the entry's folder is damaged, or belongs to another entry.
     """
-    from qrlsuite.results.claims import living
-    from qrlsuite.results.seeds import plan_groups
-    from qrlsuite.results.store import EntryStore
-
     store = EntryStore.find(runs, entry)
     busy = {seed for claim in living(store) for seed in claim.seeds} | where.engine.queued(store)
     busy &= set(seeds)
@@ -170,12 +170,6 @@ def train(
         If a group failed; finished epochs are kept.
     """
     import time
-
-    from qrlsuite.cli.terminal import printable
-    from qrlsuite.engine import api
-    from qrlsuite.errors import QrlSuiteError
-    from qrlsuite.results.claims import living
-    from qrlsuite.results.store import EntryStore
 
     began = time.monotonic()
 
@@ -234,9 +228,6 @@ def _check_device(name: str) -> None:
 
 def _remove(folder: Path) -> None:
     """Remove the folder of an entry of which nothing could be built, and those above it that are then empty."""
-    import contextlib
-    import shutil
-
     shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):
         folder.parent.rmdir()
@@ -245,7 +236,5 @@ def _remove(folder: Path) -> None:
 
 def _warnings(store: EntryStore, group: Group) -> list[str]:
     """Return what a group's worker left for the user to know."""
-    from qrlsuite.results.progress import ProgressFile
-
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

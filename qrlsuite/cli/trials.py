@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.cli.display import duration, hours_text
 from qrlsuite.cli.terminal import command, counted, table_console
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from qrlsuite.cli.training import Place, Plan
-    from qrlsuite.experiment.entry import Entry
-    from qrlsuite.tuning.search import Search, Trial
+from qrlsuite.cli.training import Place, Plan
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import speed
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.tuning.objective import cell_text
+from qrlsuite.tuning.samplers import NAMES
+from qrlsuite.tuning.search import Search, Trial, as_dict
 
 SHOWN = 10
 """Rows of the table of best settings."""
@@ -25,8 +29,6 @@ SHOWN = 10
 
 def plain(search: Search) -> dict[str, Any]:
     """Return a search as plain values."""
-    from qrlsuite.tuning.search import as_dict
-
     return as_dict(search)
 
 
@@ -52,10 +54,6 @@ class TuneDisplay:
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
-        from qrlsuite.results.seeds import format_seeds
-        from qrlsuite.tuning.objective import cell_text
-        from qrlsuite.tuning.samplers import NAMES
-
         total: float | None = 0.0
         bases: dict[str, None] = {}
         for search in self.searches:
@@ -83,8 +81,6 @@ class TuneDisplay:
 
     def _hours(self, search: Search) -> tuple[float | None, str]:
         """Return the core-hours of a whole search, None where unknown, and what that rests on."""
-        from qrlsuite.results import speed
-
         found = speed.known(search.runs, self.runs).estimate(search.base)
         basis = speed.BASES[found.basis]
         if found.seconds is None:
@@ -215,11 +211,7 @@ def report(searches: Sequence[Search], written: Mapping[int, Path], runs: Path, 
 
 
 def _table(search: Search) -> Any:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
 
-    from qrlsuite.tuning.objective import cell_text
     from qrlsuite.tuning.space import text
 
     ranking = search.base.task.file.ranking

@@ -16,6 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.numpy import save as encode
 
 from qrlsuite.errors import StoreError
 from qrlsuite.results.store import FORMAT_VERSION, EntryStore, write_atomically
@@ -51,8 +54,6 @@ def save(store: EntryStore, seeds: Sequence[int], epoch: int, arrays: Mapping[st
     StoreError
         If the file cannot be written; earlier checkpoints are then untouched.
     """
-    from safetensors.numpy import save as encode
-
     for name, array in arrays.items():
         if array.ndim == 0 or array.shape[0] != len(seeds):
             raise ValueError(f"checkpointed array '{name}' of shape {array.shape} is not seed-first")
@@ -138,9 +139,6 @@ def load(store: EntryStore, seeds: Sequence[int]) -> tuple[int, Arrays]:
     StoreError
         If the seeds are at different epochs, or a file is damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     newest = latest(store)
     epochs = {newest[seed].epoch if seed in newest else 0 for seed in seeds}
     if len(epochs) != 1:

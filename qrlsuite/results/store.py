@@ -26,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 from numpy.typing import NDArray
 
 from qrlsuite.errors import StoreError
@@ -369,9 +371,6 @@ def _epoch(row: Mapping[str, Any], path: Path) -> int:
 
 def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """Encode epoch records as parquet: one row per epoch, nested values as their own columns."""
-    import pyarrow
-    import pyarrow.parquet
-
     columns: dict[str, list[Any]] = {}
     flat = [_flatten(row) for row in rows]
     for name in sorted({name for row in flat for name in row}):
@@ -411,9 +410,6 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     StoreError
         If the file is truncated or not parquet.
     """
-    import pyarrow
-    import pyarrow.parquet
-
     try:
         table = pyarrow.parquet.ParquetFile(path).read()
     except (OSError, pyarrow.ArrowException) as error:

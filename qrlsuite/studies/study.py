@@ -21,6 +21,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting
+from qrlsuite.studies.sizes import nearest_size
 
 Name = Annotated[str, Field(pattern=specs.NAME.pattern, max_length=64)]
 LARGEST = 1000
@@ -231,8 +232,6 @@ def _entry(
     used |= {(s.side, s.name) for s in applicable}
     words = [*draft.settings, *applicable]
     if target is not None and group.match is not None:
-        from qrlsuite.studies.sizes import nearest_size
-
         option = group.match.option
         if not any(s.name == option and s.side in (None, "model") for s in applicable):
             value = nearest_size(

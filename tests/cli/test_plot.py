@@ -14,7 +14,7 @@ from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, UnknownNameError
 from qrlsuite.leaderboard import collect, pictures
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from tests.leaderboard.test_pictures import learner, noisy
 
 RUNNER = CliRunner()

@@ -9,7 +9,7 @@ import numpy as np
 
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 
 HOSTILE = (
     "<script>alert(1)</script>",

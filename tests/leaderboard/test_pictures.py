@@ -19,7 +19,7 @@ from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 
 FILE = tasks.load("beam6g").file
 

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
-from qrlsuite.leaderboard import rules
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from qrlsuite.leaderboard.calibration import Finding, Job
-    from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.cli.display import duration
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard import calibration, collect, rules
+from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
+from qrlsuite.leaderboard.calibration import Finding, Job
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures.cells import choose_horizon
+from qrlsuite.results import lookup
 
 
 class PartName(StrEnum):
@@ -63,12 +71,6 @@ def calibrate(
 
     Example: qrlsuite calibrate --task beam6g --rule difference --draws 1000
     """
-    import json
-
-    from qrlsuite.leaderboard import calibration
-    from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
-    from qrlsuite.leaderboard.pictures.cells import choose_horizon
-
     chosen = _entries(runs, published, entries or [], task)
     horizon = choose_horizon(chosen)
     judges = [rules.load(name) for name in dict.fromkeys(rule or ["intervals", "difference"])]
@@ -114,10 +116,6 @@ def calibrate(
 
 def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None) -> list[EntryCurves]:
     """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long."""
-    from qrlsuite.errors import OptionError, UnknownNameError
-    from qrlsuite.leaderboard import collect
-    from qrlsuite.results import lookup
-
     lookup.check_tasks(runs, task)
     if names:
         tasks = [task] if task else []
@@ -148,7 +146,6 @@ def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None
 
 
 def _pair(word: str) -> tuple[int, int]:
-    from qrlsuite.errors import OptionError
 
     first, comma, second = word.partition(",")
     try:
@@ -162,12 +159,6 @@ def _pair(word: str) -> tuple[int, int]:
 
 def _compute(jobs: Sequence[Job], quiet: bool) -> list[Finding]:
     """Run all jobs behind one progress bar, having said how long that will take."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    from qrlsuite.cli.display import duration
-    from qrlsuite.leaderboard import calibration
-
     console = Console(stderr=True, quiet=quiet, highlight=False)
     seconds = calibration.estimate(jobs)
     total = sum(job.draws for job in jobs)
@@ -285,10 +276,6 @@ def _cells(finding: Finding) -> tuple[str, str]:
 
 
 def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
     for name in rows[0]:

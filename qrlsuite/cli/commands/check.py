@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+import json
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.text import Text
 
+from qrlsuite import registry, testing
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.cli.terminal import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from qrlsuite.testing import Finding
-    from qrlsuite.testing.selection import Item
+from qrlsuite.options import parse_setting
+from qrlsuite.testing import Finding, selection
+from qrlsuite.testing.findings import Finding as Found
+from qrlsuite.testing.findings import watching
+from qrlsuite.testing.selection import Item
 
 
 def check(
@@ -36,11 +40,6 @@ def check(
 
     Examples: qrlsuite check my-model; qrlsuite check ansatz:ring --set depth=2; qrlsuite check my-distribution
     """
-    import json
-
-    from qrlsuite.options import parse_setting
-    from qrlsuite.testing import selection
-
     if name is None:
         _teach(json_output)
         return
@@ -58,8 +57,6 @@ def check(
 
 
 def _findings(item: Item, settings: dict[str, Any]) -> list[Finding]:
-    from qrlsuite import registry, testing
-    from qrlsuite.testing.findings import Finding as Found
 
     try:
         return testing.check(item.kind, item.name, settings)
@@ -68,7 +65,6 @@ def _findings(item: Item, settings: dict[str, Any]) -> list[Finding]:
 
 
 def _plain(item: Item, finding: Finding) -> dict[str, Any]:
-    from qrlsuite import registry
 
     return {
         "kind": registry.SINGULAR[item.kind],
@@ -81,11 +77,6 @@ def _plain(item: Item, finding: Finding) -> dict[str, Any]:
 
 def _show(items: list[Item], settings: dict[str, Any]) -> list[tuple[Item, list[Finding]]]:
     """Check things one after another, with what is going on in the last line of a terminal."""
-    from rich.console import Console
-    from rich.text import Text
-
-    from qrlsuite.testing.findings import watching
-
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     found = []
     with console.status("") as status:
@@ -117,10 +108,6 @@ def _print(console: Any, finding: Finding) -> None:
 
 def _teach(json_output: bool) -> None:
     """Say what can be checked here."""
-    import json
-
-    from qrlsuite import registry
-
     known = registry.load()
     others = sorted({plugin.distribution for plugin in known.plugins} - {"qrlsuite"})
     if json_output:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RuleOption, RunsOption
-from qrlsuite.leaderboard import rules
-
-if TYPE_CHECKING:
-    from qrlsuite.statistics import Comparison
+from qrlsuite.leaderboard import board, collect, rules
+from qrlsuite.results import lookup
+from qrlsuite.statistics import Comparison
 
 SYMBOLS = {
     "win": ("+", "bold bright_blue", "significantly fewer samples"),
@@ -41,11 +45,6 @@ def compare(
 
     Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
-    import json
-
-    from qrlsuite.leaderboard import board, collect
-    from qrlsuite.results import lookup
-
     lookup.check_tasks(runs, task)
     tasks = [task] if task else []
     one, other = (collect.find(runs, name, published, tasks) for name in (first, second))
@@ -63,10 +62,6 @@ def compare(
 
 
 def _matrix(comparison: Comparison) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     grid = comparison.grid
     level = "epsilon" if grid.epsilons is not None else "threshold"

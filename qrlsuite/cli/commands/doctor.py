@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
+from rich.console import Console
+from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.diagnosis import Diagnosis, diagnose
 from qrlsuite.cli.terminal import printable
-
-if TYPE_CHECKING:
-    from qrlsuite.cli.diagnosis import Diagnosis
 
 WIDTH = 100
 SHOWN = 24
@@ -28,14 +31,6 @@ def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> 
 
     Example: qrlsuite doctor > report.txt
     """
-    import dataclasses
-    import json
-
-    from rich.console import Console
-    from rich.text import Text
-
-    from qrlsuite.cli.diagnosis import diagnose
-
     with Console(stderr=True).status("") as status:
         found = diagnose(runs, lambda doing: status.update(Text(printable(doing))))
     if json_output:
@@ -47,9 +42,6 @@ def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> 
 
 
 def _print(found: Diagnosis) -> None:
-    import textwrap
-
-    from rich.console import Console
 
     home = str(Path.home())
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
 from qrlsuite.cli.terminal import table_console
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
-
-    from qrlsuite.results.store import EntryStore
-    from qrlsuite.training.evaluation import Played
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import collect, pictures
+from qrlsuite.leaderboard.pictures import histogram
+from qrlsuite.results import lookup
+from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.training import evaluation
+from qrlsuite.training.evaluation import Played
 
 
 def evaluate(
@@ -53,14 +63,6 @@ def evaluate(
 
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
-    import json
-    from dataclasses import replace
-
-    from qrlsuite.leaderboard import collect
-    from qrlsuite.results import lookup
-    from qrlsuite.results.store import EntryStore
-    from qrlsuite.training import evaluation
-
     format_ = _format(out)
     lookup.check_tasks(runs, task)
     tasks = [task] if task else []
@@ -98,7 +100,6 @@ def evaluate(
 
 
 def _format(out: Path | None) -> str:
-    from qrlsuite.errors import OptionError
 
     format_ = "" if out is None else out.suffix.removeprefix(".").lower()
     if out is not None and format_ not in ("png", "pdf", "svg"):
@@ -107,7 +108,6 @@ def _format(out: Path | None) -> str:
 
 
 def _one_task(stores: Sequence[EntryStore]) -> None:
-    from qrlsuite.errors import OptionError
 
     tasks = {store.record()["task_hash"]: store.record()["task_name"] for store in stores}
     if len(tasks) > 1:
@@ -119,10 +119,6 @@ def _one_task(stores: Sequence[EntryStore]) -> None:
 
 def _progress(quiet: bool) -> AbstractContextManager[Callable[[str, int, int], None]]:
     """Return a context that gives a report function showing one bar per policy."""
-    from contextlib import contextmanager
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     @contextmanager
     def shown() -> Iterator[Callable[[str, int, int], None]]:
@@ -162,9 +158,6 @@ WIDE = 100
 
 
 def _table(played: Sequence[Played], task: str, episodes: int) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
 
     relative = any(each.scores is not None for each in played)
     console, notes = table_console(), _notes(played)
@@ -198,8 +191,6 @@ def _table(played: Sequence[Played], task: str, episodes: int) -> None:
 
 def _notes(played: Sequence[Played]) -> list[str]:
     """Say how the agents were chosen, and what the choice promised against what came."""
-    import numpy as np
-
     notes = ["return: sum of rewards; score: relative, as the task defines it; percentiles over all episodes"]
     for each in played:
         if not each.seeds:
@@ -212,9 +203,6 @@ def _notes(played: Sequence[Played]) -> list[str]:
 
 
 def _draw(out: Path, format_: str, played: Sequence[Played], task: str) -> None:
-    from qrlsuite.leaderboard import pictures
-    from qrlsuite.leaderboard.pictures import histogram
-    from qrlsuite.results.store import write_atomically
 
     note = ""
     if any(each.seeds for each in played):

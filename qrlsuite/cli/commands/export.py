@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.terminal import command, counted
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.export import export as write
+from qrlsuite.results import lookup
 
 
 def export(
@@ -33,14 +39,6 @@ def export(
 
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """
-    import json
-
-    from qrlsuite.cli.terminal import command, counted
-    from qrlsuite.errors import OptionError, QrlSuiteError
-    from qrlsuite.leaderboard import collect
-    from qrlsuite.leaderboard.export import export as write
-    from qrlsuite.results import lookup
-
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
     lookup.check_tasks(runs, task)

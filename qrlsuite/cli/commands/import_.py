@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.terminal import command
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment.task import load
+from qrlsuite.results.imports import import_files
+from qrlsuite.results.seeds import format_seeds
 
 
 def import_results(
@@ -37,14 +43,6 @@ def import_results(
 
     Example: qrlsuite import results/mlp/*.pkl --task beam6g --label "MLP of the paper"
     """
-    import json
-
-    from qrlsuite.cli.terminal import command
-    from qrlsuite.errors import OptionError
-    from qrlsuite.experiment.task import load
-    from qrlsuite.results.imports import import_files
-    from qrlsuite.results.seeds import format_seeds
-
     loaded = load(task)
     name = (label if label is not None else files[0].absolute().parent.name).strip()
     if not name or len(name) > 80 or not name.isprintable():

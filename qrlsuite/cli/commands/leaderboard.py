@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich import box
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.cli.arguments import (
     EntryOption,
@@ -20,10 +26,13 @@ from qrlsuite.cli.arguments import (
 )
 from qrlsuite.cli.commands import verify
 from qrlsuite.cli.terminal import table_console
-from qrlsuite.leaderboard import rules
-
-if TYPE_CHECKING:
-    from qrlsuite.leaderboard.board import Leaderboard, Row, Section
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard import board as boards
+from qrlsuite.leaderboard import collect, report, rules
+from qrlsuite.leaderboard.absent import absent
+from qrlsuite.leaderboard.board import Leaderboard, Row, Section, steps_text
+from qrlsuite.results import lookup
+from qrlsuite.results.store import write_atomically
 
 
 class Format(StrEnum):
@@ -69,12 +78,6 @@ def leaderboard(
     """
     if context.invoked_subcommand is not None:
         return
-    import json
-
-    from qrlsuite.errors import OptionError, UnknownNameError
-    from qrlsuite.leaderboard import board as boards
-    from qrlsuite.leaderboard import collect
-    from qrlsuite.results import lookup
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
@@ -107,9 +110,6 @@ def leaderboard(
 
 def _page(board: Leaderboard, path: Path) -> None:
     """Write one self-contained page, which works offline."""
-    from qrlsuite.leaderboard import report
-    from qrlsuite.results.store import write_atomically
-
     write_atomically(path, report.render(board).encode())
     typer.echo(f"wrote {path}")
 
@@ -133,7 +133,6 @@ LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells
 
 
 def _cells(section: Section, row: Row) -> tuple[str, ...]:
-    from qrlsuite.leaderboard import board as boards
 
     entry = row.entry
     classical, quantum = entry.parameters
@@ -166,9 +165,6 @@ def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
 
 def _notes(section: Section) -> list[str]:
     """Explain the marks that occur in a section."""
-    from qrlsuite.leaderboard import board as boards
-    from qrlsuite.leaderboard.absent import absent
-
     notes = sorted({boards.undecided_reason(row) for row in section.rows if row.tier is None})
     if any(row.provisional for row in section.rows):
         wanted = section.rows[0].entry.task_file.protocol.seeds
@@ -193,7 +189,6 @@ def _notes(section: Section) -> list[str]:
 
 
 def _title(section: Section) -> str:
-    from qrlsuite.leaderboard.board import steps_text
 
     note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
     return f"{section.task}, {steps_text(section.horizon)} steps{note}, S_hat at {section.cell}"
@@ -210,9 +205,6 @@ def _left_out(width: int) -> list[str]:
 
 
 def _table(section: Section) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
 
     console = table_console(WIDE)
     notes, left_out = _notes(section), _left_out(console.width)
@@ -255,11 +247,6 @@ def _markdown(board: Leaderboard) -> str:
 
 def _csv(board: Leaderboard) -> str:
     """Write one line per entry and section; lists are separated by semicolons."""
-    import csv
-    import io
-
-    from qrlsuite.leaderboard import board as boards
-
     rows = []
     for section in boards.as_dict(board)["sections"]:
         for row in section["rows"]:

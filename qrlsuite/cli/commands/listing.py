@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import dataclasses
+import inspect
+import json
+from typing import Annotated
 
 import typer
 
+from qrlsuite import hookspecs, registry
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.cli.terminal import printable
-
-if TYPE_CHECKING:
-    from qrlsuite.registry import Registry
+from qrlsuite.errors import UnknownNameError, nearest
+from qrlsuite.registry import Registry
 
 SHOWN = 8
 """Names of a kind that `list plugins` shows."""
@@ -32,11 +35,6 @@ def list_things(
 
     Examples: qrlsuite list models; qrlsuite list plugins; qrlsuite list hooks
     """
-    import json
-
-    from qrlsuite import registry
-    from qrlsuite.errors import UnknownNameError, nearest
-
     known = registry.load()
     accepted = {name.replace("_", "-"): name for name in registry.KINDS} | {
         name: name for name in registry.KINDS
@@ -62,10 +60,6 @@ def list_things(
 
 def hooks() -> list[dict[str, str]]:
     """Return every hook: its name, its signature, the first line of its manual and the manual."""
-    import inspect
-
-    from qrlsuite import hookspecs
-
     found = []
     for name, function in vars(hookspecs).items():
         if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec"):
@@ -78,8 +72,6 @@ def hooks() -> list[dict[str, str]]:
 
 
 def _list_plugins(known: Registry, json_output: bool) -> None:
-    import dataclasses
-    import json
 
     if json_output:
         rows = [dataclasses.asdict(plugin) for plugin in known.plugins]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from qrlsuite import scaffold
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.scaffold import Kind
 
@@ -43,10 +45,6 @@ def plugin(
 
     Example: qrlsuite new plugin acme-ring --kind ansatz
     """
-    import json
-
-    from qrlsuite import scaffold
-
     made = scaffold.package(name, kind)
     folder = scaffold.write(made, out)
     if json_output:

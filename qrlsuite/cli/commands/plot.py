@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
+from matplotlib.figure import Figure
 from typer.core import TyperCommand
 
+from qrlsuite import options, registry, specs
 from qrlsuite.cli.arguments import (
     EntryOption,
     HorizonOption,
@@ -16,12 +19,14 @@ from qrlsuite.cli.arguments import (
     PublishedOption,
     RunsOption,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from qrlsuite.leaderboard.collect import EntryCurves
-    from qrlsuite.specs import PictureSpec
+from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
+from qrlsuite.experiment import task as task_files
+from qrlsuite.leaderboard import collect, pictures
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.options import parse_setting
+from qrlsuite.results import lookup
+from qrlsuite.results.store import write_atomically
+from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
 
 class Command(TyperCommand):
@@ -71,13 +76,6 @@ def plot(
     Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface --set style=3d;
     qrlsuite plot trajectories --task beam6g --set environment.degree=5
     """
-    import json
-
-    from qrlsuite import options, specs
-    from qrlsuite.errors import OptionError
-    from qrlsuite.leaderboard import pictures
-    from qrlsuite.results.store import write_atomically
-
     spec = _lookup(kind, task or [])
     reference = pictures.KINDS[kind].options if spec is None else spec.options
     if list_settings:
@@ -124,11 +122,6 @@ def plot(
 
 def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
     """Return the pictures that environments bring: by picture, then by environment."""
-    from typing import cast
-
-    from qrlsuite import registry
-    from qrlsuite.specs import EnvironmentSpec
-
     found: dict[str, dict[str, PictureSpec]] = {}
     for registered in registry.load().entries["environments"].values():
         spec = cast(EnvironmentSpec, registered.spec)
@@ -139,8 +132,6 @@ def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
 
 def _summaries() -> dict[str, str]:
     """Return one line for every picture; those of environments say of which."""
-    from qrlsuite.leaderboard import pictures
-
     lines = {name: picture.summary for name, picture in pictures.KINDS.items()}
     for name, owners in _environment_pictures().items():
         summary = next(iter(owners.values())).summary
@@ -150,10 +141,6 @@ def _summaries() -> dict[str, str]:
 
 def _lookup(kind: str, tasks: list[str]) -> PictureSpec | None:
     """Return the environment's picture of that name, None for one of the suite's own kinds."""
-    from qrlsuite.errors import OptionError, UnknownNameError, nearest
-    from qrlsuite.experiment import task as task_files
-    from qrlsuite.leaderboard import pictures
-
     if kind in pictures.KINDS:
         return None
     owners = _environment_pictures().get(kind)
@@ -175,12 +162,6 @@ def _of_environment(
     kind: str, spec: PictureSpec, tasks: list[str], own: dict[str, Any], world: dict[str, Any]
 ) -> Figure:
     """Draw a picture that an environment brings, of one or several tasks."""
-    from matplotlib.figure import Figure
-
-    from qrlsuite import options, specs
-    from qrlsuite.errors import OptionError, PluginError
-    from qrlsuite.experiment import task as task_files
-
     if not tasks:
         raise OptionError(f"picture '{kind}' shows the environment of a task: add --task TASK")
     loaded = [task_files.load(name).with_environment(world) for name in tasks]
@@ -198,9 +179,6 @@ def _of_environment(
 
 def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Divide `--set` words into the picture's settings and the environment's options."""
-    from qrlsuite.errors import OptionError
-    from qrlsuite.options import parse_setting
-
     own: dict[str, Any] = {}
     world: dict[str, Any] = {}
     for setting in map(parse_setting, words):
@@ -229,10 +207,6 @@ def _entries(
     cuts:
         Whether the picture cuts all entries to one length.
     """
-    from qrlsuite.errors import OptionError, UnknownNameError
-    from qrlsuite.leaderboard import collect
-    from qrlsuite.results import lookup
-
     lookup.check_tasks(runs, *tasks)
     found, left_out = collect.select(runs, tasks, names, shipped, horizon, min_seeds)
     if not names:
@@ -254,7 +228,6 @@ def _entries(
 
 
 def _print_settings(kind: str, rows: list[dict[str, Any]], json_output: bool) -> None:
-    import json
 
     if json_output:
         typer.echo(json.dumps(rows))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
+from qrlsuite import options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.display import RunDisplay
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -17,11 +21,16 @@ from qrlsuite.cli.training import (
     TimeOption,
     TrackOption,
     WorkersOption,
+    place,
+    plan,
+    train,
 )
-
-if TYPE_CHECKING:
-    from qrlsuite.experiment.entry import Entry
-    from qrlsuite.results.store import EntryStore
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment import entry as entries
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.seeds import parse_seeds
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import trackers
 
 QUICK_SEEDS = 8
 QUICK_EPOCHS = 10
@@ -83,16 +92,6 @@ def run(
 
     Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
     """
-    import json
-
-    from qrlsuite import options
-    from qrlsuite.cli.display import RunDisplay
-    from qrlsuite.cli.training import place, plan, train
-    from qrlsuite.errors import OptionError
-    from qrlsuite.experiment import entry as entries
-    from qrlsuite.results.seeds import parse_seeds
-    from qrlsuite.training import trackers
-
     words = [options.parse_setting(word) for word in settings or []]
     if quick:
         words = _quick_settings(model, words)
@@ -123,8 +122,6 @@ def run(
 
 def _quick_settings(model: str, words: list[Any]) -> list[Any]:
     """Reduce the qubits of a circuit, unless they were set by hand."""
-    from qrlsuite import options, registry, specs
-
     names = options.field_names(specs.resolve(registry.model(model).options))
     if "qubits" in names and not any(word.name == "qubits" for word in words):
         return [options.Setting("model", "qubits", QUICK_QUBITS), *words]
@@ -133,8 +130,6 @@ def _quick_settings(model: str, words: list[Any]) -> list[Any]:
 
 def summarize(entry: Entry, store: EntryStore, seeds: list[int], epochs: int) -> dict[str, Any]:
     """Return what a finished (or partly finished) run amounts to, as plain values."""
-    import numpy as np
-
     curves = {seed: store.seed(seed).read() for seed in seeds if store.seed(seed).record()}
     complete = {seed: curve.curve[:epochs] for seed, curve in curves.items() if len(curve.scores) >= epochs}
     summary: dict[str, Any] = {

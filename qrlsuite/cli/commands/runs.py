@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.display import duration
 from qrlsuite.cli.terminal import printable
-
-if TYPE_CHECKING:
-    from qrlsuite.results.survey import EntrySurvey
+from qrlsuite.engine.api import Queues
+from qrlsuite.errors import OptionError, nearest
+from qrlsuite.results import lookup
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import entries
+from qrlsuite.results.survey import STATUSES, EntrySurvey, delete, garbage, look, remove, survey
 
 
 def runs(
@@ -41,9 +48,6 @@ def runs(
 
     Examples: qrlsuite runs --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
     """
-    from qrlsuite.errors import OptionError, nearest
-    from qrlsuite.results import lookup
-
     lookup.check_tasks(runs, task)
     if action == "rm":
         _delete(runs, task, names or [], yes, json_output)
@@ -71,11 +75,6 @@ def size_text(size: int) -> str:
 
 
 def _list(folder: Path, task: str | None, json_output: bool) -> None:
-    import dataclasses
-    import json
-    import time
-
-    from qrlsuite.results.survey import survey
 
     found = survey(folder, task)
     if json_output:
@@ -99,8 +98,6 @@ def _list(folder: Path, task: str | None, json_output: bool) -> None:
 
 
 def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
-    from qrlsuite.cli.display import duration
-    from qrlsuite.results.survey import STATUSES
 
     seeds = ", ".join(f"{entry.seeds[status]} {status}" for status in STATUSES if entry.seeds.get(status))
     low, high = entry.epochs or (0, 0)
@@ -116,10 +113,6 @@ def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
 
 
 def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: bool) -> None:
-    import json
-
-    from qrlsuite.results.seeds import format_seeds
-    from qrlsuite.results.survey import garbage, remove
 
     items, problems = garbage(folder, task)
     total = sum(item.size for item in items)
@@ -145,13 +138,6 @@ def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: boo
 
 
 def _delete(folder: Path, task: str | None, names: list[str], yes: bool, json_output: bool) -> None:
-    import json
-
-    from qrlsuite.engine.api import Queues
-    from qrlsuite.errors import OptionError
-    from qrlsuite.results import lookup
-    from qrlsuite.results.store import entries
-    from qrlsuite.results.survey import delete, look
 
     if not names:
         raise OptionError("name the entries to delete: qrlsuite runs lists them")

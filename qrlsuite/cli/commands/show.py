@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from qrlsuite import circuit, options, registry, specs
+from qrlsuite.circuit import drawing
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.commands.listing import hooks
 from qrlsuite.cli.terminal import printable_lines
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
+from qrlsuite.experiment.task import load
+from qrlsuite.leaderboard import pictures, rules
+from qrlsuite.options import parse_setting
+from qrlsuite.results import lookup
+from qrlsuite.results.store import EntryStore, entries, write_atomically
 
 
 def show(
@@ -42,11 +52,6 @@ def show(
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4
     """
-    import json
-
-    from qrlsuite import registry
-    from qrlsuite.errors import OptionError, UnknownNameError, nearest
-
     manual = _hook(name, second)
     if manual is not None:
         typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
@@ -80,9 +85,6 @@ def show(
 
 def _hook(first: str, second: str | None) -> dict[str, str] | None:
     """Return a hook and its manual: `show hook register_models`, or `show register_models`."""
-    from qrlsuite.cli.commands.listing import hooks
-    from qrlsuite.errors import UnknownNameError, nearest
-
     found = {row["name"]: row for row in hooks()}
     if second is None:
         return found.get(first)
@@ -95,9 +97,6 @@ def _hook(first: str, second: str | None) -> dict[str, str] | None:
 
 def _kind(first: str, second: str | None) -> tuple[str | None, str]:
     """Split `show [KIND] NAME` into the kind in the plural, or None, and the name."""
-    from qrlsuite import registry
-    from qrlsuite.errors import UnknownNameError, nearest
-
     if second is None:
         return None, first
     singulars = {word: kind for kind, word in registry.SINGULAR.items()} | {
@@ -111,10 +110,6 @@ def _kind(first: str, second: str | None) -> tuple[str | None, str]:
 
 def _entry_folder(runs: Path, name: str) -> Path | None:
     """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits."""
-    from qrlsuite.errors import UnknownNameError
-    from qrlsuite.results import lookup
-    from qrlsuite.results.store import entries
-
     if (Path(name) / "entry.json").exists():
         return Path(name)
     if not runs.is_dir():
@@ -129,7 +124,6 @@ def _entry_folder(runs: Path, name: str) -> Path | None:
 
 
 def _entry(folder: Path) -> dict[str, Any]:
-    from qrlsuite.results.store import EntryStore
 
     store = EntryStore(folder)
     record = store.record()
@@ -151,8 +145,6 @@ def _entry(folder: Path) -> dict[str, Any]:
 
 def _content(kind: str, name: str) -> dict[str, Any]:
     """Return what there is to say about a registered thing."""
-    from qrlsuite import options, registry, specs
-
     registered = registry.load().get(kind, name)
     spec = registered.spec
     content: dict[str, Any] = {
@@ -162,8 +154,6 @@ def _content(kind: str, name: str) -> dict[str, Any]:
         "distribution": registered.distribution,
     }
     if isinstance(spec, specs.TaskSpec):
-        from qrlsuite.experiment.task import load
-
         task = load(name)
         content |= {
             "hash": task.hash,
@@ -172,8 +162,6 @@ def _content(kind: str, name: str) -> dict[str, Any]:
         }
         return content
     if isinstance(spec, specs.SignificanceTestSpec):
-        from qrlsuite.leaderboard import rules
-
         content["promises"] = rules.load(name).promise
     for field in dataclasses.fields(spec):
         if field.name == "family":
@@ -187,8 +175,6 @@ def _content(kind: str, name: str) -> dict[str, Any]:
 
 def _set_with(kind: str, name: str) -> str:
     """Return what to type to change an option of a thing."""
-    from qrlsuite import options, registry, specs
-
     if kind != "ansatzes":
         return "--set NAME=VALUE"
     for model, registered in registry.load().entries["models"].items():
@@ -203,13 +189,6 @@ def _draw(
     name: str, qubits: int, layers: int, words: list[str], figure: Path | None, content: dict[str, Any]
 ) -> str:
     """Draw an ansatz as text (and to a file), and add its resources to the content."""
-    from qrlsuite import circuit
-    from qrlsuite.circuit import drawing
-    from qrlsuite.errors import OptionError
-    from qrlsuite.leaderboard import pictures
-    from qrlsuite.options import parse_setting
-    from qrlsuite.results.store import write_atomically
-
     format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
     if figure is not None and format_ not in pictures.FORMATS:
         raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
@@ -245,6 +224,5 @@ def _text(content: dict[str, Any], indent: str = "") -> str:
 
 
 def _value(value: Any) -> str:
-    import json
 
     return value if isinstance(value, str) else json.dumps(value)

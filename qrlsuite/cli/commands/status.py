@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.display import duration
 from qrlsuite.cli.terminal import printable
-
-if TYPE_CHECKING:
-    from qrlsuite.results.survey import GroupStatus
+from qrlsuite.engine.api import Queues
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.results import lookup
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import entries
+from qrlsuite.results.survey import GroupStatus, groups, look
 
 
 def status(
@@ -26,14 +31,6 @@ def status(
 
     Example: qrlsuite status --task beam6g
     """
-    import json
-
-    from qrlsuite.engine.api import Queues
-    from qrlsuite.errors import QrlSuiteError
-    from qrlsuite.results import lookup
-    from qrlsuite.results.store import entries
-    from qrlsuite.results.survey import groups, look
-
     lookup.check_tasks(runs, task)
     shown: list[dict[str, Any]] = []
     queues = Queues()
@@ -76,8 +73,6 @@ def _plain(group: GroupStatus) -> dict[str, Any]:
 
 
 def _print(row: dict[str, Any]) -> None:
-    from qrlsuite.cli.display import duration
-    from qrlsuite.results.seeds import format_seeds
 
     seeds = ", ".join(f"{count} {status}" for status, count in row["seeds"].items()) or "none"
     typer.echo(printable(f"{row['task']}  {row['label']}  ({row['entry']}): {seeds}"))

@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
+from qrlsuite import options, registry
+from qrlsuite.cli import budget as budgets
 from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.display import duration, hours_text
+from qrlsuite.cli.studying import Item, Session, cheapest_first, check_budget, fitting, survey
 from qrlsuite.cli.terminal import counted, table_console
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
     PartitionOption,
+    Place,
     TimeOption,
     WorkersOption,
+    place,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from qrlsuite.cli.studying import Item
-    from qrlsuite.cli.training import Place
-    from qrlsuite.leaderboard.studies import Drawn
-    from qrlsuite.results.speed import Speeds
-    from qrlsuite.studies.study import Member, Study
+from qrlsuite.errors import OptionError, nearest
+from qrlsuite.leaderboard import pictures, studies
+from qrlsuite.leaderboard.studies import NOTHING, Drawn
+from qrlsuite.results import speed
+from qrlsuite.results.seeds import parse_seeds
+from qrlsuite.results.speed import BASES, Speeds
+from qrlsuite.results.store import write_atomically
+from qrlsuite.studies.study import Member, Study
 
 app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: list, show, run, draw.")
 
@@ -72,9 +83,6 @@ def list_studies(json_output: JsonOption = False) -> None:
 
     Example: qrlsuite study list
     """
-    import json
-
-    from qrlsuite import registry
     from qrlsuite.studies import study
 
     known = registry.load()
@@ -117,10 +125,6 @@ def show(
 
     Example: qrlsuite study show fig7
     """
-    import json
-
-    from qrlsuite.cli.training import place
-
     where = place(engine, workers)
     study, members = _members(name, settings, models, only)
     items, _ = _survey(study, name, members, runs, where, seeds, epochs)
@@ -164,12 +168,6 @@ def run(
 
     Example: qrlsuite study run fig6 --seeds 20 --budget 30min
     """
-    import json
-
-    from qrlsuite.cli import budget as budgets
-    from qrlsuite.cli.studying import Session, check_budget
-    from qrlsuite.cli.training import place
-
     _check_format(format_)
     where = place(engine, workers, partition, time, engine_options, device)
     limit = budgets.seconds(budget) if budget is not None else None
@@ -218,10 +216,6 @@ def draw(
 
     Example: qrlsuite study draw fig6 --format pdf
     """
-    import json
-
-    from qrlsuite.errors import OptionError
-
     _check_format(format_)
     study, members = _members(name, settings, models, only)
     drawn = _draw(study, members, runs, format_, quiet=json_output)
@@ -235,7 +229,6 @@ def draw(
 
 
 def _check_format(format_: str) -> None:
-    from qrlsuite.errors import OptionError, nearest
 
     if format_ not in ("png", "pdf", "svg"):
         raise OptionError(f"--format {format_}{nearest(format_, ['png', 'pdf', 'svg'])}")
@@ -245,8 +238,6 @@ def _members(
     name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
 ) -> tuple[Study, list[Member]]:
     """Load a study and resolve its entries."""
-    from qrlsuite import options, registry
-    from qrlsuite.errors import OptionError
     from qrlsuite.studies import study
 
     given = [options.parse_setting(word) for word in settings or []]
@@ -269,7 +260,6 @@ def _members(
 
 
 def _check_pictures(study: Study) -> None:
-    from qrlsuite.leaderboard import studies
 
     studies.check(study)
 
@@ -288,9 +278,6 @@ def _survey(
     seeds: str | None,
     epochs: int | None,
 ) -> tuple[list[Item], Speeds]:
-    from qrlsuite.cli.studying import survey
-    from qrlsuite.results import speed
-    from qrlsuite.results.seeds import parse_seeds
 
     wanted = parse_seeds(seeds) if seeds is not None else None
     speeds = speed.known(runs)
@@ -311,13 +298,6 @@ def _as_dict(study: Study, items: Sequence[Item], where: Place) -> dict[str, Any
 
 
 def _show(study: Study, items: Sequence[Item], where: Place) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from qrlsuite.cli.display import duration, hours_text
-    from qrlsuite.results.speed import BASES
 
     file = study.file
     console = Console(highlight=False, soft_wrap=True)
@@ -372,10 +352,6 @@ def _show(study: Study, items: Sequence[Item], where: Place) -> None:
 def _dry_run(
     study: Study, items: Sequence[Item], where: Place, limit: float | None, json_output: bool
 ) -> None:
-    import json
-
-    from qrlsuite.cli.display import duration
-    from qrlsuite.cli.studying import cheapest_first, fitting
 
     steps: list[dict[str, Any]] = []
     left = limit
@@ -405,9 +381,6 @@ def _draw(
     study: Study, members: Sequence[Member], runs: Path, format_: str, quiet: bool
 ) -> list[dict[str, Any]]:
     """Draw every picture, write it, and say what it rests on."""
-    from qrlsuite.leaderboard import pictures, studies
-    from qrlsuite.results.store import write_atomically
-
     rows = []
     for drawn in studies.draw(study, members, runs):
         path = runs / f"study-{study.name}-{drawn.name}.{format_}"
@@ -433,7 +406,6 @@ def _draw(
 
 
 def _say(drawn: Drawn, path: Path) -> None:
-    from qrlsuite.leaderboard.studies import NOTHING
 
     if drawn.figure is None:
         if drawn.problem != NOTHING:

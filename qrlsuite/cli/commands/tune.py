@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from qrlsuite import options
+from qrlsuite.cli import budget as budgets
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -16,12 +21,14 @@ from qrlsuite.cli.training import (
     PartitionOption,
     TimeOption,
     WorkersOption,
+    place,
+    plan,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from qrlsuite.tuning.search import Request, Search
+from qrlsuite.cli.trials import TuneDisplay, plain, report
+from qrlsuite.engine import api
+from qrlsuite.errors import OptionError
+from qrlsuite.results.store import EntryStore
+from qrlsuite.tuning.search import FOLDER, Request, Search
 
 LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
@@ -130,13 +137,6 @@ def tune(
 
     Example: qrlsuite tune --task beam6g --model mlp --grid paper --sampler one-at-a-time --seeds 20
     """
-    import json
-
-    from qrlsuite import options
-    from qrlsuite.cli import budget as budgets
-    from qrlsuite.cli.training import place
-    from qrlsuite.cli.trials import TuneDisplay, plain
-    from qrlsuite.errors import OptionError
     from qrlsuite.tuning import search, space
 
     if (model is None) == (equal_budget is None):
@@ -190,11 +190,6 @@ def tune(
 
 def _searches(requests: Sequence[Request], runs: Path) -> list[Search]:
     """Build the searches; of two, the larger grid is sampled down to the number of combinations of the smaller."""
-    import dataclasses
-
-    from qrlsuite.errors import OptionError
-    from qrlsuite.tuning.search import Search
-
     built = [Search(request, runs) for request in requests]
     fewest = min(search.planned for search in built)
     for i, search in enumerate(built):
@@ -213,11 +208,6 @@ def _searches(requests: Sequence[Request], runs: Path) -> list[Search]:
 def _run(searches: Sequence[Search], runs: Path, where: Any, display: Any, limit: float | None) -> bool:
     """Run trials, of several searches in turns, until all are over or the budget is; returns whether all are."""
     import time
-
-    from qrlsuite.cli.training import plan
-    from qrlsuite.engine import api
-    from qrlsuite.results.store import EntryStore
-    from qrlsuite.tuning.search import FOLDER
 
     def train(entry: Any, seeds: Sequence[int], epochs: int) -> EntryStore:
         work = plan(runs / FOLDER, entry, seeds, epochs, where)
@@ -254,11 +244,6 @@ def _finish(
     json_output: bool,
 ) -> None:
     """Write the preset files where there is a best trial and none is waited for, and say what came out."""
-    import json
-
-    from qrlsuite.cli.trials import plain, report
-    from qrlsuite.errors import OptionError
-
     written: dict[int, Path] = {}
     for i, search in enumerate(searches):
         if search.best is not None and not search.pending:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import secrets
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption
+from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard import verify as checks
+from qrlsuite.results.progress import Progress as RunProgress
 
 
 def verify(
@@ -34,18 +43,6 @@ def verify(
 
     Example: qrlsuite leaderboard verify leaderboard/entries --rerun 2
     """
-    import json
-    import secrets
-
-    import numpy as np
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-    from rich.text import Text
-
-    from qrlsuite.leaderboard import published
-    from qrlsuite.leaderboard import verify as checks
-    from qrlsuite.results.progress import Progress as RunProgress
-
     folders = [folder for path in paths or [published.SHIPPED] for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice
     verdicts = []
