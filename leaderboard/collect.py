@@ -53,6 +53,8 @@ class EntryCurves:
         How the settings were found, where a preset file says so.
     source:
         Whether the curves were read from a results folder or from a published entry.
+    color:
+        Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     """
 
     name: str
@@ -78,6 +80,7 @@ class EntryCurves:
     tuning: Mapping[str, Any] | None = None
     source: Literal["runs", "published"] = "runs"
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    color: int | None = None
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -93,6 +96,14 @@ class EntryCurves:
         """Return the first epochs of every run that has reached a number of them; None for none."""
         reached = self.reaching(epochs)
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
+
+    @property
+    def legend(self) -> str:
+        """The label, with the ansatz where the model has one and the label leaves the default out."""
+        ansatz = self.identity.get("model_options", {}).get("ansatz")
+        if ansatz is None or " ansatz=" in self.label:
+            return self.label
+        return f"{self.label} ansatz={ansatz}"
 
     @property
     def longest(self) -> int:

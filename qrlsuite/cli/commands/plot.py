@@ -229,6 +229,8 @@ def _entries(
     cuts:
         Whether the picture cuts all entries to one length.
     """
+    from dataclasses import replace
+
     from qrlsuite.errors import OptionError, UnknownNameError
     from qrlsuite.leaderboard import collect
     from qrlsuite.results import lookup
@@ -237,6 +239,7 @@ def _entries(
     found, left_out = collect.select(runs, tasks, names, shipped, horizon, min_seeds)
     if not names:
         found.sort(key=lambda e: (e.model, sum(e.parameters), e.label))
+        found = [replace(entry, color=place) for place, entry in enumerate(found)]
         if cuts:
             found, short = collect.equally_long(found)
             left_out += short
