@@ -49,6 +49,8 @@ class EntryCurves:
         How the settings were found, where a preset file says so.
     source:
         Whether the curves were read from a results folder or from a published entry.
+    color:
+        Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     """
 
     name: str
@@ -74,6 +76,7 @@ class EntryCurves:
     tuning: Mapping[str, Any] | None = None
     source: Literal["runs", "published"] = "runs"
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    color: int | None = None
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""

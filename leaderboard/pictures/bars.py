@@ -15,6 +15,9 @@ from qrlsuite import options
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 
+WIDEST = 12.0
+"""Inches; on a page, what is written in a wider picture could not be read."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -54,14 +57,13 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     measured = [cells.measure(entry, grid, horizon) for entry in entries]
     n_levels, n_deltas = grid.shape
     width = 0.84 / len(entries)
-    figure = Figure(
-        figsize=(max(6.0, 1.2 + n_levels * n_deltas * (0.35 + 0.2 * len(entries))), 4.0), layout="constrained"
-    )
+    wide = 1.2 + n_levels * n_deltas * (0.35 + 0.2 * len(entries))
+    figure = Figure(figsize=(min(max(6.0, wide), WIDEST), 4.0), layout="constrained")
     axes = figure.subplots()
     centers = np.arange(n_levels)[:, None] + np.arange(n_deltas)[None, :] * (n_levels + 0.35)
     handles: list[Patch] = []
     for k, (name, entry, found) in enumerate(zip(style.labels(entries), entries, measured)):
-        look = style.style(k)
+        look = style.of(entry, k)
         places = centers + (k - (len(entries) - 1) / 2) * width
         text = f"{name}: {style.parameters_text(entry)} parameters, {style.seeds_text(entry)}"
         handles.append(Patch(facecolor=look.color, edgecolor="white", hatch=look.hatch, lw=0, label=text))

@@ -45,7 +45,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
     single = few if chosen.runs is None else chosen.runs
     for i, entry in enumerate(entries):
-        look = style.style(i)
+        look = style.of(entry, i)
         steps = np.arange(1, entry.curves.shape[1] + 1) * entry.steps_per_epoch
         low, middle, high = np.percentile(entry.curves, (5, 50, 95), axis=0)
         if single:

@@ -42,6 +42,11 @@ def style(index: int) -> Style:
     )
 
 
+def of(entry: EntryCurves, index: int) -> Style:
+    """Return an entry's own style where it has one, else that of its place in the legend."""
+    return style(index if entry.color is None else entry.color)
+
+
 def seeds_text(entry: EntryCurves) -> str:
     """Write the number of seeds of an entry, with a mark where the protocol asks for more: `50 seeds*`."""
     count = len(entry.seeds)
@@ -55,7 +60,7 @@ def provisional(entry: EntryCurves) -> bool:
 
 def label(entry: EntryCurves) -> str:
     """Return what a legend says of an entry: its label and its seeds."""
-    return f"{plain(entry.label)}  ({seeds_text(entry)})"
+    return f"{plain(entry.legend)}  ({seeds_text(entry)})"
 
 
 def plain(text: str, longest: int = 60) -> str:
@@ -96,7 +101,7 @@ def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
     """Return what legends call entries: without the algorithm where all share it, never twice the same."""
     algorithms = {entry.algorithm for entry in entries}
     short = [
-        entry.label.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else entry.label
+        entry.legend.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else entry.legend
         for entry in entries
     ]
     return [

@@ -23,6 +23,10 @@ class EntryView:
 
     Attributes
     ----------
+    color:
+        Number of its color and pattern: that of the entry in every section and picture of the page.
+    legend:
+        The label, with the ansatz where there is one.
     facts:
         What it was made with: (term, description).
     options:
@@ -32,6 +36,8 @@ class EntryView:
     index: int
     curves: EntryCurves
     label: str
+    color: int
+    legend: str
     facts: tuple[tuple[str, str], ...]
     options: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
 
@@ -44,11 +50,19 @@ class EntryView:
 def views(entries: Sequence[EntryCurves]) -> list[EntryView]:
     """Return the entries of a page, labels made harmless and unique within a task."""
     labels = [(entry.task, clean(entry.label)) for entry in entries]
+    names: dict[str, dict[str, int]] = {}
+    for entry in entries:  # one at two horizons may be two objects
+        own = names.setdefault(entry.task, {})
+        own.setdefault(entry.name, len(own))
     return [
         EntryView(
             index=index,
             curves=entry,
             label=label if labels.count((task, label)) == 1 else clean(f"{label} ({entry.name})"),
+            color=names[task][entry.name],
+            legend=clean(
+                entry.legend if labels.count((task, label)) == 1 else f"{entry.legend} ({entry.name})"
+            ),
             facts=tuple((term, value) for term, value in _facts(entry) if value),
             options=tuple(_options(entry)),
         )
@@ -133,6 +147,8 @@ def curves_data(entries: Sequence[EntryView]) -> list[dict[str, Any]]:
         data.append(
             {
                 "label": view.label,
+                "legend": view.legend,
+                "color": view.color,
                 "steps": view.curves.steps_per_epoch,
                 "epochs": curves.shape[1],
                 "runs": curves.shape[0],

@@ -6,6 +6,8 @@
   const CODE = Object.fromEntries([...BASE64].map((character, value) => [character, value]));
   const DASHES = ["solid", "dash", "dot", "dashdot"];
   const SHOWN = 8; // entries shown at first
+  const BANDS = 5; // bands of more entries would hide the curves
+  const CROWD = 8; // values of more entries would fill the picture
   const plain = (text) => text.replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
   const brief = (text) => plain(text.length > 44 ? `${text.slice(0, 43)}…` : text);
 
@@ -23,6 +25,7 @@
     probe.style.color = `var(--${name})`;
     return getComputedStyle(probe).color;
   };
+  const look = (entry) => [color(`c${entry.color % 7}`), Math.floor(entry.color / 7) % 4]; // color and pattern
   const faint = (rgb, opacity) => rgb.replace(/^rgb\((.*)\)$/, `rgba($1, ${opacity})`);
 
   const base = (width) => {
@@ -33,13 +36,13 @@
       layout: {
         width, paper_bgcolor: ground, plot_bgcolor: ground, showlegend: false, dragmode: false,
         font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: text },
-        margin: { l: 58, r: 14, t: 10, b: 48 },
+        margin: { l: 58, r: 24, t: 10, b: 54 },
         hoverlabel: { bgcolor: ground, bordercolor: line, font: { color: text }, namelength: -1 },
       },
     };
   };
 
-  const drawCurves = (plot, section, shown, singles) => {
+  const drawCurves = (plot, section, shown, singles, pointed) => {
     const { axis, layout } = base(plot.width);
     const traces = [];
     const tops = [];
@@ -48,12 +51,14 @@
       const entry = data.entries[index];
       const length = Math.floor(section.horizon / entry.steps);
       const x = Array.from({ length }, (_, t) => (t + 1) * entry.steps);
-      const tone = color(`c${place % 7}`);
+      const [tone, turn] = look(entry);
       const [low, middle, high] = entry.band.map((band) => unpack(band, entry).slice(0, length));
       const common = { type: "scatter", mode: "lines", hoverinfo: "skip" };
-      const crowd = shown.size > 2; // overlapping bands turn gray: then their edges say more than their fill
-      traces.push({ ...common, x: [...x, ...x.slice().reverse()], y: [...high, ...low.slice().reverse()],
-        fill: "toself", fillcolor: faint(tone, crowd ? 0.06 : 0.13), line: { color: faint(tone, 0.4), width: crowd ? 0.8 : 0 } });
+      if (shown.size <= BANDS || place === pointed) {
+        const crowd = shown.size > 2; // overlapping bands turn gray: then their edges say more than their fill
+        traces.push({ ...common, x: [...x, ...x.slice().reverse()], y: [...high, ...low.slice().reverse()],
+          fill: "toself", fillcolor: faint(tone, crowd ? 0.06 : 0.13), line: { color: faint(tone, 0.4), width: crowd ? 0.8 : 0 } });
+      }
       if (singles) {
         const all = unpack(entry.single, entry);
         const [xs, ys] = [[], []];
@@ -63,13 +68,12 @@
         }
         traces.push({ ...common, x: xs, y: ys, line: { color: faint(tone, 0.28), width: 0.7 } });
       }
-      tops.push({ ...common, x, y: middle, name: brief(entry.label), hoverinfo: "all",
-        line: { color: tone, width: 2.2, dash: DASHES[Math.floor(place / 7) % 4] },
-        hovertemplate: "%{y:.3f}" });
+      tops.push({ ...common, x, y: middle, name: brief(entry.legend), hoverinfo: "all",
+        line: { color: tone, width: place === pointed ? 3.4 : 2.2, dash: DASHES[turn] }, hovertemplate: "%{y:.3f}" });
     });
     Object.assign(layout, {
       height: plot.width < 600 ? 340 : 440,
-      hovermode: "x unified",
+      hovermode: shown.size > CROWD ? "closest" : "x unified",
       xaxis: { ...axis, title: { text: "environment steps" }, range: [0, section.horizon], tickformat: "~s", hoverformat: "~s" },
       yaxis: { ...axis, title: { text: section.score }, automargin: true },
       shapes: [{ type: "line", xref: "paper", x0: 0, x1: 1, y0: section.level, y1: section.level,
@@ -87,13 +91,14 @@
     deltas.forEach((delta, d) => {
       section.entries.forEach((index, place) => {
         if (!shown.has(place)) return;
+        const [tone, turn] = look(data.entries[index]);
         const pick = (key) => levels.map((_, e) => entries[place][key][e * deltas.length + d]);
         const [s, l, h] = ["s", "l", "h"].map(pick);
         traces.push({
           type: "bar", x: levels, y: s, xaxis: d ? `x${d + 1}` : "x", yaxis: d ? `y${d + 1}` : "y",
-          name: brief(data.entries[index].label),
-          marker: { color: color(`c${place % 7}`), opacity: h.map((high) => (high >= section.horizon ? 0.35 : 1)),
-            pattern: { shape: ["", "/", "x", "."][Math.floor(place / 7) % 4], fgcolor: color("bg") } },
+          name: brief(data.entries[index].legend),
+          marker: { color: tone, opacity: h.map((high) => (high >= section.horizon ? 0.35 : 1)),
+            pattern: { shape: ["", "/", "x", "."][turn], bgcolor: tone, fgcolor: color("bg") } },
           error_y: { type: "data", symmetric: false, array: h.map((v, i) => v - s[i]), arrayminus: s.map((v, i) => v - l[i]),
             color: faint(text, 0.75), thickness: 1.2, width: 2.5 },
           customdata: s.map((_, i) => `${short(s[i])} (${short(l[i])} to ${short(h[i])})`),
@@ -124,10 +129,11 @@
       document.querySelector(`.plot[data-section="${number}"][data-kind="${kind}"]`));
     const legend = document.querySelector(`.legend[data-section="${number}"]`);
     const singles = element("input", { type: "checkbox" });
+    let pointed = -1;
     const draw = () => {
       for (const [node, make] of [[curves, drawCurves], [bars, drawBars]]) {
         const width = window.report.printing ? PAPER_WIDTH : node.clientWidth;
-        window.Plotly.react(node, ...make({ width }, section, shown, singles.checked), CONFIG);
+        window.Plotly.react(node, ...make({ width }, section, shown, singles.checked, pointed), CONFIG);
       }
     };
     legend.classList.toggle("many", places.length > 6);
@@ -140,7 +146,15 @@
         draw();
       });
       const swatch = document.querySelectorAll(`#board-${number} .ranks .swatch`)[place].cloneNode(true);
-      legend.append(element("label", {}, box, swatch, element("span", {}, data.entries[section.entries[place]].label)));
+      const label = element("label", {}, box, swatch, element("span", {}, data.entries[section.entries[place]].legend));
+      const point = (at) => () => {
+        if (at === pointed || (at < 0 && pointed !== place)) return;
+        pointed = at;
+        window.Plotly.react(curves, ...drawCurves({ width: curves.clientWidth }, section, shown, singles.checked, pointed), CONFIG);
+      };
+      for (const event of ["pointerenter", "focusin"]) label.addEventListener(event, point(place));
+      for (const event of ["pointerleave", "focusout"]) label.addEventListener(event, point(-1));
+      legend.append(label);
     });
     singles.addEventListener("change", draw);
     legend.append(element("label", { class: "push" }, singles, "Single runs"));

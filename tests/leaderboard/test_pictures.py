@@ -283,3 +283,25 @@ def test_no_global_state_of_matplotlib_is_touched() -> None:
         "assert 'matplotlib.pyplot' not in sys.modules; assert before == now()"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
+
+
+def test_legends_name_the_ansatz_and_pictures_of_many_can_be_read() -> None:
+    entries = [learner(f"ddqn vqc-native qubits={n}", model_options={"ansatz": "iqp"}) for n in range(12)]
+    for kind in ("curves", "bars", "surface", "tiers"):
+        figure = pictures.draw(kind, entries)
+        assert "vqc-native qubits=11 ansatz=iqp" in texts(figure)
+    assert pictures.draw("bars", entries).get_figwidth() <= 12
+    named = learner("ddqn vqc-native qubits=4 ansatz=cz", model_options={"ansatz": "cz"})
+    assert named.legend == named.label
+
+
+def test_an_entry_keeps_its_color_where_others_are_left_out() -> None:
+    from dataclasses import replace
+
+    entries = [replace(entry, color=place) for place, entry in enumerate(ENTRIES)]
+    both, one = pictures.draw("curves", entries), pictures.draw("curves", entries[1:])
+    assert both.axes[0].lines[-1].get_color() == one.axes[0].lines[-1].get_color()
+    colors = [bar.get_facecolor()[:3] for bar in bars(pictures.draw("bars", entries[1:]).axes[0])]
+    assert set(colors) <= {
+        bar.get_facecolor()[:3] for bar in bars(pictures.draw("bars", entries).axes[0])[-6:]
+    }

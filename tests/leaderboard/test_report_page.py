@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -236,3 +237,65 @@ def test_a_real_entry(opened: Open, train: Callable[..., Path]) -> None:
     tab = opened(board.build(found, refused))
     assert "mlp width=8" in tab.locator("main").inner_text()
     assert tab.locator(".board").count() == 2
+
+
+def test_every_bar_is_filled_however_many_entries_there_are(opened: Open) -> None:
+    tab = opened(boards.of(boards.graded(16)))
+    for box in tab.locator("#board-0 .legend input[data-place]").all():
+        box.check()
+    patterns = tab.locator("#board-0-bars pattern")
+    assert patterns.count() > 0
+    grounds = (
+        "[...document.querySelectorAll('#board-0-bars pattern')].map((each) => each.querySelector('rect'))"
+    )
+    fills = tab.evaluate(f"{grounds}.map((rect) => rect?.getAttribute('fill'))")
+    colors = tab.evaluate("document.querySelector('#board-0-bars').data.map((trace) => trace.marker.color)")
+    assert {fill or "none" for fill in fills} <= set(colors), (
+        "from the eighth entry on, patterns had no ground"
+    )
+
+
+def test_an_entry_has_one_color_in_every_picture(opened: Open) -> None:
+    long = [boards.entry(f"slow {i}", epochs=500, speed=0.4 - i / 20) for i in range(5)]
+    short = [boards.entry(f"fast {i}", speed=3 - i / 2) for i in range(4)]
+    tab = opened(boards.of([*short, *long]))
+    assert tab.locator(".board").count() == 2
+    looks: dict[str, set[str]] = {}
+    for number in (0, 1):
+        for box in tab.locator(f"#board-{number} .legend input[data-place]").all():
+            box.check()
+        for row in tab.locator(f"#board-{number} .ranks tbody tr").all():
+            look = str(row.locator(".swatch line").get_attribute("class"))
+            looks.setdefault(row.locator("a").first.inner_text(), set()).add(look)
+        for kind, color in (("curves", "trace.line.color"), ("bars", "trace.marker.color")):
+            script = (
+                f"document.querySelector('#board-{number}-{kind}').data.map((trace) => [trace.name, {color}])"
+            )
+            for name, tone in tab.evaluate(script):
+                if name:
+                    looks.setdefault(f"{name} in pictures", set()).add(tone)
+    assert len(looks) == 2 * 9
+    assert {name: look for name, look in looks.items() if len(look) > 1} == {}
+
+
+def test_bands_are_those_of_a_few(opened: Open) -> None:
+    tab = opened(boards.of(boards.graded(6)))
+    bands = "document.querySelector('#board-0-curves').data.filter((trace) => trace.fill === 'toself').length"
+    assert tab.evaluate(bands) == 0
+    tab.locator("#board-0 .legend label").nth(2).hover()
+    assert tab.evaluate(bands) == 1
+    tab.mouse.move(0, 0)
+    assert tab.evaluate(bands) == 0
+    tab.locator("#board-0 .legend input").first.uncheck()
+    tab.mouse.move(0, 0)
+    assert tab.evaluate(bands) == 5
+
+
+def test_the_legend_names_the_ansatz(opened: Open) -> None:
+    options = {"model_options": {"qubits": 4, "ansatz": "iqp"}}
+    entry = dataclasses.replace(boards.entry("ddqn vqc-native qubits=4", quantum=96), identity=options)
+    tab = opened(boards.of([entry, boards.entry("ddqn mlp width=16")]))
+    legend = tab.locator("#board-0 .legend").inner_text().splitlines()
+    assert {"ddqn vqc-native qubits=4 ansatz=iqp", "ddqn mlp width=16"} <= {line.strip() for line in legend}
+    hostile = dataclasses.replace(entry, identity={"model_options": {"ansatz": boards.HOSTILE[0]}})
+    assert boards.HOSTILE[0] not in render(boards.of([hostile]))

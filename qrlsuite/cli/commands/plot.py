@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -211,6 +212,7 @@ def _entries(
     found, left_out = collect.select(runs, tasks, names, shipped, horizon, min_seeds)
     if not names:
         found.sort(key=lambda e: (e.model, sum(e.parameters), e.label))
+        found = [replace(entry, color=place) for place, entry in enumerate(found)]
         if cuts:
             found, short = collect.equally_long(found)
             left_out += short
