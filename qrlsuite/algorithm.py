@@ -26,8 +26,8 @@ class Algorithm(Protocol):
     a whole epoch's numbers are drawn at once.
 
     Observations are to be stored as they come and given to the networks as they are: where a task normalizes by
-    running statistics, the populations of `build_model` standardize what they are given (`qrlsuite.training.standardization`),
-    by statistics that stand still during an epoch.
+    running statistics, the populations of `build_model` standardize what they are given, by statistics that stand
+    still during an epoch (`qrlsuite.training.standardization`).
     """
 
     def start(self) -> None:
