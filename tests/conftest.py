@@ -232,11 +232,11 @@ def results(entry: Path, seed: int) -> tuple[bytes, bytes]:
 
 
 def most_epochs(entry: Path) -> int:
-    """How far the farthest seed of an entry has come."""
+    """How far the farthest seed of an entry has come; 0 where none has begun."""
     from qrlsuite.results.store import EntryStore
 
     store = EntryStore(entry)
-    return max(len(store.seed(seed).epochs()) for seed in store.seeds())
+    return max((len(store.seed(seed).epochs()) for seed in store.seeds()), default=0)
 
 
 def golden(name: str) -> Any:

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -82,16 +81,16 @@ class Installation:
         """Make a folder of links to what is installed beside the suite, without other packages' plugins."""
         borrowed = self.folder / "borrowed"
         borrowed.mkdir()
-        for place in dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib")):
+        for place in (path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")):
             plugins = {
                 Path(str(found.locate_file(file))).relative_to(place).parts[0]
                 for found in metadata.distributions(path=[place])
                 if found.entry_points.select(group="qrlsuite")
                 for file in found.files or []
-                if Path(str(found.locate_file(file))).resolve().is_relative_to(place)
+                if Path(os.path.normpath(str(found.locate_file(file)))).is_relative_to(place)
             }
             for path in Path(place).iterdir():
-                if path.name not in plugins:
+                if path.name not in plugins and not (borrowed / path.name).exists():
                     (borrowed / path.name).symlink_to(path)
         return borrowed
 
