@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from qrlsuite import options, population, registry, specs
+from qrlsuite import hidden, options, population, registry, specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, StoreError
 from qrlsuite.experiment.entry import Entry
@@ -79,7 +79,8 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
 class ModelBuilder:
     """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
 
-    With `statistics`, all of them standardize their observations by these.
+    With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
+    refused (PluginError), see `qrlsuite.hidden`.
     """
 
     def __init__(
@@ -101,10 +102,15 @@ class ModelBuilder:
         spec, given = self.entry.model, self.entry.model_options
         build = specs.resolve(spec.build)
         call = len(self.built)
-        agents = [
-            build(self.observation_size, out_dim, given, streams.torch("init", call))
-            for streams in self.streams
-        ]
+
+        def agent(streams: Streams) -> nn.Module:
+            made: nn.Module = build(self.observation_size, out_dim, given, streams.torch("init", call))
+            return made
+
+        first = self.streams[0]
+        two = first, Streams(first.task_hash, first.seed + 1)
+        hidden.require_none(lambda which: agent(two[which]), self.observation_size, spec.name)
+        agents = [agent(streams) for streams in self.streams]
         self.parameters.append(population.count_parameters(agents[0]))
         if spec.population is None:
             together = population.stack(agents)
@@ -114,6 +120,11 @@ class ModelBuilder:
             self.statistics.attach(together)
         self.built.append(together)
         return together
+
+    def problems(self) -> list[str]:
+        """Say why populations run slower than they might; each reason once."""
+        found = [getattr(module, "problem", None) for module in self.built]
+        return list(dict.fromkeys(f"model '{self.entry.model.name}' {text}" for text in found if text))
 
     def executions(self) -> dict[str, int]:
         """Return each agent's circuit executions so far, summed over its networks; empty without circuits."""
@@ -292,6 +303,7 @@ class GroupRun:
         metrics = dict(self.algorithm.train_epoch(self.entry.task.file.protocol.rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained, between = time.perf_counter(), self.models.executions()
+        self.progress.warnings += [p for p in self.models.problems() if p not in self.progress.warnings]
         scores = self.validate(self.epoch + 1)
         finished, after = time.perf_counter(), self.models.executions()
         own_steps, played = self.validation_steps

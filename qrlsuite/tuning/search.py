@@ -311,7 +311,7 @@ def pace(folders: Sequence[Path], entry: Entry) -> float | None:
                 continue
             measured = _measured(store)
             like += measured
-            if identity.get("model_options") == options.plain(entry.model_options):
+            if identity.get("model_options") == entry.identity["model_options"]:
                 same += measured
     found = same or like
     return statistics.median(found) if found else None
