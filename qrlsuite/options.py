@@ -6,16 +6,50 @@ Every error names where the value came from, what is wrong with it, and what to 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, get_args, get_origin
 
 import pydantic
+import pydantic_core
 
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.errors import OptionError, PluginError, nearest
 
 Values = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Since:
+    """Marks an option that was added to a released options class, with the version that brought it.
+
+    ::
+
+        momentum: Annotated[float, Field(ge=0, description="..."), Since("0.2.0")] = 0.0
+
+    The default does what was done before there was the option, and never changes: while the option has it, the option
+    is left out of the entry's identity, hash and label (an environment's, out of the task's hash), so that earlier
+    results keep their names and random streams, and are resumed.
+
+    Attributes
+    ----------
+    version:
+        Of the package that the options class belongs to.
+
+    Raises
+    ------
+    PluginError
+        If that is not a version such as 0.2.0.
+    """
+
+    version: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.version, str) or re.fullmatch(r"\d+(\.\d+)+", self.version) is None:
+            raise PluginError(
+                f"Since({self.version!r}): write the version that brought the option, such as 0.2.0"
+            )
 
 
 def field_names(cls: type[Any]) -> list[str]:
@@ -24,19 +58,22 @@ def field_names(cls: type[Any]) -> list[str]:
 
 
 def describe(cls: type[Any]) -> list[dict[str, Any]]:
-    """Return name, type, default and description of every option, for `qrlsuite show`."""
+    """Return name, type, default and description of every option, and where it was added later the version."""
     properties = pydantic.TypeAdapter(cls).json_schema().get("properties", {})
+    added = later(cls)
     rows = []
     for name in field_names(cls):
         schema = properties.get(name, {})
-        rows.append(
-            {
-                "name": name,
-                "values": _values(schema),
-                "default": schema.get("default"),
-                "description": schema.get("description", ""),
-            }
-        )
+        row = {
+            "name": name,
+            "values": _values(schema),
+            "default": schema.get("default"),
+            "description": schema.get("description", ""),
+        }
+        if name in added:
+            row["since"], _ = added[name]
+            row["description"] += f" (since {row['since']})"
+        rows.append(row)
     return rows
 
 
@@ -163,6 +200,67 @@ def plain(options: Any) -> Values:
     """Return an options object as JSON-compatible values, every default written out."""
     result: Values = pydantic.TypeAdapter(type(options)).dump_python(options, mode="json")
     return result
+
+
+def identity(options: Any) -> Values:
+    """Return what an entry's hash covers: `plain` without the options marked `Since` that have their default."""
+    result: Values = _without_later(options, plain(options))
+    return result
+
+
+def _without_later(value: Any, written: Any) -> Any:
+    """Leave out options marked `Since` that have their default, at any depth.
+
+    Parameters
+    ----------
+    written:
+        The value as `plain` writes it.
+    """
+    if isinstance(written, dict) and (is_dataclass(value) or isinstance(value, pydantic.BaseModel)):
+        kept = without_later(type(value), written)
+        return {name: _without_later(getattr(value, name, None), item) for name, item in kept.items()}
+    if isinstance(written, dict) and isinstance(value, Mapping) and len(value) == len(written):
+        return {
+            name: _without_later(inner, item) for inner, (name, item) in zip(value.values(), written.items())
+        }
+    if isinstance(written, list) and isinstance(value, list | tuple) and len(value) == len(written):
+        return [_without_later(inner, item) for inner, item in zip(value, written)]
+    return written
+
+
+def without_later(cls: type[Any], values: Mapping[str, Any]) -> Values:
+    """Return values of an options class without the options marked `Since` that have their default.
+
+    Parameters
+    ----------
+    values:
+        Plain values by name, any number of them.
+    """
+    added = later(cls)
+    return {name: value for name, value in values.items() if name not in added or value != added[name][1]}
+
+
+def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
+    """Return version and plain default of every option marked `Since`, by name.
+
+    Raises
+    ------
+    PluginError
+        If one has no default.
+    """
+    if is_dataclass(cls) and not hasattr(cls, "__pydantic_fields__"):
+        cls = pydantic.dataclasses.dataclass(cls, frozen=vars(cls)["__dataclass_params__"].frozen)
+    found = {}
+    for name, info in (getattr(cls, "model_fields", None) or getattr(cls, "__pydantic_fields__", {})).items():
+        for mark in info.metadata:
+            if isinstance(mark, Since):
+                if info.is_required():
+                    raise PluginError(
+                        f"{cls.__name__}.{name} was added in {mark.version} and needs a default"
+                    )
+                default = info.get_default(call_default_factory=True)
+                found[name] = mark.version, pydantic_core.to_jsonable_python(default)
+    return found
 
 
 @dataclass(frozen=True)

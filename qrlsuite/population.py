@@ -8,6 +8,7 @@ losses: gradients do not mix, and one elementwise optimizer serves all.
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -74,8 +75,11 @@ class StackedPopulation(nn.Module):
     """S ordinary modules (B, in) -> (B, out) with their parameters stacked, run by `torch.vmap`.
 
     Modules that cannot be vmapped (data-dependent control flow, foreign code) are run in a loop over their
-    slices instead; that is found out at the first forward pass. Buffers are read, never written.
+    slices instead; that is found out at the first forward pass, and `problem` says why. Other errors are the
+    module's own, and raised. Buffers are read, never written.
     """
+
+    problem: str | None = None
 
     def __init__(self, modules: Sequence[nn.Module]) -> None:
         super().__init__()
@@ -110,8 +114,14 @@ class StackedPopulation(nn.Module):
         if self._vmap:
             try:
                 return torch.vmap(self._call)(state, x)
-            except (RuntimeError, ValueError, NotImplementedError):
+            except RuntimeError as error:
+                if _NOT_VMAPPABLE.search(str(error)) is None:  # the module's own, or memory is exhausted
+                    raise
                 self._vmap = False
+                reason = " ".join(str(error).split())[:200]
+                self.problem = (
+                    f"cannot be run by torch.vmap, so its agents are computed one by one, slowly: {reason}"
+                )
         return torch.stack([self._call({k: v[s] for k, v in state.items()}, x[s]) for s in range(self._size)])
 
     def _call(self, state: Mapping[str, Tensor], x: Tensor) -> Tensor:
@@ -119,17 +129,18 @@ class StackedPopulation(nn.Module):
         return result
 
 
+_NOT_VMAPPABLE = re.compile(
+    r"vmap|functorch|batching rule|data pointer of Tensor|broadcast shape|Could not run 'aten::",
+    re.IGNORECASE,
+)
+"""What torch 2.4 to 2.13 say where one agent's module can be run and a stack of them cannot."""
+
+
 def _exact(module: nn.Module) -> nn.Module:
-    """Replace every `nn.Linear` inside a module by one that is exact in any stack."""
-    for name, child in module.named_children():
-        if type(child) is nn.Linear:
-            replacement = _FixedOrderLinear(
-                child.in_features, child.out_features, bias=child.bias is not None, device="meta"
-            )
-            replacement.weight, replacement.bias = child.weight, child.bias
-            setattr(module, name, replacement)
-        else:
-            _exact(child)
+    """Make every `nn.Linear` of a module exact in any stack; a second name for the same layer stays one."""
+    for part in module.modules():
+        if type(part) is nn.Linear:
+            part.__class__ = _FixedOrderLinear
     return module
 
 

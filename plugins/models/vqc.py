@@ -17,15 +17,15 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
 from qrlsuite.circuit.resources import shift_evaluations
-from qrlsuite.errors import OptionError
-from qrlsuite.options import field_names
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.options import field_names, without_later
 from qrlsuite.plugins.circuits.options import PennyLaneOptions as PennyLaneBackendOptions
 from qrlsuite.plugins.circuits.options import QiskitOptions as QiskitBackendOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
@@ -60,6 +60,22 @@ class VQCOptions:
     dtype: Annotated[
         Literal["float32", "float64"], Field(description="precision of parameters and circuit values")
     ] = "float32"
+
+    @field_validator("ansatz_options")
+    @classmethod
+    def _ansatz_options(cls, given: dict[str, OptionValue], info: ValidationInfo) -> dict[str, OptionValue]:
+        """Leave out what the hash does not cover, see `qrlsuite.options.Since`."""
+        try:
+            return (
+                without_later(specs.resolve(registry.ansatz(info.data["ansatz"]).options), given)
+                if given
+                else {}
+            )
+        except (
+            KeyError,
+            QrlSuiteError,
+        ):  # an ansatz that cannot be found is refused by `check`, in better words
+            return given
 
     def check(self) -> None:
         """Build the circuit once, so that one that cannot be built is refused before anything is trained.

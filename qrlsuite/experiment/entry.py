@@ -1,7 +1,8 @@
 """An entry: one algorithm with one model on one task, every option resolved; the unit that is ranked.
 
 Its hash covers the task definition, the algorithm, the model and all their options: not seeds, epochs, device,
-engine, workers or versions. More epochs extend an entry, more seeds widen it.
+engine, workers or versions. More epochs extend an entry, more seeds widen it. An option that a later version added
+(`qrlsuite.options.Since`) is covered where it does not have its default.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ class Entry:
         return {
             "task": self.task.definition,
             "algorithm": self.algorithm.name,
-            "algorithm_options": options.plain(self.algorithm_options),
+            "algorithm_options": options.identity(self.algorithm_options),
             "model": self.model.name,
-            "model_options": options.plain(self.model_options),
+            "model_options": options.identity(self.model_options),
         }
 
     @property
@@ -65,17 +66,21 @@ class Entry:
     def label(self) -> str:
         """A readable name: the model with its first option and every option that is not the default."""
         words = [self.model.name]
-        plain = options.plain(self.model_options)
+        plain = options.identity(self.model_options)
         defaults = options.plain(specs.resolve(self.model.options)())
         words += [f"{k}={v}" for i, (k, v) in enumerate(plain.items()) if i == 0 or v != defaults.get(k)]
-        usual = options.plain(self._usual_algorithm_options())
-        words += [f"{k}={v}" for k, v in options.plain(self.algorithm_options).items() if v != usual.get(k)]
+        usual = self._usual_algorithm_options()
+        words += [
+            f"{k}={v}" for k, v in options.identity(self.algorithm_options).items() if v != usual.get(k)
+        ]
         return f"{self.algorithm.name} {' '.join(words)}"
 
-    def _usual_algorithm_options(self) -> Any:
-        """Return the algorithm's options as the task's default preset has them."""
+    def _usual_algorithm_options(self) -> options.Values:
+        """Return the algorithm's options as the task's default preset has them, later ones at their defaults."""
         _, values = self.task.preset(None, self.algorithm.name, self.model.family)
-        return options.build(specs.resolve(self.algorithm.options), values, "preset")
+        cls = specs.resolve(self.algorithm.options)
+        given = {k: v for k, v in values.items() if k not in options.later(cls)}
+        return options.plain(options.build(cls, given, "preset"))
 
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""

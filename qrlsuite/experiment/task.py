@@ -162,7 +162,7 @@ class Task:
     environment_options:
         The environment's options object.
     definition:
-        Everything that a run's numbers depend on, as plain values.
+        Everything that a run's numbers depend on, as plain values (but for `options.Since`).
     hash:
         The first 16 hexadecimal digits of SHA-256 over the definition; the key of all random streams.
     """
@@ -180,7 +180,7 @@ class Task:
         self.environment_options = options.build(cls, file.environment.options, where)
         self.definition: dict[str, Any] = {
             "environment": file.environment.name,
-            "environment_options": options.plain(self.environment_options),
+            "environment_options": options.identity(self.environment_options),
             "environments": file.protocol.environments,
             "interactions": file.protocol.interactions,
             "validation_episodes": file.protocol.validation_episodes,

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from qrlsuite import hidden, specs
 from qrlsuite import population as populations
-from qrlsuite import specs
+from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
-from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
+from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
 
 OBS, OUT, B, S = 4, 3, 6, 5
 
@@ -55,7 +56,12 @@ def check(subject: Subject) -> list[Finding]:
         if not rules.run("shapes", "(B, 4) to (B, 3), float32, finite", lambda: _shapes(made), cause):
             return rules.findings
         rules.run(
-            "parameters registered", "no tensor or module is hidden from torch", lambda: _registered(made)
+            "parameters registered", "what wants a gradient is known to torch", lambda: _registered(made)
+        )
+        rules.run(
+            "nothing hidden",
+            "what differs between seeds, or is changed by a pass, is registered",
+            lambda: _hidden(made),
         )
         rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(made))
         rules.run("same seed", "the generator alone decides the parameters", lambda: _same(made))
@@ -141,6 +147,13 @@ def _registered(made: Subjects) -> None:
                 )
     trainable = [name for name, p in agent.named_parameters() if p.requires_grad]
     require(bool(trainable), "there is no trainable parameter: write self.name = nn.Parameter(...)")
+
+
+def _hidden(made: Subjects) -> None:
+    try:
+        hidden.require_none(made.agent, OBS, made.spec.name)
+    except PluginError as error:
+        raise BrokenRuleError(str(error)) from None
 
 
 def _quantum(made: Subjects) -> None:

@@ -29,6 +29,7 @@ from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, unpack
+from qrlsuite.training import hidden
 from qrlsuite.training.device import find as find_device
 from qrlsuite.training.metering import MeteredEnv
 from qrlsuite.training.standardization import PREFIX, RunningStatistics
@@ -140,7 +141,8 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
 class ModelBuilder:
     """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
 
-    With `statistics`, all of them standardize their observations by these.
+    With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
+    refused (PluginError), see `qrlsuite.training.hidden`.
     """
 
     def __init__(
@@ -163,10 +165,15 @@ class ModelBuilder:
         call = len(self.built)
         with _building("models", spec.name):
             build = specs.resolve(spec.build)
-            agents = [
-                build(self.observation_size, out_dim, given, streams.torch("init", call))
-                for streams in self.streams
-            ]
+
+            def agent(streams: Streams) -> nn.Module:
+                made: nn.Module = build(self.observation_size, out_dim, given, streams.torch("init", call))
+                return made
+
+            first = self.streams[0]
+            two = first, Streams(first.task_hash, first.seed + 1)
+            hidden.require_none(lambda which: agent(two[which]), self.observation_size, spec.name)
+            agents = [agent(streams) for streams in self.streams]
             self.parameters.append(population.count_parameters(agents[0]))
             if spec.population is None:
                 together = population.stack(agents)
@@ -176,6 +183,11 @@ class ModelBuilder:
             self.statistics.attach(together)
         self.built.append(together)
         return together
+
+    def problems(self) -> list[str]:
+        """Say why populations run slower than they might; each reason once."""
+        found = [getattr(module, "problem", None) for module in self.built]
+        return list(dict.fromkeys(f"model '{self.entry.model.name}' {text}" for text in found if text))
 
     def executions(self) -> dict[str, int]:
         """Return each agent's circuit executions so far, summed over its networks; empty without circuits."""
@@ -302,6 +314,7 @@ class Trainer:
         metrics = dict(self.algorithm.train_epoch(rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained, between = time.perf_counter(), self.models.executions()
+        self.progress.warnings += [p for p in self.models.problems() if p not in self.progress.warnings]
         episodes = self._validate(self.epoch + 1)
         finished, after = time.perf_counter(), self.models.executions()
         own_steps, played = episodes.lengths.reshape(self.S, self.V).sum(1), episodes.rounds * self.V

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -85,6 +88,116 @@ def test_a_stacked_population_is_its_modules(kind: str) -> None:
             torch.testing.assert_close(mine.grad[s], theirs.grad)
     assert isinstance(together, population.StackedPopulation)
     assert together._vmap == (kind == "vmapped")
+
+
+class Foreign(torch.autograd.Function):
+    """Doubles, without a rule for vmap."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return 2 * gradients[0]
+
+
+UNBATCHABLE: dict[str, Callable[[Tensor], Tensor]] = {
+    "control flow": lambda x: x if x.sum() > 0 else -x,
+    "item": lambda x: x * x.sum().item(),
+    "numpy": lambda x: torch.from_numpy(x.detach().numpy()),
+    "tolist": lambda x: torch.tensor(x.tolist()),
+    "mask": lambda x: x + x[x > 0.5].sum(),
+    "unique": lambda x: x + torch.unique(x).sum(),
+    "nonzero": lambda x: x + len(torch.nonzero(x)),
+    "foreign": lambda x: cast(Tensor, Foreign.apply(x)),
+    "sparse": lambda x: x.to_sparse().to_dense(),
+}
+
+
+class Through(nn.Module):
+    """A linear layer of what a function gives."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.function = function
+        self.weight = nn.Parameter(torch.rand(2, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.function(x) @ self.weight.T
+
+
+@pytest.mark.parametrize("name", UNBATCHABLE)
+@pytest.mark.filterwarnings("ignore:.*nvoking.*:UserWarning", "ignore:.*parse.*:UserWarning")
+def test_what_cannot_be_vmapped_is_looped_over_and_said(name: str) -> None:
+    agents = [Through(UNBATCHABLE[name]) for _ in range(3)]
+    together, x = population.stack(agents), torch.rand(3, 4, 3)
+    for _ in range(2):
+        torch.testing.assert_close(together(x), torch.stack([agent(x[s]) for s, agent in enumerate(agents)]))
+    assert isinstance(together, population.StackedPopulation)
+    assert together.problem is not None
+    assert together.problem.startswith("cannot be run by torch.vmap, so its agents are computed one by one")
+
+
+def fail(error: Exception) -> Callable[[Tensor], Tensor]:
+    def function(x: Tensor) -> Tensor:
+        if torch._C._functorch.maybe_get_level(x) > 0:  # alone it would run: the loop must not hide the error
+            raise error
+        return x
+
+    return function
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "message"),
+    [
+        (fail(RuntimeError("my own")), RuntimeError, "my own"),
+        (fail(ValueError("my own")), ValueError, "my own"),
+        (fail(NotImplementedError("my own")), NotImplementedError, "my own"),
+        (
+            fail(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate")),
+            RuntimeError,
+            "CUDA out of memory",
+        ),
+        (lambda x: x + torch.empty(10**15).sum(), RuntimeError, "can't allocate memory"),
+        (lambda x: x @ torch.ones(5, 5), RuntimeError, "cannot be multiplied|size mismatch"),
+    ],
+    ids=["runtime", "value", "not implemented", "gpu memory", "memory", "shapes"],
+)
+def test_other_errors_are_raised(
+    function: Callable[[Tensor], Tensor], kind: type[Exception], message: str
+) -> None:
+    together = population.stack([Through(function) for _ in range(3)])
+    with pytest.raises(kind, match=message):
+        together(torch.rand(3, 4, 3))
+    assert isinstance(together, population.StackedPopulation)
+    assert together.problem is None
+
+
+def test_a_module_that_is_a_linear_layer_is_exact() -> None:
+    """A single output, which a batched product sums in an order that depends on its place."""
+    agents, x = [nn.Linear(10, 1) for _ in range(STACK)], torch.randn(STACK, 64, 10)
+    whole = population.stack(agents)(x)
+    for s, agent in enumerate(agents):
+        assert torch.equal(population.stack([agent])(x[s : s + 1])[0], whole[s])
+    assert all(type(agent) is nn.Linear for agent in agents)
+
+
+def test_a_second_name_of_a_layer_is_the_same_layer() -> None:
+    class Named(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = nn.Linear(3, 2)
+            self.layers = [self.inner]
+
+        def forward(self, x: Tensor) -> Tensor:
+            y: Tensor = self.layers[0](x)
+            return y
+
+    agents, x = [Named() for _ in range(3)], torch.randn(3, 8, 3)
+    torch.testing.assert_close(
+        population.stack(agents)(x), torch.stack([agent(x[s]) for s, agent in enumerate(agents)])
+    )
 
 
 def test_a_stacked_population_is_bitwise_independent_of_company() -> None:

@@ -58,6 +58,12 @@ class Hidden(Good):
         return super().forward(x) * self.scales[0]
 
 
+class Drawn(Good):
+    def __init__(self, obs: int, out: int, generator: torch.Generator) -> None:
+        super().__init__(obs, out, generator)
+        self.offsets = {"all": torch.rand(out, generator=generator)}
+
+
 class Mislabeled(Good):
     def quantum_parameters(self) -> set[str]:
         return {"linear.weight"}
@@ -141,6 +147,9 @@ BROKEN = {
     "builds": Broken(spec(f"{HERE}:nothing"), r"returned NoneType, not a torch.nn.Module: is `return` there"),
     "shapes": Broken(spec(f"{HERE}:narrow"), r"maps \(6, 4\) to \(6, 2\), and it must give \(6, 3\)"),
     "parameters registered": Broken(spec(build_of(Hidden)), r"self.scales is a tensor .* nn.ParameterList"),
+    "nothing hidden": Broken(
+        spec(build_of(Drawn)), r"self\.offsets\['all'\] differs between seeds.*self\.register_buffer"
+    ),
     "quantum parameters": Broken(spec(build_of(Mislabeled)), r"names \['linear.weight'\]: is it 'quantum'"),
     "same seed": Broken(
         spec(build_of(Unseeded)),

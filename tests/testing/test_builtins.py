@@ -21,8 +21,8 @@ RULES = {
     ],
     "circuit_backends": ["builds", "shapes", "values", "gradients", "repeatable", "seed independence"],
     "models": [
-        "builds", "shapes", "parameters registered", "quantum parameters", "same seed", "different seed",
-        "global randomness", "pure", "gradients", "finite differences", "copies", "population",
+        "builds", "shapes", "parameters registered", "nothing hidden", "quantum parameters", "same seed",
+        "different seed", "global randomness", "pure", "gradients", "finite differences", "copies", "population",
         "seed independence", "state",
     ],
     "environments": [

@@ -1,0 +1,132 @@
+"""State that a model hides from torch: values outside of parameters, buffers and submodules.
+
+A population (`qrlsuite.population`) stacks parameters and buffers, one slice per seed, and keeps everything else of
+the first seed's module. So a tensor in a plain attribute that is drawn per seed would be seed 1's for all of them, and
+one that a forward pass changes would be changed by all: a seed would not be the agent that it is alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from qrlsuite.errors import PluginError
+
+BATCH = 2
+_OF_TORCH = frozenset(vars(nn.Module()))
+_REGISTER = "register it, self.register_buffer('name', tensor), or as nn.Parameter where it is trained"
+_MODULES = "assign it to an attribute of its own, or keep several in nn.ModuleList or nn.ModuleDict"
+_GENERATOR = "draw what is random in `build`, and register it as a parameter or buffer"
+
+Held = dict[str, tuple[Any, str]]
+"""By where it is (`blocks[0].weight`): a copy of the value, and what to do about it."""
+
+
+def held(module: nn.Module) -> Held:
+    """Return the tensors, arrays, random generators and floats that a module holds where torch does not look.
+
+    Lists, tuples, sets and mappings are searched, and modules inside of them; other objects, such as a circuit
+    backend, are not.
+    """
+    registered = {id(each) for each in module.modules()}
+    return dict(_of_module(module, "", "", registered))
+
+
+def _of_module(
+    module: nn.Module, path: str, cure: str, seen: set[int]
+) -> Iterator[tuple[str, tuple[Any, str]]]:
+    """Go through the plain attributes of a module and of its submodules."""
+    for name, part in module.named_modules(prefix=path):
+        for attribute, value in vars(part).items():
+            # a recurrent layer's second list of its own parameters, which torch keeps up to date
+            own = attribute in _OF_TORCH or (isinstance(part, nn.RNNBase) and attribute == "_flat_weights")
+            if not own:
+                yield from _inside(value, f"{name}.{attribute}".lstrip("."), cure, seen)
+
+
+def _inside(value: Any, path: str, cure: str, seen: set[int]) -> Iterator[tuple[str, tuple[Any, str]]]:
+    if isinstance(value, Tensor):
+        yield path, (value.detach().cpu().clone(), cure or _REGISTER)
+    elif isinstance(value, np.ndarray):
+        yield path, (value.copy(), cure or _REGISTER.replace("tensor", "torch.as_tensor(array)"))
+    elif isinstance(value, float | complex | np.floating):
+        yield path, (value, cure or _REGISTER)
+    elif isinstance(value, torch.Generator):
+        yield path, (value.get_state(), _GENERATOR)
+    elif isinstance(value, np.random.Generator | np.random.RandomState):
+        yield (
+            path,
+            (
+                repr(
+                    value.bit_generator.state if isinstance(value, np.random.Generator) else value.get_state()
+                ),
+                _GENERATOR,
+            ),
+        )
+    elif isinstance(value, nn.Module | Mapping | list | tuple | set | frozenset) and id(value) not in seen:
+        seen.add(id(value))
+        if isinstance(value, nn.Module):
+            seen.update(id(each) for each in value.modules())
+            for name, tensor in [*value.named_parameters(), *value.named_buffers()]:
+                yield f"{path}.{name}", (tensor.detach().cpu().clone(), _MODULES)
+            yield from _of_module(value, path, _MODULES, seen)
+        elif isinstance(value, Mapping):
+            for key, item in value.items():
+                yield from _inside(item, f"{path}[{key!r}]", cure, seen)
+        else:
+            for place, item in enumerate(value):
+                yield from _inside(item, f"{path}[{place}]", cure, seen)
+
+
+def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> None:
+    """Refuse a model that holds values which differ between two seeds, or which a forward pass changes.
+
+    Parameters
+    ----------
+    build:
+        Builds the module of the first seed (0), and that of another (1), anew at every call.
+    inputs:
+        Number of inputs.
+
+    Raises
+    ------
+    PluginError
+        Naming the attribute and what to write instead.
+    """
+    probe = build(0)
+    before, other = held(probe), held(build(1))
+    for path, (value, cure) in before.items():
+        if path not in other or not _equal(value, other[path][0]):
+            _refuse(model, path, "differs between seeds, and torch does not know it", cure)
+    source = torch.Generator().manual_seed(0)
+    try:
+        with torch.no_grad(), torch.random.fork_rng(devices=()):
+            probe(torch.rand(BATCH, inputs, generator=source))
+    except (
+        Exception
+    ):  # its own error, which training will meet and report; inputs of the task may be of another kind
+        return
+    for path, (value, cure) in held(probe).items():
+        known = before.get(path)
+        if not isinstance(value, float | complex) and (known is None or not _equal(value, known[0])):
+            _refuse(model, path, "is changed by a forward pass, and torch does not know it", cure)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, Tensor):
+        one, other = one.numpy(), other.numpy()
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
+    return bool(one == other) or one != one  # nan
+
+
+def _refuse(model: str, path: str, problem: str, cure: str) -> None:
+    raise PluginError(
+        f"model '{model}': self.{path} {problem}: seeds that are trained together would share the first one's; {cure}"
+    )
