@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from qrlsuite import hidden, specs
 from qrlsuite import population as populations
+from qrlsuite import specs
 from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
+from qrlsuite.training import hidden
 
 OBS, OUT, B, S = 4, 3, 6, 5
 

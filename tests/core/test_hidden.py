@@ -15,7 +15,7 @@ import torch
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite import hidden, registry
+from qrlsuite import registry
 from qrlsuite.errors import PluginError
 from qrlsuite.registry import Registered
 from qrlsuite.results.checkpoint import group_id
@@ -24,6 +24,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import ModelSpec
 from qrlsuite.testing import model as rules
 from qrlsuite.testing.common import Subject
+from qrlsuite.training import hidden
 from tests.conftest import results
 
 
