@@ -24,7 +24,6 @@ from qrlsuite.statistics import (
     Grid,
     IntervalRule,
     LearningCurves,
-    Resampling,
     SmoothedRuns,
     board_false_winners,
     bootstrap_interval,
@@ -32,7 +31,8 @@ from qrlsuite.statistics import (
 )
 
 CURVES = Path(__file__).parents[1] / "tests" / "golden" / "statistics.json.gz"
-RULES = (IntervalRule(), DifferenceRule())
+RULES = (IntervalRule(), DifferenceRule(n_resamples=1000))
+"""With 1000 resamples instead of 10,000: the rates are averages over pairs, and it is done in a tenth of the time."""
 
 
 def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, pairs: int) -> float:
@@ -107,7 +107,7 @@ def main() -> None:
     for entry in entries:
         strict = DifferenceRule(alpha=0.05 / 45)
         model = SmoothedRuns(entry)
-        rate = board_false_winners(model, [100] * 10, grid, strict, 40, resampling=Resampling(10_000))
+        rate = board_false_winners(model, [100] * 10, grid, strict, 40)
         print(f"{entry.name}: {rate:.1%}", flush=True)
 
     for n_runs in (20, 50, 100):

@@ -6,8 +6,8 @@ a provisional section of their own length.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.statistics import (
     MIN_RUNS,
+    Board,
     Comparison,
     Grid,
     IntervalRule,
@@ -47,13 +48,41 @@ class Complexity:
 
 
 @dataclass(frozen=True)
+class Support:
+    """The narrowest win in the chain that puts an entry into its tier.
+
+    Attributes
+    ----------
+    winner, loser:
+        Labels of the pair.
+    cells:
+        Cells in which the winner needs significantly fewer samples.
+    at_cap:
+        Cells that say nothing, because both are at the cap.
+    total:
+        Cells of the grid.
+    """
+
+    winner: str
+    loser: str
+    cells: int
+    at_cap: int
+    total: int
+
+    @property
+    def text(self) -> str:
+        """`1 of 3`: won, of the cells in which not both are at the cap."""
+        return f"{self.cells} of {self.total - self.at_cap}"
+
+
+@dataclass(frozen=True)
 class Row:
     """One entry of a section.
 
     Attributes
     ----------
     tier:
-        None for an undecided entry.
+        None for an entry that is undecided, or reached the goal of no cell.
     wins, losses:
         Cells of the ranking grid, over all other entries, in which it needs significantly fewer samples, and more.
     """
@@ -69,6 +98,15 @@ class Row:
     outperformed_by: tuple[str, ...]
     provisional: bool
     """Fewer seeds than the task's protocol asks for."""
+    not_reached: bool = False
+    """At the cap in every cell: below those that outperform it, not ranked among others like it."""
+    rests_on: Support | None = None
+    """None in the first tier, and without a tier."""
+
+    @property
+    def depth(self) -> float:
+        """What orders entries on the board: the tier, then those that reached no goal; 0 where undecided."""
+        return float("inf") if self.not_reached else float(self.tier or 0)
 
 
 @dataclass(frozen=True)
@@ -200,7 +238,9 @@ def _section(
     labels = {entry.name: entry.label for entry in entries}
     wanted = entries[0].task_file.protocol.seeds
     rows = []
-    for place in board.ranking.entries:
+    places = board.ranking
+    capped = {place.name for place in places.not_reached}
+    for place in places.entries:
         entry = by_name[place.name]
         values = entry.curves[:, : horizon // entry.steps_per_epoch]
         rows.append(
@@ -215,9 +255,24 @@ def _section(
                 outperforms=tuple(labels[name] for name in place.outperforms),
                 outperformed_by=tuple(labels[name] for name in place.outperformed_by),
                 provisional=len(entry.seeds) < wanted,
+                not_reached=place.name in capped,
+                rests_on=_support(board, place.rests_on, labels),
             )
         )
     return Section(task, entries[0].task_file.summary, horizon, provisional, cell_text(ranking), tuple(rows))
+
+
+def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, str]) -> Support | None:
+    if pair is None:
+        return None
+    won, lost = (board.names.index(name) for name in pair)
+    return Support(
+        winner=labels[pair[0]],
+        loser=labels[pair[1]],
+        cells=int(board.better_cells[won, lost]),
+        at_cap=int(board.capped_cells[won, lost]),
+        total=board.n_cells,
+    )
 
 
 def cell_text(ranking: RankingSection) -> str:
@@ -308,8 +363,10 @@ def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves,
     return one, other
 
 
-def undecided_reason(row: Row) -> str:
+def untiered_reason(row: Row) -> str:
     """Say why an entry has no tier."""
+    if row.not_reached:
+        return "not reached: at the cap in every cell, and not ranked among each other"
     if len(row.entry.seeds) < MIN_RUNS:
         return f"undecided: fewer than {MIN_RUNS} seeds"
     return "undecided: nothing to compare with"
@@ -350,7 +407,8 @@ def _row_dict(row: Row) -> dict[str, Any]:
     entry = row.entry
     return {
         "tier": row.tier,
-        "verdict": "ranked" if row.tier is not None else undecided_reason(row),
+        "verdict": "ranked" if row.tier is not None else untiered_reason(row),
+        "rests_on": None if row.rests_on is None else asdict(row.rests_on),
         "entry": entry.name,
         "label": entry.label,
         "parameters": {"classical": entry.parameters[0], "quantum": entry.parameters[1]},

@@ -104,6 +104,11 @@ class EntryCurves:
         return tuple(name for name, found in self.versions.items() if len(found) > 1)
 
     @property
+    def on_protocol_seeds(self) -> bool:
+        """Whether its settings are known to have been chosen on seeds that it is judged by."""
+        return bool(self.tuning and self.tuning.get("on_protocol_seeds"))
+
+    @property
     def steps_per_epoch(self) -> int:
         """Environment steps per epoch of one run."""
         return self.task_file.protocol.interactions

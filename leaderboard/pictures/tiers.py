@@ -111,13 +111,22 @@ def _name_rows_and_columns(
     """Write entries beside rows and below columns, and set the tiers apart."""
     ranks = board.ranking.entries
     order = [board.names.index(ranked.name) for ranked in ranks]
+    capped = {ranked.name for ranked in board.ranking.not_reached}
     for k, (ranked, before) in enumerate(zip(ranks, [None, *ranks[:-1]])):
-        if before is not None and ranked.tier == before.tier:
+        if before is not None and (ranked.tier, ranked.name in capped) == (
+            before.tier,
+            before.name in capped,
+        ):
             continue
         if k:
             axes.axhline(k, color="#303030", lw=1)
             axes.axvline(k, color="#303030", lw=1)
-    tiers = ["undecided" if ranked.tier is None else f"tier {ranked.tier}" for ranked in ranks]
+    tiers = [
+        f"tier {ranked.tier}"
+        if ranked.tier is not None
+        else ("not reached" if ranked.name in capped else "undecided")
+        for ranked in ranks
+    ]
     texts = []
     for k, (tier, index) in enumerate(zip(tiers, order)):
         shown_tier = tier if k == 0 or tiers[k - 1] != tier else " " * len(tier)

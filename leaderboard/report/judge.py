@@ -19,7 +19,7 @@ from qrlsuite.statistics import (
     SignificanceRule,
     at_cap,
 )
-from qrlsuite.statistics.compare import overall
+from qrlsuite.statistics.compare import in_words, never_reached, overall
 
 SYMBOLS = {1: "+", -1: "-", 0: ".", 2: "^", 3: "?"}
 """A cell's verdict from the first entry's side: fewer samples, more, no difference, both at cap, undecided."""
@@ -41,6 +41,8 @@ class Pair:
     second: int
     n_runs: int
     cells: str
+    neither_reached: bool = False
+    """Both are at the cap in every cell, with all their runs."""
 
     def counts(self, by: int) -> tuple[int, int]:
         """Return in how many cells an entry of the pair needs significantly fewer, and more, samples."""
@@ -49,23 +51,11 @@ class Pair:
 
     def outcome(self, by: int) -> Outcome:
         """Return the result from an entry's side."""
-        return Outcome.UNDECIDED if "?" in self.cells else overall(*self.counts(by))
+        return Outcome.UNDECIDED if "?" in self.cells else overall(*self.counts(by), self.neither_reached)
 
     def words(self, by: int) -> str:
         """Return the result from an entry's side in words."""
-        (wins, losses), cells = self.counts(by), len(self.cells)
-        fewer, more = "significantly fewer samples", "significantly more samples"
-        match self.outcome(by):
-            case Outcome.UNDECIDED:
-                return f"undecided: fewer than {MIN_RUNS} runs"
-            case Outcome.OUTPERFORMS:
-                return f"outperforms: {fewer} in {wins} of {cells} cells, {more} in none"
-            case Outcome.OUTPERFORMED:
-                return f"is outperformed: {more} in {losses} of {cells} cells, {fewer} in none"
-            case Outcome.TRADE_OFF:
-                return f"trade-off: {fewer} in {wins} of {cells} cells, {more} in {losses}"
-            case _:
-                return f"no significant difference in any of {cells} cells"
+        return in_words(self.outcome(by), *self.counts(by), self.cells.count("^"), len(self.cells))
 
 
 @dataclass(frozen=True)
@@ -115,6 +105,7 @@ def judge(entries: Sequence[EntryCurves], horizon: int, rule: SignificanceRule |
     grid = grid_of(ranking_of(entries))
     curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)
     evidence = {(i, curve.n_runs): Evidence(curve, grid, curve.n_runs) for i, curve in enumerate(curves)}
+    nothing = [never_reached(curve, grid) for curve in curves]
     pairs = []
     for i in range(len(curves)):
         for j in range(i + 1, len(curves)):
@@ -123,7 +114,7 @@ def judge(entries: Sequence[EntryCurves], horizon: int, rule: SignificanceRule |
                 if (place, n_runs) not in evidence:
                     evidence[place, n_runs] = Evidence(curves[place], grid, n_runs)
             cells = _cells(chosen, evidence[i, n_runs], evidence[j, n_runs], horizon)
-            pairs.append(Pair(i, j, n_runs, cells))
+            pairs.append(Pair(i, j, n_runs, cells, nothing[i] and nothing[j]))
     return Judgement(grid, horizon, chosen.name, curves, tuple(pairs), evidence)
 
 

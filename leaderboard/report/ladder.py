@@ -43,7 +43,7 @@ class Ladder:
     """Pairs joined by a chain of arcs, of which the upper does not outperform the lower."""
 
 
-def draw(beats: NDArray[np.bool_], tiers: Sequence[int | None]) -> Ladder:
+def draw(beats: NDArray[np.bool_], tiers: Sequence[float]) -> Ladder:
     """Draw the relation.
 
     Parameters
@@ -51,7 +51,7 @@ def draw(beats: NDArray[np.bool_], tiers: Sequence[int | None]) -> Ladder:
     beats:
         Shape (M, M), whether the row's entry outperforms the column's, in the order of the board.
     tiers:
-        The M tiers.
+        The M tiers; 0 where undecided, infinite where no goal was reached.
     """
     kept = reduced(beats, tiers)
     pairs = [(int(i), int(j)) for i, j in np.argwhere(kept)]
@@ -69,12 +69,12 @@ def draw(beats: NDArray[np.bool_], tiers: Sequence[int | None]) -> Ladder:
     )
 
 
-def reduced(beats: NDArray[np.bool_], tiers: Sequence[int | None]) -> NDArray[np.bool_]:
+def reduced(beats: NDArray[np.bool_], tiers: Sequence[float]) -> NDArray[np.bool_]:
     """Return the relation without pairs that a chain of others, each a tier further down, stands for.
 
     Pairs inside a tier (a circle) all stay. Every chain of the relation is a chain of what is kept.
     """
-    order = np.array([0 if tier is None else tier for tier in tiers])
+    order = np.array(tiers, dtype=np.float64)
     down = beats & (order[:, None] < order[None, :])
     through = down.astype(np.float32) @ reachable(down).astype(np.float32) > 0
     kept: NDArray[np.bool_] = beats & ~(down & through)

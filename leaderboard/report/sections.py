@@ -8,7 +8,7 @@ from typing import Any
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.absent import absent
-from qrlsuite.leaderboard.board import Row, Section, ranking_of, undecided_reason
+from qrlsuite.leaderboard.board import Row, Section, ranking_of, untiered_reason
 from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
@@ -50,6 +50,8 @@ class SectionView:
     rows: tuple[RowView, ...]
     wanted: int
     missing: str
+    flattered: str
+    """Entries whose settings were chosen on the protocol's seeds."""
     ladder: ladder.Ladder
     matrix: tuple[tuple[tuple[str, str, str], ...], ...]
     surfaces: tuple[tuple[tuple[CellView, ...], ...], ...]
@@ -107,7 +109,8 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
         rows=rows,
         wanted=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
-        ladder=ladder.draw(judgement.beats(), [row.tier for row in section.rows]),
+        flattered=", ".join(row.entry.label for row in rows if row.row.entry.on_protocol_seeds),
+        ladder=ladder.draw(judgement.beats(), [row.depth for row in section.rows]),
         matrix=tuple(
             tuple(_matrix_cell(judgement, i, j) for j in range(len(rows))) for i in range(len(rows))
         ),
@@ -145,7 +148,7 @@ def _row(place: int, row: Row, entry: EntryView, judgement: Judgement) -> RowVie
         high=100 * reference.high / horizon,
         wins=int(beats[place].sum()),
         losses=int(beats[:, place].sum()),
-        reason="" if row.tier is not None else undecided_reason(row),
+        reason="" if row.tier is not None else untiered_reason(row),
     )
 
 
@@ -163,9 +166,11 @@ def _lead(rows: Sequence[RowView]) -> str:
     best = first[0]
     rest = len(ranked) - 1
     if best.wins == rest:
-        return f"{best.entry.label} outperforms " + (
-            "the other entry." if rest == 1 else f"all {rest} others."
-        )
+        if rest > 1:
+            return f"{best.entry.label} outperforms all {rest} others."
+        win = next(row.row.rests_on for row in ranked if row is not best)
+        cells = f", in {win.text} cells that are not at the cap for both" if win is not None else ""
+        return f"{best.entry.label} outperforms the other entry{cells}."
     return f"{best.entry.label} stands in the first tier and outperforms {best.wins} of {rest} others."
 
 

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.statistics.compare import MIN_RUNS
+from qrlsuite.statistics.compare import MIN_RUNS, never_reached, shown_percentiles
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
+from qrlsuite.statistics.estimator import at_cap
 from qrlsuite.statistics.grid import BoolArray, Grid, IntArray, whole
 from qrlsuite.statistics.ranking import Ranking, rank
 from qrlsuite.statistics.significance import (
@@ -36,14 +37,24 @@ class Board:
         Name of the rule that judged.
     better_cells:
         Shape (M, M): in how many cells the row's entry needs significantly fewer samples than the column's.
+    capped_cells:
+        Shape (M, M), symmetric: cells without a significant difference in which both intervals end at the
+        horizon: too few steps to tell.
+    n_cells:
+        Cells of the grid.
     decided:
         Shape (M, M): whether both have at least 20 runs.
+    not_reached:
+        Shape (M,): whether S_hat is the horizon in every cell.
     """
 
     names: tuple[str, ...]
     rule: str
     better_cells: IntArray
+    capped_cells: IntArray
+    n_cells: int
     decided: BoolArray
+    not_reached: BoolArray
 
     @property
     def outperforms(self) -> BoolArray:
@@ -54,7 +65,7 @@ class Board:
     @property
     def ranking(self) -> Ranking:
         """The tiers."""
-        return rank(self.names, self.outperforms, self.decided)
+        return rank(self.names, self.outperforms, self.decided, self.better_cells, self.not_reached)
 
 
 def outperformance(
@@ -81,6 +92,7 @@ def outperformance(
     chosen = rule or IntervalRule()
     size = len(entries)
     better = np.zeros((size, size), dtype=np.int64)
+    capped = np.zeros((size, size), dtype=np.int64)
     runs = np.array([entry.n_runs for entry in entries], dtype=np.int64)
     ends = np.array([_end(entry, horizon) for entry in entries], dtype=np.int64)
     shared_runs, shared_ends = np.minimum.outer(runs, runs), np.minimum.outer(ends, ends)
@@ -92,12 +104,24 @@ def outperformance(
         group = todo & (shared_runs == n_runs) & (shared_ends == end)
         members = np.flatnonzero(group.any(axis=0) | group.any(axis=1)).tolist()
         evidence = {i: Evidence(entries[i].cut(end), grid, n_runs, resampling) for i in members}
+        at_end = {i: at_cap(evidence[i].interval(shown_percentiles(chosen)), end) for i in members}
         for first in np.flatnonzero(group.any(axis=1)).tolist():
             others = np.flatnonzero(group[first]).tolist()
             signs = _judge(chosen, evidence[first], [evidence[other] for other in others])
             better[first, others] = (signs > 0).sum(axis=(1, 2))
             better[others, first] = (signs < 0).sum(axis=(1, 2))
-    return Board(tuple(entry.name for entry in entries), chosen.name, better, decided)
+            both = at_end[first] & np.stack([at_end[other] for other in others]) & (signs == 0)
+            capped[first, others] = capped[others, first] = both.sum(axis=(1, 2))
+    reached_nothing = [never_reached(entry.cut(end), grid) for entry, end in zip(entries, ends.tolist())]
+    return Board(
+        names=tuple(entry.name for entry in entries),
+        rule=chosen.name,
+        better_cells=better,
+        capped_cells=capped,
+        n_cells=grid.size,
+        decided=decided,
+        not_reached=np.array(reached_nothing, dtype=bool),
+    )
 
 
 def _end(entry: LearningCurves, horizon: int | None) -> int:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
-from qrlsuite.statistics.estimator import at_cap
+from qrlsuite.statistics.estimator import at_cap, complexity
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
 from qrlsuite.statistics.significance import (
     Evidence,
@@ -45,6 +45,7 @@ class Outcome(StrEnum):
     OUTPERFORMS = "outperforms"
     OUTPERFORMED = "is outperformed"
     TRADE_OFF = "trade-off"
+    NOT_REACHED = "not reached"
     NO_DIFFERENCE = "no significant difference"
     UNDECIDED = "undecided"
 
@@ -71,6 +72,8 @@ class Comparison:
         Shape (2, E, D): the estimates in steps at `n_runs` runs and this horizon.
     intervals:
         Shape (2, E, D, 2): 5th and 95th percentiles at `n_runs` runs (the rule's own where it has any).
+    not_reached:
+        Whether each entry's S_hat, of all its runs, is the horizon in every cell.
     """
 
     names: tuple[str, str]
@@ -81,6 +84,7 @@ class Comparison:
     verdicts: tuple[tuple[Verdict, ...], ...]
     points: FloatArray = field(repr=False)
     intervals: FloatArray = field(repr=False)
+    not_reached: tuple[bool, bool] = (False, False)
 
     def count(self, verdict: Verdict) -> int:
         """Return the number of cells with a verdict."""
@@ -91,25 +95,15 @@ class Comparison:
         """The overall result."""
         if self.count(Verdict.UNDECIDED):
             return Outcome.UNDECIDED
-        return overall(self.count(Verdict.WIN), self.count(Verdict.LOSS))
+        return overall(
+            self.count(Verdict.WIN), self.count(Verdict.LOSS), neither_reached=all(self.not_reached)
+        )
 
     @property
     def sentence(self) -> str:
         """The overall result in words, with the first entry as its subject."""
-        wins, losses, cells = self.count(Verdict.WIN), self.count(Verdict.LOSS), self.grid.size
-        fewer, more = "significantly fewer", "significantly more"
-        match self.outcome:
-            case Outcome.UNDECIDED:
-                explanation = f"fewer than {MIN_RUNS} seeds"
-            case Outcome.OUTPERFORMS:
-                explanation = f"{fewer} samples in {wins} of {cells} cells, {more} in none"
-            case Outcome.OUTPERFORMED:
-                explanation = f"{more} samples in {losses} of {cells} cells, {fewer} in none"
-            case Outcome.TRADE_OFF:
-                explanation = f"{fewer} samples in {wins} of {cells} cells, {more} in {losses}"
-            case Outcome.NO_DIFFERENCE:
-                explanation = f"in none of {cells} cells"
-        return f"{self.outcome}: {explanation}"
+        counts = (self.count(verdict) for verdict in (Verdict.WIN, Verdict.LOSS, Verdict.BOTH_AT_CAP))
+        return in_words(self.outcome, *counts, self.grid.size)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as plain values, for JSON."""
@@ -123,19 +117,67 @@ class Comparison:
             "deltas": [float(delta) for delta in self.grid.deltas],
             "outcome": str(self.outcome),
             "sentence": self.sentence,
+            "not_reached": list(self.not_reached),
             "verdicts": [[str(verdict) for verdict in row] for row in self.verdicts],
             "points": self.points.tolist(),
             "intervals": self.intervals.tolist(),
         }
 
 
-def overall(wins: int, losses: int) -> Outcome:
-    """Return the outcome for an entry with so many significantly better and worse cells."""
+def overall(wins: int, losses: int, neither_reached: bool = False) -> Outcome:
+    """Return the outcome for an entry with so many significantly better and worse cells.
+
+    Parameters
+    ----------
+    neither_reached:
+        Whether both entries reached the goal of no cell: that is then said in place of "no difference".
+    """
     if wins and losses:
         return Outcome.TRADE_OFF
     if wins:
         return Outcome.OUTPERFORMS
-    return Outcome.OUTPERFORMED if losses else Outcome.NO_DIFFERENCE
+    if losses:
+        return Outcome.OUTPERFORMED
+    return Outcome.NOT_REACHED if neither_reached else Outcome.NO_DIFFERENCE
+
+
+def in_words(outcome: Outcome, wins: int, losses: int, capped: int, cells: int) -> str:
+    """Return an outcome and the cells it rests on, as `outperforms: significantly fewer samples in 4 of 6 cells`.
+
+    Parameters
+    ----------
+    wins, losses:
+        Cells with significantly fewer, and more, samples.
+    capped:
+        Cells without a significant difference in which both are at the cap.
+    cells:
+        All cells.
+    """
+    fewer, more = "significantly fewer", "significantly more"
+    match outcome:
+        case Outcome.UNDECIDED:
+            return f"{outcome}: fewer than {MIN_RUNS} seeds"
+        case Outcome.NOT_REACHED:
+            return f"{outcome}: both are at the cap in all {cells} cells"
+        case Outcome.OUTPERFORMS:
+            explanation = f"{fewer} samples in {wins} of {cells} cells, {more} in none"
+        case Outcome.OUTPERFORMED:
+            explanation = f"{more} samples in {losses} of {cells} cells, {fewer} in none"
+        case Outcome.TRADE_OFF:
+            explanation = f"{fewer} samples in {wins} of {cells} cells, {more} in {losses}"
+        case Outcome.NO_DIFFERENCE:
+            explanation = f"in none of {cells} cells"
+    return f"{outcome}: {explanation}" + (f"; both at the cap in {capped}" if capped else "")
+
+
+def never_reached(entry: LearningCurves, grid: Grid) -> bool:
+    """Return whether S_hat of all an entry's runs is its horizon in every cell."""
+    return bool((complexity(entry.values, grid, entry.steps_per_epoch) == entry.horizon).all())
+
+
+def shown_percentiles(rule: SignificanceRule) -> tuple[float, float]:
+    """Return the percentiles of the intervals that are shown beside a rule's verdicts."""
+    return rule.percentiles if isinstance(rule, IntervalRule) else (5, 95)
 
 
 def compare(
@@ -171,8 +213,7 @@ def compare(
     steps = common_horizon(first, second, horizon)
     n_runs = min(first.n_runs, second.n_runs)
     pair = [Evidence(entry.cut(steps), grid, n_runs, resampling) for entry in (first, second)]
-    percentiles = chosen.percentiles if isinstance(chosen, IntervalRule) else (5, 95)
-    intervals = np.stack([evidence.interval(percentiles) for evidence in pair])
+    intervals = np.stack([evidence.interval(shown_percentiles(chosen)) for evidence in pair])
     signs = None
     if n_runs >= MIN_RUNS:
         signs = check_signs(chosen(*pair), grid.shape, chosen)
@@ -185,6 +226,7 @@ def compare(
         verdicts=_verdicts(signs, intervals, steps, grid),
         points=np.stack([evidence.point for evidence in pair]),
         intervals=intervals,
+        not_reached=(never_reached(first.cut(steps), grid), never_reached(second.cut(steps), grid)),
     )
 
 

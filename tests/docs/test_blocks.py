@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from qrlsuite.specs import AnsatzSpec
 from tests.conftest import HANGS
 
 ROOT = Path(__file__).parents[2]
@@ -57,6 +58,21 @@ def test_a_block_runs(text: str, results: Path, capsys: pytest.CaptureFixture[st
 
 def test_there_are_blocks_to_run() -> None:
     assert len(blocks()) >= 6
+
+
+def test_the_readmes_plugin_is_what_its_summary_says() -> None:
+    """RX of every input, RY of every weight, and a ring: each qubit has two CZs, the last one with the first."""
+    text = (ROOT / "README.md").read_text()
+    (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
+    space: dict[str, Any] = {}
+    exec(compile(code, "README.md", "exec"), space)
+    specs: list[AnsatzSpec] = []
+    space["register_ansatzes"](specs.append)
+    assert specs[0].summary == "RX re-uploading, RY weights and a ring of CZs"
+    circuit = space["ry_ring"](4, 1, None)
+    gates = [(step.gate, step.wires) for step in circuit.operations]
+    assert gates[:2] == [("RX", (0,)), ("RY", (0,))]
+    assert [qubits for name, qubits in gates if name == "CZ"] == [(0, 1), (1, 2), (2, 3), (3, 0)]
 
 
 def test_the_readmes_plugin_is_a_package(tmp_path: Path) -> None:

@@ -113,5 +113,6 @@ def test_three_entries_in_a_circle_collapse_into_one_tier_under_the_papers_rule(
     behind = LearningCurves(np.zeros((30, 60)), 100, "behind")
     board = outperformance([a, b, c, behind], Grid.relative([0.9, 0.5, 0.1], [0.5]))
     assert board.outperforms[:3, :3].tolist() == [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
-    assert [[entry.name for entry in tier] for tier in board.ranking.tiers] == [["a", "b", "c"], ["behind"]]
+    assert [[entry.name for entry in tier] for tier in board.ranking.tiers] == [["a", "b", "c"]]
+    assert [entry.name for entry in board.ranking.not_reached] == ["behind"]
     assert board.ranking.entries[0].cycle == ("a", "b", "c")

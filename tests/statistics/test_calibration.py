@@ -29,7 +29,9 @@ FAST = Resampling(300)
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize(("n_first", "n_second"), [(10, 40), (25, 50), (50, 25)])
 @pytest.mark.parametrize(
-    ("rule", "limit"), [(IntervalRule(), 0.12), (DifferenceRule(), 0.05)], ids=["intervals", "difference"]
+    ("rule", "limit"),
+    [(IntervalRule(), 0.12), (DifferenceRule(n_resamples=300), 0.05)],
+    ids=["intervals", "difference"],
 )
 def test_unequal_numbers_of_one_network_rarely_make_a_winner(
     index: int, n_first: int, n_second: int, rule: SignificanceRule, limit: float
@@ -65,7 +67,7 @@ def test_equal_numbers_of_one_network_rarely_make_a_winner_in_a_cell() -> None:
 
 def test_a_real_difference_is_found() -> None:
     wide, narrow = SmoothedRuns(entry(0)), SmoothedRuns(entry(1))
-    for rule in (IntervalRule(), DifferenceRule()):
+    for rule in (IntervalRule(), DifferenceRule(n_resamples=300)):
         rates = power(wide, narrow, 30, 30, SURFACE, rule, n_pairs=20, resampling=FAST)
         assert rates.first_wins > 0.9
         assert rates.fewer.max() > 0.9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from qrlsuite.statistics import (
     sample_complexity,
     significance,
 )
+from qrlsuite.statistics.significance import Draws
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE
 
 CELL = Grid.relative([0.1], [0.5])
@@ -186,6 +188,8 @@ def test_a_horizon_that_is_not_whole_epochs_of_both_is_refused() -> None:
 def test_swapping_the_entries_swaps_the_verdicts(
     rule: SignificanceRule, n_resamples: int, wide: LearningCurves, narrow: LearningCurves
 ) -> None:
+    if isinstance(rule, DifferenceRule):
+        rule = replace(rule, n_resamples=n_resamples)
     # closer together than the originals, so that the answer hangs on the draws
     mixed = LearningCurves(np.concatenate([narrow.values[:18], wide.values[:12]]), 2000, "mixed")
     pair = [Evidence(entry, SURFACE, 30, Resampling(n_resamples)) for entry in (mixed, narrow)]
@@ -254,8 +258,26 @@ def test_alpha_is_a_probability(alpha: float) -> None:
 
 
 def test_one_resample_has_no_spread_of_differences() -> None:
-    with pytest.raises(OptionError, match="two or more resamples"):
-        compare(learner(1), learner(2), CELL, DifferenceRule(), Resampling(1))
+    with pytest.raises(OptionError, match="n_resamples = 1"):
+        DifferenceRule(n_resamples=1)
+
+
+def test_the_difference_rule_draws_ten_thousand_times_whatever_the_interval_draws(
+    wide: LearningCurves, narrow: LearningCurves
+) -> None:
+    mixed = LearningCurves(np.concatenate([narrow.values[:18], wide.values[:12]]), 2000, "mixed")
+    asked: list[int] = []
+
+    class Watched(Evidence):
+        def draws(self, n_resamples: int) -> Draws:
+            asked.append(n_resamples)
+            return super().draws(n_resamples)
+
+    signs = [
+        DifferenceRule()(*[Watched(e, SURFACE, 30, Resampling(n)) for e in (mixed, narrow)]) for n in (2, 50)
+    ]
+    assert set(asked) == {10_000}
+    assert (signs[0] == signs[1]).all()
 
 
 @pytest.mark.parametrize("answer", [np.zeros(3), np.full((1, 1), 2), np.full((1, 1), np.nan)])

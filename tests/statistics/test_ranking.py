@@ -130,3 +130,37 @@ def test_tiers_follow_the_definition(wins: np.ndarray) -> None:
 
     assert [tier[names[i]] for i in range(size)] == [longest(i) for i in range(size)]
     assert sorted(set(tier.values())) == list(range(1, len(result.tiers) + 1))
+
+
+def test_a_tier_rests_on_the_narrowest_win_of_the_chain_above_it() -> None:
+    names = ["a", "b", "c", "d"]
+    cells = np.zeros((4, 4), dtype=int)
+    cells[0, 1], cells[1, 2], cells[0, 2], cells[2, 3], cells[0, 3] = 1, 40, 49, 7, 30
+    result = rank(names, cells > 0, np.ones((4, 4)), cells)
+    assert [entry.rests_on for entry in result.entries] == [None, ("a", "b"), ("a", "b"), ("a", "b")]
+    cells[0, 1] = 9
+    result = rank(names, cells > 0, np.ones((4, 4)), cells)
+    assert [entry.rests_on for entry in result.entries] == [None, ("a", "b"), ("a", "b"), ("c", "d")]
+
+
+def test_of_two_chains_the_firmer_counts() -> None:
+    cells = np.zeros((3, 3), dtype=int)
+    cells[0, 2], cells[1, 2] = 1, 20
+    assert rank(["a", "b", "c"], cells > 0, np.ones((3, 3)), cells).tiers[1][0].rests_on == ("b", "c")
+
+
+def test_entries_that_reached_no_goal_are_not_ranked_among_each_other() -> None:
+    # c is outperformed by b, d by a alone: without the mark d would stand a tier above c
+    cells = np.zeros((4, 4), dtype=int)
+    cells[0, 1], cells[0, 2], cells[1, 2], cells[0, 3] = 20, 20, 5, 5
+    names, decided = ["a", "b", "c", "d"], np.ones((4, 4))
+    assert tiers(rank(names, cells > 0, decided, cells)) == ["a", "bd", "c"]
+    result = rank(names, cells > 0, decided, cells, [False, False, True, True])
+    assert tiers(result) == ["a", "b"]
+    assert [(entry.name, entry.tier, entry.rests_on) for entry in result.not_reached] == [
+        ("c", None, None),
+        ("d", None, None),
+    ]
+    assert result.not_reached[0].outperformed_by == ("a", "b")
+    assert [entry.name for entry in result.entries] == list(names)
+    assert result.undecided == ()

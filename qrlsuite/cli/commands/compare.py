@@ -59,6 +59,11 @@ def compare(
         + ":"
     )
     typer.echo(comparison.sentence)
+    for entry in (one, other):
+        if entry.on_protocol_seeds:
+            typer.echo(
+                f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
+            )
 
 
 def _matrix(comparison: Comparison) -> None:

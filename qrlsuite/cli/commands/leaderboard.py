@@ -116,6 +116,7 @@ def _page(board: Leaderboard, path: Path) -> None:
 
 COLUMNS = (
     "tier",
+    "rests on",
     "entry",
     "parameters",
     "seeds",
@@ -126,6 +127,8 @@ COLUMNS = (
     "outperformed by",
     "hours",
 )
+SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
+"""What a spreadsheet shows of the win that a tier rests on."""
 WIDE = 150
 """Columns of a terminal, or a file, in which the whole table can be read."""
 LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells +/-", "hours")))
@@ -137,23 +140,29 @@ def _cells(section: Section, row: Row) -> tuple[str, ...]:
     entry = row.entry
     classical, quantum = entry.parameters
     return (
-        str(row.tier) if row.tier is not None else "undecided",
+        tier_text(row),
+        row.rests_on.text if row.rests_on is not None else "-",
         entry.label,
         f"{classical} + {quantum} q" if quantum else str(classical),
         f"{len(entry.seeds)}" + "*" * row.provisional,
         boards.complexity_text(row.reference),
         f"{row.median_score:.3f}",
         f"{row.wins}/{row.losses}",
-        _names(
-            row.outperforms, [r for r in section.rows if (r.tier or 0) > (row.tier or 0)], "all lower tiers"
-        ),
+        _names(row.outperforms, [r for r in section.rows if r.depth > row.depth], "all lower tiers"),
         _names(
             row.outperformed_by,
-            [r for r in section.rows if 0 < (r.tier or 0) < (row.tier or 0)],
+            [r for r in section.rows if 0 < r.depth < row.depth],
             "all higher tiers",
         ),
         f"{entry.hours:.2f}",
     )
+
+
+def tier_text(row: Row) -> str:
+    """Return the tier, or in a word why there is none."""
+    if row.tier is not None:
+        return str(row.tier)
+    return "not reached" if row.not_reached else "undecided"
 
 
 def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
@@ -165,7 +174,12 @@ def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
 
 def _notes(section: Section) -> list[str]:
     """Explain the marks that occur in a section."""
-    notes = sorted({boards.undecided_reason(row) for row in section.rows if row.tier is None})
+    notes = sorted({boards.untiered_reason(row) for row in section.rows if row.tier is None})
+    if any(row.rests_on for row in section.rows):
+        notes.append(
+            "rests on: cells of the narrowest win in the chain of wins above an entry, of the cells in which not "
+            "both are at the cap"
+        )
     if any(row.provisional for row in section.rows):
         wanted = section.rows[0].entry.task_file.protocol.seeds
         notes.append(f"* provisional: the protocol asks for {wanted} seeds")
@@ -176,6 +190,11 @@ def _notes(section: Section) -> list[str]:
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
+    seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
+    if seen:
+        notes.append(
+            f"settings chosen after seeing runs on protocol seeds, which may flatter: {', '.join(seen)}"
+        )
     mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
     if mixed:
         notes.append(
@@ -220,7 +239,7 @@ def _table(section: Section) -> None:
         caption_justify="left",
         pad_edge=False,
     )
-    numeric = {"parameters", "seeds", "score", "cells +/-", "hours"}
+    numeric = {"rests on", "parameters", "seeds", "score", "cells +/-", "hours"}
     for name in shown:
         table.add_column(
             Text(name),
@@ -252,15 +271,19 @@ def _csv(board: Leaderboard) -> str:
         for row in section["rows"]:
             low, high = row.pop("interval")
             count = row.pop("parameters")
-            tuned = bool(row.pop("tuning"))
+            tuning = row.pop("tuning") or {}
+            tuned, on_protocol_seeds = bool(tuning), bool(tuning.get("on_protocol_seeds"))
+            support = row.pop("rests_on") or {}
             flat = {
                 **{name: section[name] for name in ("task", "horizon", "cell")},
                 **row,
                 "parameters_classical": count["classical"],
                 "parameters_quantum": count["quantum"],
+                **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
                 "interval_low": low,
                 "interval_high": high,
                 "tuned": tuned,
+                "tuned_on_protocol_seeds": on_protocol_seeds,
                 "rule": board.rule,
             }
             rows.append({k: "; ".join(v) if isinstance(v, list) else v for k, v in flat.items()})

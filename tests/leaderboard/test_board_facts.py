@@ -1,0 +1,99 @@
+"""What a board says beside a tier: how few cells it rests on, and who reached no goal at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qrlsuite.cli.commands import leaderboard as command
+from qrlsuite.leaderboard import board, report
+from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.pictures import tiers
+from tests.leaderboard import boards
+
+
+def flat(label: str, score: float, last: float | None = None) -> EntryCurves:
+    """An entry of 20 seeds at one score all along, or from epoch 50 on at another."""
+    curves = np.full((20, 100), score)
+    if last is not None:
+        curves[:, 50:] = last
+    return replace(boards.entry(label), curves=curves)
+
+
+@pytest.fixture
+def mostly_at_the_cap() -> board.Leaderboard:
+    """Best reaches .6 (epsilon .4, seven cells of 49) halfway; the two others reach nothing."""
+    return boards.of([flat("best one", 0.1, 0.62), flat("poor one", 0.1), flat("poor two", 0.2)])
+
+
+def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
+    mostly_at_the_cap: board.Leaderboard,
+) -> None:
+    (section,) = mostly_at_the_cap.sections
+    assert [(row.entry.label, row.tier, row.not_reached) for row in section.rows] == [
+        ("best one", 1, False),
+        ("poor one", None, True),
+        ("poor two", None, True),
+    ]
+    assert [row.outperformed_by for row in section.rows[1:]] == [("best one",)] * 2
+    rows = board.as_dict(mostly_at_the_cap)["sections"][0]["rows"]
+    assert [row["verdict"].partition(":")[0] for row in rows] == ["ranked", "not reached", "not reached"]
+    text = command._markdown(mostly_at_the_cap)
+    assert "| not reached | - | poor one |" in text
+    assert "not reached: at the cap in every cell" in text
+    assert "not reached: at the cap in every cell" in report.render(mostly_at_the_cap)
+    written = [row["verdict"] for row in csv.DictReader(io.StringIO(command._csv(mostly_at_the_cap)))]
+    assert written == [row["verdict"] for row in rows]
+
+
+def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.Leaderboard) -> None:
+    best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].rows)
+    assert board.compare_entries(one, two).sentence == "not reached: both are at the cap in all 49 cells"
+    assert board.compare_entries(best, two).sentence == (
+        "outperforms: significantly fewer samples in 7 of 49 cells, significantly more in none; "
+        "both at the cap in 42"
+    )
+    page = report.render(mostly_at_the_cap)
+    assert "not reached: both are at the cap in all 49 cells" in page
+    assert "significantly more in none; both at the cap in 42" in page
+
+
+def test_a_tier_says_on_how_few_cells_it_rests() -> None:
+    made = boards.of([flat("best one", 0.1, 0.62), flat("later one", 0.1, 0.62)])
+    later = made.sections[0].rows[1].entry
+    later.curves[:, :70] = 0.1
+    made = boards.of([made.sections[0].rows[0].entry, later])
+    first, second = made.sections[0].rows
+    assert first.rests_on is None
+    assert second.rests_on == board.Support("best one", "later one", cells=7, at_cap=42, total=49)
+    assert "| 2 | 7 of 7 | later one |" in command._markdown(made)
+    (row,) = [r for r in csv.DictReader(io.StringIO(command._csv(made))) if r["tier"] == "2"]
+    assert (row["rests_on_cells"], row["rests_on_at_cap"], row["rests_on_total"]) == ("7", "42", "49")
+    (told,) = [r["rests_on"] for r in board.as_dict(made)["sections"][0]["rows"] if r["tier"] == 2]
+    assert json.loads(json.dumps(told))["cells"] == 7
+    page = report.render(made)
+    assert ">7 of 7</abbr>" in page
+    assert "best one outperforms the other entry, in 7 of 7 cells that are not at the cap for both." in page
+
+
+def test_the_picture_of_tiers_names_who_reached_nothing(mostly_at_the_cap: board.Leaderboard) -> None:
+    figure = tiers.draw([row.entry for row in mostly_at_the_cap.sections[0].rows])
+    shown = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert [text.rpartition("   ")[2].strip() for text in shown] == ["tier 1", "not reached", ""]
+
+
+def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
+    entries = boards.graded(2)
+    marked = [replace(entries[0], tuning={"steps": 1, "on_protocol_seeds": True}), entries[1]]
+    made = boards.of(marked)
+    note = f"settings chosen after seeing runs on protocol seeds, which may flatter: {entries[0].label}"
+    assert note in command._markdown(made)
+    assert note[1:] in report.render(made)
+    rows = list(csv.DictReader(io.StringIO(command._csv(made))))
+    assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
+    assert "protocol seeds, which" not in command._markdown(boards.of(entries))
