@@ -12,7 +12,7 @@ import pytest
 
 from qrlsuite.cli.commands import leaderboard as command
 from qrlsuite.leaderboard import board, report
-from qrlsuite.leaderboard.collect import EntryCurves
+from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import tiers
 from tests.leaderboard import boards
 
