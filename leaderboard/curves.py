@@ -94,6 +94,14 @@ class EntryCurves:
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
 
     @property
+    def legend(self) -> str:
+        """The label, with the ansatz where the model has one and the label leaves the default out."""
+        ansatz = self.identity.get("model_options", {}).get("ansatz")
+        if ansatz is None or " ansatz=" in self.label:
+            return self.label
+        return f"{self.label} ansatz={ansatz}"
+
+    @property
     def longest(self) -> int:
         """The epochs of the longest run."""
         return max((len(curve) for curve in self.runs.values()), default=int(self.curves.shape[1]))
