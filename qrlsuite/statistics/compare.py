@@ -102,8 +102,8 @@ class Comparison:
     @property
     def sentence(self) -> str:
         """The overall result in words, with the first entry as its subject."""
-        counts = (self.count(verdict) for verdict in (Verdict.WIN, Verdict.LOSS, Verdict.BOTH_AT_CAP))
-        return in_words(self.outcome, *counts, self.grid.size)
+        wins, losses = self.count(Verdict.WIN), self.count(Verdict.LOSS)
+        return in_words(self.outcome, wins, losses, self.count(Verdict.BOTH_AT_CAP), self.grid.size)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as plain values, for JSON."""
