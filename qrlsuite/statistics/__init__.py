@@ -5,10 +5,21 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 
 - `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
-- `board` and `ranking`: all pairs, and tiers.
-- `calibration`: how often all this errs.
+- `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
+- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times.
+- `sequential`: as many runs as it takes to decide, at one error for all looks.
+- `calibration`: how often all this errs. `planning`: how many runs it takes.
+- `across`: several tasks at once.
 """
 
+from qrlsuite.statistics.across import (
+    AcrossTasks,
+    across_tasks,
+    horizon_shares,
+    interquartile_mean,
+    probability_of_improvement,
+    rliable_arrays,
+)
 from qrlsuite.statistics.board import Board, outperformance
 from qrlsuite.statistics.bootstrap import (
     bootstrap_draws,
@@ -17,13 +28,17 @@ from qrlsuite.statistics.bootstrap import (
     bootstrap_interval_at,
 )
 from qrlsuite.statistics.calibration import (
+    DecisionRates,
     Rates,
     SmoothedRuns,
+    TimesRates,
     board_false_winners,
+    decision_rates,
     false_winners,
     power,
     slower,
     split_halves,
+    times_rates,
 )
 from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
@@ -36,7 +51,18 @@ from qrlsuite.statistics.estimator import (
     unsettled_at,
 )
 from qrlsuite.statistics.grid import Grid
+from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
+from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
+from qrlsuite.statistics.sequential import (
+    Decided,
+    Decision,
+    DecisionPlan,
+    PairDecision,
+    Spending,
+    decide,
+    nominal_levels,
+)
 from qrlsuite.statistics.significance import (
     DifferenceRule,
     Evidence,
@@ -45,24 +71,42 @@ from qrlsuite.statistics.significance import (
     SignificanceRule,
     paired_difference_rule,
 )
+from qrlsuite.statistics.times import MeanTime, mean_time, times_below
+from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board
 
 __all__ = [
     "MIN_RUNS",
+    "AcrossTasks",
     "Board",
     "Comparison",
+    "Decided",
+    "Decision",
+    "DecisionPlan",
+    "DecisionRates",
     "DifferenceRule",
+    "Direction",
     "Evidence",
     "Grid",
     "IntervalRule",
     "LearningCurves",
+    "MaxT",
+    "MeanTime",
+    "Need",
     "Outcome",
+    "PairDecision",
+    "PermutationRule",
     "Ranked",
     "Ranking",
     "Rates",
     "Resampling",
     "SignificanceRule",
     "SmoothedRuns",
+    "Spending",
+    "TimesBoard",
+    "TimesRates",
+    "TimesRule",
     "Verdict",
+    "across_tasks",
     "at_cap",
     "board_false_winners",
     "bootstrap_draws",
@@ -71,16 +115,31 @@ __all__ = [
     "bootstrap_interval_at",
     "common_horizon",
     "compare",
+    "decide",
+    "decision_rates",
     "false_winners",
+    "holm",
+    "horizon_shares",
+    "interquartile_mean",
+    "mean_time",
+    "nominal_levels",
     "outperformance",
     "paired_difference_rule",
     "power",
     "printed",
+    "probability_of_improvement",
     "rank",
+    "rank_ranges",
+    "rliable_arrays",
+    "runs_needed",
+    "runs_to_detect",
     "sample_complexity",
     "sample_complexity_at",
     "slower",
     "split_halves",
+    "times_below",
+    "times_board",
+    "times_rates",
     "unsettled",
     "unsettled_at",
 ]
