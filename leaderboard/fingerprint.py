@@ -58,7 +58,7 @@ def fingerprint(entry: Entry, seeds: Sequence[int]) -> Fingerprint:
 
 
 def _chunk(entry: Entry, seeds: list[int]) -> Fingerprint:
-    group = GroupRun(entry, EntryStore(Path()), seeds, epochs=0)
+    group = GroupRun(entry, EntryStore(Path()), seeds, epochs=0, tracked=False)
     group.begin_episodes()
     observations, _ = group.envs.reset()
     first = np.asarray(observations, np.float64).reshape(len(seeds), -1)

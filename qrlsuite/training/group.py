@@ -152,6 +152,8 @@ class GroupRun:
         Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:
         Called after every round with the group's progress.
+    tracked:
+        Whether trackers hear of it; not where seeds are trained again to compare them.
 
     Raises
     ------
@@ -167,6 +169,7 @@ class GroupRun:
         epochs: int,
         device: str = "cpu",
         report: Report = lambda progress: None,
+        tracked: bool = True,
     ) -> None:
         torch.set_num_threads(1)
         self.entry, self.store, self.seeds, self.epochs = entry, entry_store, list(seeds), epochs
@@ -188,7 +191,7 @@ class GroupRun:
         factory = specs.resolve(entry.algorithm.factory)
         self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, where)
         self.epoch = 0
-        self.events = EventSink(registry.load(), asked())
+        self.events = EventSink(registry.load(), asked()) if tracked else EventSink(None)
         self.progress.warnings = self.events.problems
         self.validation_steps = np.zeros(self.S, np.int64), 1
         self._saved_epoch = -1
@@ -254,7 +257,7 @@ class GroupRun:
             self.begin_episodes()
             self.algorithm.start()
         self.progress.epoch = self.epoch
-        origin = provenance.collect([registry.load().get("models", self.entry.model.name).distribution])
+        origin = provenance.collect(self.entry.distributions(), find_device(self.device))
         for seed in self.seeds:
             folder = self.store.seed(seed)
             old = folder.record() or {}

@@ -66,7 +66,7 @@ class EventSink:
     Parameters
     ----------
     known:
-        Where trackers are registered.
+        Where trackers are registered; None for nobody who listens.
     words:
         The trackers that are asked for, `NAME` or `NAME=TARGET`.
 
@@ -76,7 +76,7 @@ class EventSink:
         One line for every tracker that was left out.
     """
 
-    def __init__(self, known: registry.Registry, words: Sequence[str] = ()) -> None:
+    def __init__(self, known: registry.Registry | None, words: Sequence[str] = ()) -> None:
         self.known = known
         self.problems: list[str] = []
         self._failed: set[str] = set()
@@ -98,7 +98,8 @@ class EventSink:
                 self._guarded(name, event, call)
 
     def _listeners(self, event: str, content: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
-        for hook in getattr(self.known.manager.hook, event).get_hookimpls():
+        hooks = [] if self.known is None else getattr(self.known.manager.hook, event).get_hookimpls()
+        for hook in hooks:
             arguments = [content[name] for name in hook.argnames]
             yield str(hook.plugin_name), functools.partial(hook.function, *arguments)
         for name, tracker in self._asked.items():
