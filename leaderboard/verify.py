@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qrlsuite import registry
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.leaderboard import published
@@ -86,11 +85,11 @@ def verify(
 ) -> Verdict:
     """Check one published entry.
 
-    With `rerun`, that many seeds are chosen at random and trained again from nothing. On the type of machine and
-    the versions that made them, their curves must be equal. Elsewhere floating point differs in the last bits and
-    training amplifies that, so that initial parameters, the first epoch's episodes and the score before training
-    must agree to 1e-5, and the final scores must be plausible members of the entry (two-sided Mann-Whitney rank
-    test, p > .01).
+    With `rerun`, that many seeds are chosen at random and trained again from nothing, on the CPU. On the type of
+    machine and with the versions that made them, their curves must be equal. Elsewhere, and where they were made on a
+    GPU, floating point differs in the last bits and training amplifies that, so that initial parameters, the first
+    epoch's episodes and the score before training must agree to 1e-5, and the final scores must be plausible members
+    of the entry (two-sided Mann-Whitney rank test, p > .01).
 
     Parameters
     ----------
@@ -160,15 +159,22 @@ def _train(
 
 
 def _elsewhere(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:
-    """Say in what this machine differs from the one that made the seeds; None where bits must be equal."""
-    here = provenance.collect([registry.load().get("models", made_by.model.name).distribution])
+    """Say in what this machine differs from the one that made the seeds; None where bits must be equal.
+
+    Versions of plugins, and the device, are missing from what earlier versions of the suite recorded: they are then not
+    compared, and the device was the CPU.
+    """
+    here = provenance.collect(made_by.distributions())
     for place in places:
         there = entry.provenance[place]
+        if provenance.device_kind(there) != "cpu":
+            name = there["device"].get("name", "unknown")
+            return f"trained on the CPU here, on {provenance.device_kind(there)} ({name}) there"
         versions = there.get("versions")
+        versions = versions if isinstance(versions, dict) else {}
         for name, version in here["versions"].items():
-            other = versions.get(name) if isinstance(versions, dict) else None
-            if other != version:
-                return f"{name} {version} here, {other} there"
+            if versions.get(name) != version and (name in versions or name in provenance.PACKAGES):
+                return f"{name} {version} here, {versions.get(name)} there"
         for name in ("processor", "system", "python"):
             if there.get(name) != here[name]:
                 return f"{name} {here[name]} here, {there.get(name)} there"

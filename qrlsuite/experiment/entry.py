@@ -82,6 +82,22 @@ class Entry:
         given = {k: v for k, v in values.items() if k not in options.later(cls)}
         return options.plain(options.build(cls, given, "preset"))
 
+    def distributions(self) -> list[str]:
+        """Return the distributions whose code makes the entry's numbers, each once.
+
+        Those of environment, algorithm and model, and of ansatz and circuit backend where the model has them.
+        """
+        known = registry.load()
+        named = {
+            "environments": self.task.environment.name,
+            "algorithms": self.algorithm.name,
+            "models": self.model.name,
+            "ansatzes": getattr(self.model_options, "ansatz", None),
+            "circuit_backends": getattr(self.model_options, "backend", None),
+        }
+        found = [known.entries[kind].get(name) for kind, name in named.items() if isinstance(name, str)]
+        return list(dict.fromkeys(each.distribution for each in found if each is not None))
+
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
         tuned = {} if self.tuning is None else {"tuning": self.tuning}

@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from qrlsuite import registry
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import Task, digest
-from qrlsuite.results.claims import acquire
+from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.provenance import collect
 from qrlsuite.results.released import Released, read
 from qrlsuite.results.store import EntryStore, shortest, table_bytes, write_atomically, write_json
 
 MODEL = "imported"
+_ANY = (0,)
+"""What an import claims: nothing else works on an imported entry, so one seed stands for all."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ def import_files(
     Raises
     ------
     StoreError
-        If a file is refused or its returns cannot be scores of the task; nothing is then written.
+        If a file is refused or its returns cannot be scores of the task, or another import into the same entry is
+        going on; nothing is then written.
     UnknownNameError
         If there is no such algorithm.
     """
@@ -81,23 +84,26 @@ def import_files(
             (path, content, _scores(content.returns, task, path), _parameters(content, quantum, path))
         )
     store = _create(task, algorithm, label, runs)
-    seeds = store.seeds()
-    known = {str((store.seed(seed).record() or {}).get("imported", {}).get("sha256")) for seed in seeds}
-    fresh, digests = [], set(known)
-    for item in contents:
-        if item[1].sha256 not in digests:
-            digests.add(item[1].sha256)
-            fresh.append(item)
-    first = max(seeds, default=-1) + 1
-    new = tuple(range(first, first + len(fresh)))
-    if new:
-        claim = acquire(store, new)
-        try:
-            for seed, (path, content, scores, parameters) in zip(new, fresh):
-                _write(store, seed, path, content, scores, parameters)
-        finally:
-            claim.release()
-    return Imported(store, label, new, len(files) - len(new), _differing([c for _, c, _, _ in contents]))
+    try:
+        claim = acquire(store, _ANY)  # before the numbers are chosen: two imports would choose the same
+    except SeedsClaimedError:
+        raise StoreError(
+            f"another import into {store.path} is going on: repeat this command when it has ended"
+        ) from None
+    try:
+        seeds = store.seeds()
+        digests = {str((store.seed(seed).record() or {}).get("imported", {}).get("sha256")) for seed in seeds}
+        new = []
+        for path, content, scores, parameters in contents:
+            if content.sha256 not in digests:
+                digests.add(content.sha256)
+                new.append(max([*seeds, *new], default=-1) + 1)
+                _write(store, new[-1], path, content, scores, parameters)
+    finally:
+        claim.release()
+    return Imported(
+        store, label, tuple(new), len(files) - len(new), _differing([c for _, c, _, _ in contents])
+    )
 
 
 def _scores(returns: NDArray[np.float64], task: Task, path: Path) -> NDArray[np.float64]:

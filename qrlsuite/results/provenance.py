@@ -5,20 +5,26 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import torch
 
 PACKAGES = ("qrlsuite", "torch", "numpy", "scipy", "gymnasium", "numba", "pennylane", "qiskit")
 
 
-def collect(distributions: list[str]) -> dict[str, Any]:
-    """Return versions, processor, threads and git commit.
+def collect(distributions: Sequence[str], device: torch.device | None = None) -> dict[str, Any]:
+    """Return versions, device, processor, threads and git commit.
 
     Parameters
     ----------
     distributions:
         Further distributions whose versions matter: those of the plugins in use.
+    device:
+        What the models are trained on; the processor by default.
     """
     versions = {}
     for name in dict.fromkeys([*PACKAGES, *distributions]):
@@ -31,10 +37,24 @@ def collect(distributions: list[str]) -> dict[str, Any]:
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": processor(),
+        "device": {"kind": "cpu", "name": processor()} if device is None else _device(device),
         "cores": os.cpu_count(),
         "threads": 1,
         "commit": _commit(),
     }
+
+
+def device_kind(made_with: Mapping[str, Any]) -> str:
+    """Return the kind of device (`cpu`, `cuda`) of what `collect` returned; before it was recorded, read as `cpu`."""
+    device = made_with.get("device")
+    return str(device.get("kind", "cpu")) if isinstance(device, Mapping) else "cpu"
+
+
+def _device(device: torch.device) -> dict[str, str]:
+    import torch
+
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else processor()
+    return {"kind": device.type, "name": name}
 
 
 def processor() -> str:

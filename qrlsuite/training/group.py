@@ -121,7 +121,7 @@ class GroupRun:
         else:
             self.trainer.start()
         self.progress.epoch = self.trainer.epoch
-        origin = provenance.collect([registry.load().get("models", self.entry.model.name).distribution])
+        origin = provenance.collect(self.entry.distributions(), self.trainer.device)
         for seed in self.seeds:
             folder = self.store.seed(seed)
             old = folder.record() or {}

@@ -263,7 +263,8 @@ class Trainer:
         report: Report = lambda progress: None,
     ) -> None:
         torch.set_num_threads(1)
-        self.entry, self.seeds, self.device, self.report = entry, list(seeds), device, report
+        self.entry, self.seeds, self.report = entry, list(seeds), report
+        self.device = find_device(device)
         self.progress = Progress()
         self.epoch = 0
         protocol = entry.task.file.protocol
@@ -271,15 +272,16 @@ class Trainer:
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
         self.envs = build_envs(entry, self.S * self.E, self._tick)
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
-        found = find_device(device)
         self.statistics: RunningStatistics | None = None
         if self.envs.inner.running_statistics:
-            self.statistics = RunningStatistics(self.S, self.E, size, found)
+            self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
         self.models = ModelBuilder(entry, size, self.streams, self.statistics)
         with _building("algorithms", entry.algorithm.name):
             factory = specs.resolve(entry.algorithm.factory)
-            self.algorithm = factory(self.envs, self.models, entry.algorithm_options, self.streams, found)
+            self.algorithm = factory(
+                self.envs, self.models, entry.algorithm_options, self.streams, self.device
+            )
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:
@@ -327,7 +329,7 @@ class Trainer:
         ]
         self.progress.epoch_seconds = finished - started
         seconds = {"train": trained - started, "validate": finished - trained}
-        if self.device == "cpu":
+        if self.device.type == "cpu":
             seconds["cpu"] = time.process_time() - processor
         self.epoch += 1
         return Epoch(self.epoch, metrics, episodes.scores.reshape(self.S, self.V), executions, seconds)

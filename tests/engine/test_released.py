@@ -21,7 +21,8 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.collect import collect
-from qrlsuite.results import released
+from qrlsuite.results import imports, released
+from qrlsuite.results.claims import acquire
 from qrlsuite.results.imports import import_files
 from qrlsuite.results.store import EntryStore, entries, learning_curve
 
@@ -254,3 +255,36 @@ def test_nothing_else_reads_pickles() -> None:
                     assert (node.value.id, node.attr) != ("torch", "load"), path
                 assert path == fence or not names & UNPICKLERS, f"{path} imports {names & UNPICKLERS}"
     assert read > 50
+
+
+def test_an_import_in_between_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another import begins and ends right before this one claims its seeds."""
+    task, runs = load("beam6g"), tmp_path / "runs"
+    first, second = (write(tmp_path / f"{seed}.pkl", content(seed)) for seed in (1, 2))
+    acquire, begun = imports.acquire, []
+
+    def late(*given: Any) -> Any:
+        if not begun:
+            begun.append(True)
+            import_files([second], task, "ddqn", "theirs", runs)
+        return acquire(*given)
+
+    monkeypatch.setattr(imports, "acquire", late)
+    done = import_files([first], task, "ddqn", "theirs", runs)
+    assert done.new == (1,)
+    files = [(done.store.seed(seed).record() or {})["imported"]["file"] for seed in done.store.seeds()]
+    assert files == ["2.pkl", "1.pkl"]
+
+
+def test_an_import_waits_for_no_other(tmp_path: Path) -> None:
+    task, runs = load("beam6g"), tmp_path / "runs"
+    files = [write(tmp_path / f"{seed}.pkl", content(seed)) for seed in (1, 2)]
+    store = import_files(files[:1], task, "ddqn", "theirs", runs).store
+    claim = acquire(store, [0])
+    try:
+        with pytest.raises(StoreError, match=r"another import into .* is going on: repeat this command"):
+            import_files(files[1:], task, "ddqn", "theirs", runs)
+    finally:
+        claim.release()
+    assert store.seeds() == [0]
+    assert import_files(files, task, "ddqn", "theirs", runs).new == (1,)

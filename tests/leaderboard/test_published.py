@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -17,11 +18,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from qrlsuite import hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import collect, published, verify
 from qrlsuite.leaderboard.export import export
+from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
 
 EPOCHS = 3
@@ -255,6 +258,68 @@ def test_a_curve_that_was_changed_is_found_out_here(folder: Path) -> None:
     assert not verdict.ok
     assert verdict.check == "equal"
     assert "differs from epoch 1 on" in verdict.message
+
+
+def test_records_from_before_devices_and_plugins_were_recorded_keep_their_bits(folder: Path) -> None:
+    def older(record: dict[str, Any]) -> None:
+        for made in record["published"]["provenance"]:
+            assert made.pop("device")["kind"] == "cpu"
+
+    edit(folder, older)
+    verdict = verify.verify(folder, rerun=1)
+    assert (verdict.ok, verdict.check) == (True, "equal"), verdict.message
+    assert not collect.collect(folder.parent.parent)[0][0].mixed_versions
+
+
+def test_another_device_is_another_machine(folder: Path) -> None:
+    """A curve of a GPU is not equal to the CPU's, and that is no failure."""
+
+    def on_a_gpu(record: dict[str, Any]) -> None:
+        for made in record["published"]["provenance"]:
+            made["device"] = {"kind": "cuda", "name": "NVIDIA H100"}
+
+    edit(folder, on_a_gpu)
+    rewrite(folder / "curves.parquet", lambda c: c.update(score=[s - 1e-6 for s in c["score"]]))
+    verdict = verify.verify(folder, rerun=1)
+    assert (verdict.ok, verdict.check) == (True, "plausible"), verdict.message
+    assert "trained on the CPU here, on cuda (NVIDIA H100) there" in verdict.message
+
+
+def test_verification_is_no_run_that_trackers_hear_of(folder: Path) -> None:
+    heard: list[str] = []
+
+    class Tracker:
+        @hookimpl
+        def run_started(self, run: dict[str, Any]) -> None:
+            heard.append(run["folder"])
+
+        @hookimpl
+        def run_finished(self, run: dict[str, Any]) -> None:
+            heard.append(run["folder"])
+
+    manager = registry.load().manager
+    tracker = Tracker()
+    manager.register(tracker)
+    try:
+        assert verify.verify(folder, rerun=1).check == "equal"
+        assert heard == []
+    finally:
+        manager.unregister(tracker)
+
+
+def test_what_a_seed_was_made_with_names_device_and_every_plugin(
+    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = registry.load()
+    named = {"environments": "beam6g", "algorithms": "ddqn", "ansatzes": "cx", "circuit_backends": "native"}
+    packages = dict(zip(named, ("pluggy", "packaging", "pydantic", "pydantic_core")))
+    for kind, name in named.items():
+        owned = dataclasses.replace(known.entries[kind][name], distribution=packages[kind])
+        monkeypatch.setitem(known.entries[kind], name, owned)
+    folder = train("runs", [0], 1, model="vqc-native", settings=("qubits=2", "layers=1", "ansatz=cx"))
+    (made,) = (EntryStore(folder).seed(0).record() or {})["provenance"]
+    assert set(packages.values()) <= made["versions"].keys()
+    assert made["device"] == {"kind": "cpu", "name": provenance.processor()}
 
 
 def elsewhere(record: dict[str, Any]) -> None:
