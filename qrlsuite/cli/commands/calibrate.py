@@ -19,7 +19,7 @@ from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.cli.display import duration
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import calibration, collect, rules
-from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
+from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.calibration import Finding, Job
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
@@ -81,7 +81,7 @@ def calibrate(
         type(learned)(learned.values, learned.steps_per_epoch, name)
         for learned, name in zip((learning_curves(entry).cut(horizon) for entry in chosen), names)
     ]
-    grid = grid_of(ranking_of(chosen))
+    grid = ranking_of(chosen).grid
     jobs = calibration.plan(
         curves,
         grid,
