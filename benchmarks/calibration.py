@@ -60,7 +60,9 @@ def print_bias(entry: LearningCurves, draws: int) -> None:
     for n_runs in (5, 10, 20, 50, 100, 1000):
         found = [
             sample_complexity(
-                model.draw(n_runs, generator).values, Grid.relative([0.2], deltas), entry.steps_per_epoch
+                model.draw(n_runs, generator).values,
+                Grid.relative([0.2], deltas),
+                entry.steps_per_epoch,
             )[0]
             for _ in range(draws)
         ]

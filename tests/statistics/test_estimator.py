@@ -63,7 +63,10 @@ def test_noise_of_a_computed_grid_does_not_ask_for_one_run_more() -> None:
 
 def test_never_reached_is_the_horizon_and_unsettled() -> None:
     curves = np.zeros((4, 5))
-    assert sample_complexity(curves, Grid.relative([0.1, 0.2], [0.5]), 7).tolist() == [[35], [35]]
+    assert sample_complexity(curves, Grid.relative([0.1, 0.2], [0.5]), 7).tolist() == [
+        [35],
+        [35],
+    ]
     assert unsettled(curves, Grid.relative([0.1, 0.2], [0.5])).tolist() == [[True], [True]]
 
 
@@ -91,7 +94,10 @@ def test_a_lower_bound_is_printed_as_one() -> None:
 
 def test_thresholds_may_be_any_number_and_curves_too() -> None:
     curves = [[-500.0, -110.0, -np.inf], [np.inf, -90.0, -110.0]]
-    assert sample_complexity(curves, Grid.absolute([-110, 0], [0.5, 1]), 10).tolist() == [[0, 20], [20, 30]]
+    assert sample_complexity(curves, Grid.absolute([-110, 0], [0.5, 1]), 10).tolist() == [
+        [0, 20],
+        [20, 30],
+    ]
 
 
 unit = st.floats(0, 1, width=32)
