@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.group import ACTIONS, ROUNDS, E, array, differs
+from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, array, differs
 
 S = 5
 
