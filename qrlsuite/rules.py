@@ -1,7 +1,7 @@
 """The rules that say which difference in sample complexity is significant: registered, looked up, fenced.
 
-The built-in rules are in `qrlsuite.statistics.significance`, which knows nothing of plugins; they enter here, by
-the same door as anyone's.
+The built-in rules are in `qrlsuite.statistics.significance` and `.permutation`, which know nothing of plugins; they
+enter here, by the same door as anyone's.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ DEFAULT = "intervals"
 """The paper's rule."""
 
 _HERE = "qrlsuite.statistics.significance"
+_PERMUTATION = "qrlsuite.statistics.permutation"
 
 
 @hookimpl
 def register_significance_tests(register: Callable[[SignificanceTestSpec], None]) -> None:
-    """Register the paper's rule and the bootstrap of the difference, unpaired and paired."""
+    """Register the paper's rule, the bootstrap of the difference, and two permutation tests."""
     register(
         SignificanceTestSpec(
             name=DEFAULT,
@@ -44,6 +45,20 @@ def register_significance_tests(register: Callable[[SignificanceTestSpec], None]
             name="difference-paired",
             summary="the same, run by run of the same seed: sharper where equal seeds do similarly",
             factory=f"{_HERE}:paired_difference_rule",
+        )
+    )
+    register(
+        SignificanceTestSpec(
+            name="permutation",
+            summary="labels of runs permuted, per cell; error probability 5 percent over a pair's whole grid",
+            factory=f"{_PERMUTATION}:PermutationRule",
+        )
+    )
+    register(
+        SignificanceTestSpec(
+            name="times",
+            summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
+            factory=f"{_PERMUTATION}:TimesRule",
         )
     )
 

@@ -5,6 +5,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 
 - `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
+- `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
 - `board` and `ranking`: all pairs, and tiers.
 - `calibration`: how often all this errs.
 """
@@ -36,6 +37,7 @@ from qrlsuite.statistics.estimator import (
     unsettled_at,
 )
 from qrlsuite.statistics.grid import Grid
+from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.significance import (
     DifferenceRule,
@@ -45,6 +47,7 @@ from qrlsuite.statistics.significance import (
     SignificanceRule,
     paired_difference_rule,
 )
+from qrlsuite.statistics.times import MeanTime, mean_time, times_below
 
 __all__ = [
     "MIN_RUNS",
@@ -55,13 +58,17 @@ __all__ = [
     "Grid",
     "IntervalRule",
     "LearningCurves",
+    "MaxT",
+    "MeanTime",
     "Outcome",
+    "PermutationRule",
     "Ranked",
     "Ranking",
     "Rates",
     "Resampling",
     "SignificanceRule",
     "SmoothedRuns",
+    "TimesRule",
     "Verdict",
     "at_cap",
     "board_false_winners",
@@ -72,6 +79,7 @@ __all__ = [
     "common_horizon",
     "compare",
     "false_winners",
+    "mean_time",
     "outperformance",
     "paired_difference_rule",
     "power",
@@ -81,6 +89,7 @@ __all__ = [
     "sample_complexity_at",
     "slower",
     "split_halves",
+    "times_below",
     "unsettled",
     "unsettled_at",
 ]

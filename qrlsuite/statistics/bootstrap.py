@@ -27,8 +27,8 @@ from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, exact, whole
 Weights = NDArray[np.float32]
 EpochDraws = NDArray[np.int32]
 
-_BLOCK = 2048  # resamples at a time: a block of counts stays in the cache
-_BYTE = 255  # the most that a byte can count
+BLOCK = 2048  # resamples at a time: a block of counts stays in the cache
+BYTE = 255  # the most that a byte can count
 _TILE = 2**18  # rows x columns x depth up to which OpenBLAS multiplies float32 matrices on one thread
 
 
@@ -235,7 +235,7 @@ def weighted_epochs(curves: Curve, grid: Grid, weights: Weights, n_runs: int) ->
     n_thresholds, n_deltas = grid.shape
     resamples = weights.shape[1]
     required = grid.required_counts(n_runs)
-    counts_type = np.uint8 if n_runs <= _BYTE else np.uint32
+    counts_type = np.uint8 if n_runs <= BYTE else np.uint32
     indicators = reached(curves, grid)
     totals = np.count_nonzero(indicators, axis=2)
     result = np.empty((n_thresholds, n_deltas, resamples), dtype=np.int32)
@@ -246,32 +246,33 @@ def weighted_epochs(curves: Curve, grid: Grid, weights: Weights, n_runs: int) ->
         if not mixed.any():
             continue
         matrix = indicators[row][mixed].astype(np.float32)
-        for start in range(0, resamples, _BLOCK):
-            block = slice(start, start + _BLOCK)
-            counts = _product(matrix, weights[:, block]).astype(counts_type)
+        for start in range(0, resamples, BLOCK):
+            block = slice(start, start + BLOCK)
+            counts = small_product(matrix, weights[:, block]).astype(counts_type)
             for column, needed in enumerate(required.astype(counts_type)):
-                _add_epochs(counts < needed, result[row, column, block])
+                add_epochs(counts < needed, result[row, column, block])
     return result
 
 
-def _product(matrix: NDArray[np.float32], weights: Weights) -> NDArray[np.float32]:
+def small_product(matrix: NDArray[np.float32], weights: Weights) -> NDArray[np.float32]:
     """Return `matrix @ weights` in tiles too small for OpenBLAS to start a second thread.
 
     The whole product takes two tenths of a millisecond. Threads would halve that on an idle machine, and
     stall for tens of milliseconds on a busy one, such as one with a worker process per core.
     """
-    rows, columns = matrix.shape[0], weights.shape[1]
-    side = max(8, math.isqrt(_TILE // matrix.shape[1]))
+    rows, columns, depth = matrix.shape[0], weights.shape[1], matrix.shape[1]
+    height = max(8, math.isqrt(_TILE // depth))
+    width = max(8, _TILE // (depth * min(rows, height)))
     product = np.empty((rows, columns), dtype=np.float32)
-    for left in range(0, columns, side):
-        for top in range(0, rows, side):
-            tile = product[top : top + side, left : left + side]
-            np.matmul(matrix[top : top + side], weights[:, left : left + side], out=tile)
+    for left in range(0, columns, width):
+        for top in range(0, rows, height):
+            tile = product[top : top + height, left : left + width]
+            np.matmul(matrix[top : top + height], weights[:, left : left + width], out=tile)
     return product
 
 
-def _add_epochs(below: NDArray[np.bool_], total: EpochDraws) -> None:
+def add_epochs(below: NDArray[np.bool_], total: EpochDraws) -> None:
     """Add the number of true epochs of a (T, R) block to `total` (R,), in bytes for speed."""
     marks = below.view(np.uint8)
-    for start in range(0, marks.shape[0], _BYTE):
-        total += np.add.reduce(marks[start : start + _BYTE], axis=0, dtype=np.uint8)
+    for start in range(0, marks.shape[0], BYTE):
+        total += np.add.reduce(marks[start : start + BYTE], axis=0, dtype=np.uint8)

@@ -19,8 +19,10 @@ from qrlsuite.statistics import (
     IntervalRule,
     LearningCurves,
     Outcome,
+    PermutationRule,
     Resampling,
     SignificanceRule,
+    TimesRule,
     Verdict,
     bootstrap_interval,
     common_horizon,
@@ -33,7 +35,13 @@ from qrlsuite.statistics import (
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE
 
 CELL = Grid.relative([0.1], [0.5])
-RULES: list[SignificanceRule] = [IntervalRule(), DifferenceRule(), paired_difference_rule()]
+RULES: list[SignificanceRule] = [
+    IntervalRule(),
+    DifferenceRule(),
+    paired_difference_rule(),
+    PermutationRule(),
+    TimesRule(),
+]
 
 
 def learner(

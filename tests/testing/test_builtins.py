@@ -45,6 +45,7 @@ WHERE_OFFERED = {
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
     ("significance_tests", "intervals"): ["against"],
+    ("significance_tests", "times"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},
 }
 """Rules about what a thing need not have."""

@@ -1,0 +1,476 @@
+"""Permutation tests of one pair: labels of whole runs exchanged, one critical value for all comparisons.
+
+If two entries follow the same law, any assignment of the labels "first" and "second" to their runs is as likely
+as the observed one. The observed statistic is therefore compared with those of R random relabelings,
+
+    p = (1 + number of relabelings whose statistic is at least as large) / (R + 1),
+
+which is exact for independent runs of equal laws, whatever R. The maximum of |t| over all comparisons of the
+pair is the statistic, under the same relabeling for all of them (single-step max-T; Westfall and Young 1993,
+"Resampling-based multiple testing"): so p holds for the whole pair, and a comparison by itself is significant
+where the maxima rarely reach its own |t|. The t are studentized: with equal means but unequal laws the test
+is still valid for many runs (Janssen 1997, Statistics & Probability Letters 36; Chung and Romano 2013, Annals of
+Statistics 41).
+
+Two rules are built on it, `TimesRule` (tolerances) and `PermutationRule` (cells).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.bootstrap import BLOCK, BYTE, Weights, add_epochs, small_product
+from qrlsuite.statistics.curves import Curve, reached
+from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray
+from qrlsuite.statistics.significance import Evidence, Signs
+from qrlsuite.statistics.times import check_probability, times_below
+
+CHUNK = 10_000
+"""Relabelings that are made at a time, and the least that decide."""
+_FIRST = 2_000  # relabelings of the cells that suffice where no cell is near the boundary
+_EXACT = 2**24  # float32 counts so far without error
+_TOGETHER = 64  # pairs whose relabelings are in memory at the same time
+_FINEST = 20_000  # epochs to which two entries of different steps per epoch are cut at most
+
+Blocks = tuple[tuple[int, int], ...]
+"""Runs of the first and the second entry in each block within which labels are exchanged."""
+
+
+def relabelings_for(level: float) -> int:
+    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands."""
+    return CHUNK * max(1, math.ceil(20 / check_probability(level, "level") / CHUNK))
+
+
+@functools.lru_cache(maxsize=12)  # all pairs of equal sizes share their relabelings
+def relabelings(n_first: int, n_second: int, chunk: int = 0, seed: int = 0, block: int = 0) -> Weights:
+    """Return, shape (n_first + n_second, 10,000): 1 where a run is labeled "first", n_first times per column.
+
+    Parameters
+    ----------
+    n_first, n_second:
+        Runs of both entries.
+    chunk, seed, block:
+        Others of them give other relabelings, the same the same on every machine.
+    """
+    generator = np.random.default_rng([seed, block, chunk])
+    keys = generator.integers(0, 2**32, size=(CHUNK, n_first + n_second), dtype=np.uint32)
+    labels = np.ascontiguousarray(smallest(keys, n_first).T, dtype=np.float32)
+    labels.flags.writeable = False
+    return labels
+
+
+def smallest(keys: NDArray[np.uint32], count: int) -> BoolArray:
+    """Return, shape (R, n), which are the `count` smallest keys of each row; among equal ones the first."""
+    chosen: BoolArray = keys <= np.sort(keys, axis=1)[:, count - 1 : count]
+    for row in np.flatnonzero(np.count_nonzero(chosen, axis=1) != count).tolist():
+        chosen[row] = False
+        chosen[row, np.argsort(keys[row], kind="stable")[:count]] = True
+    return chosen
+
+
+class MaxT:
+    """Max-T permutation tests of P pairs over E comparisons: the difference of means, studentized (Welch).
+
+    Parameters
+    ----------
+    pairs:
+        P pairs of whole-number arrays (N_A, E) and (N_B, E), one row per run: for instance the times below
+        threshold in steps. Row i of a pair's two arrays need not belong together.
+    blocks:
+        Runs of both entries per block, in the order of the rows, the same for all pairs: labels are exchanged
+        within a block only. None means a single block. Relabelings of a block do not depend on later blocks.
+    seed:
+        Of the relabelings.
+
+    Attributes
+    ----------
+    t:
+        Shape (P, E): Welch's t, positive where the first has the smaller mean; infinite where neither entry
+        varies and they differ, 0 where nothing differs.
+    reached:
+        Shape (P, E): relabelings whose max |t| is at least |t| here.
+    n_relabelings:
+        Shape (P,): relabelings so far.
+
+    Raises
+    ------
+    OptionError
+        If an entry has fewer than two runs, or the blocks do not add up to the runs.
+    """
+
+    def __init__(
+        self, pairs: Sequence[tuple[IntArray, IntArray]], blocks: Blocks | None = None, seed: int = 0
+    ) -> None:
+        self.seed = seed
+        self._swapped = [_in_order(*pair) for pair in pairs]
+        ordered = [pair[::-1] if swap else pair for pair, swap in zip(pairs, self._swapped, strict=True)]
+        self._pairs: list[tuple[IntArray, IntArray]] = [(first, second) for first, second in ordered]
+        self._blocks = [_checked_blocks(pair, blocks, swap) for pair, swap in zip(self._pairs, self._swapped)]
+        shape = (len(pairs), pairs[0][0].shape[1] if pairs else 0)
+        self.t = np.array([welch_t(*pair) for pair in pairs]).reshape(shape)
+        self.reached = np.zeros(shape, dtype=np.int64)
+        self.n_relabelings = np.zeros(len(pairs), dtype=np.int64)
+
+    @property
+    def p_each(self) -> FloatArray:
+        """Shape (P, E): p of every comparison, adjusted for all comparisons of its pair."""
+        p: FloatArray = (1 + self.reached) / (1 + self.n_relabelings)[:, None]
+        return p
+
+    @property
+    def p(self) -> FloatArray:
+        """Shape (P,): p of every pair, that of its largest |t|."""
+        smallest: FloatArray = self.p_each.min(axis=1)
+        return smallest
+
+    def extend(self, n_relabelings: int, which: IntArray | None = None) -> None:
+        """Continue to `n_relabelings` (a multiple of 10,000), for all pairs or for those in `which`."""
+        chosen = range(len(self._pairs)) if which is None else which.tolist()
+        groups: dict[tuple[Blocks, int], list[int]] = {}
+        for index in chosen:
+            groups.setdefault((self._blocks[index], int(self.n_relabelings[index])), []).append(index)
+        for (blocks, done), members in groups.items():
+            for begin in range(0, len(members), _TOGETHER):
+                group = members[begin : begin + _TOGETHER]
+                statistics = _Statistics([self._pairs[index] for index in group], blocks)
+                for chunk in range(done // CHUNK, n_relabelings // CHUNK):
+                    self.reached[group] += statistics.count(chunk, self.seed)
+                    self.n_relabelings[group] += CHUNK
+
+
+def _in_order(first: IntArray, second: IntArray) -> bool:
+    """Return whether a pair is to be swapped: by its content, so that the answer hangs on no order of names."""
+    if len(first) != len(second):
+        return len(first) > len(second)
+    return np.ascontiguousarray(first).tobytes() > np.ascontiguousarray(second).tobytes()
+
+
+def _checked_blocks(pair: tuple[IntArray, IntArray], blocks: Blocks | None, swapped: bool) -> Blocks:
+    sizes = len(pair[0]), len(pair[1])
+    if min(sizes) < 2:
+        raise OptionError("a permutation test needs two runs or more of each entry: one has no spread")
+    if blocks is None:
+        return (sizes,)
+    if swapped:
+        blocks = tuple((second, first) for first, second in blocks)
+    if tuple(np.sum(blocks, axis=0).tolist()) != sizes:
+        raise OptionError(f"blocks {blocks} do not add up to {sizes[0]} and {sizes[1]} runs")
+    return blocks
+
+
+def welch_t(first: IntArray, second: IntArray) -> FloatArray:
+    """Return Welch's t, shape (E,), of two arrays (N_A, E) and (N_B, E): positive where the first is smaller."""
+    difference = second.mean(axis=0) - first.mean(axis=0)
+    spread = np.sqrt(first.var(axis=0, ddof=1) / len(first) + second.var(axis=0, ddof=1) / len(second))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t: FloatArray = np.where(difference == 0, 0.0, difference / spread)
+    return t
+
+
+class _Statistics:
+    """A strictly increasing function of |t|, for P pairs of equal sizes: what relabelings are compared by.
+
+    For equal numbers of runs, with sum of squares and total of both entries together, t is an increasing
+    function of the difference alone: (sum_A - sum_B)^2 / (n x squares - total^2), which lies in [0, 1]. For
+    unequal numbers it is t^2. Sums are whole numbers and exact, so that ties are ties on every machine.
+    """
+
+    def __init__(self, pairs: Sequence[tuple[IntArray, IntArray]], blocks: Blocks) -> None:
+        self.blocks = blocks
+        self.sizes = tuple(np.sum(blocks, axis=0).tolist())
+        self.n_pairs, self.n_comparisons = len(pairs), pairs[0][0].shape[1]
+        pooled = np.stack([_interleaved(pair, blocks) for pair in pairs])  # (P, n, E)
+        unit = max(1, int(np.gcd.reduce(pooled, axis=None)))
+        rows = np.ascontiguousarray(np.moveaxis(pooled // unit, 2, 0)).reshape(
+            -1, pooled.shape[1]
+        )  # (E P, n)
+        rows -= np.rint(rows.mean(axis=1)).astype(np.int64)[
+            :, None
+        ]  # small numbers lose least in differences
+        labels = np.concatenate([np.repeat([1, 0], block) for block in blocks])
+        self.totals, self.squares = rows.sum(axis=1), (rows**2).sum(axis=1)
+        self.equal = self.sizes[0] == self.sizes[1]
+        summed = [rows] if self.equal else [rows, rows**2]
+        largest = max(2 * int(np.abs(each).sum(axis=1).max()) for each in summed)
+        self.kind: Any = np.float32 if largest < _EXACT else np.float64
+        self.matrices = [each.astype(self.kind) for each in summed]
+        observed = [(each @ labels)[:, None].astype(self.kind) for each in summed]
+        self.observed = self._of(observed).reshape(self.n_comparisons, self.n_pairs)
+
+    def count(self, chunk: int, seed: int) -> IntArray:
+        """Return, shape (P, E), how many relabelings of a chunk have a maximum of at least the observed."""
+        labels = [relabelings(*sizes, chunk, seed, block) for block, sizes in enumerate(self.blocks)]
+        sums = [self._sum(matrix, labels) for matrix in self.matrices]
+        largest = self._of(sums).reshape(self.n_comparisons, self.n_pairs, CHUNK).max(axis=0)
+        return np.stack(
+            [np.count_nonzero(largest >= each[:, None], axis=1) for each in self.observed], axis=1
+        )
+
+    def _sum(self, matrix: NDArray[Any], labels: Sequence[Weights]) -> NDArray[Any]:
+        """Return, shape (E P, relabelings), the sum over the runs labeled "first"."""
+        ends = np.cumsum([len(each) for each in labels]).tolist()
+        total: NDArray[Any] | None = None
+        for end, each in zip(ends, labels):
+            columns = matrix[:, end - len(each) : end]
+            if self.kind is np.float32:
+                part: NDArray[Any] = small_product(columns, each)
+            else:
+                part = columns @ each.astype(np.float64)
+            total = part if total is None else np.add(total, part, out=total)
+        assert total is not None
+        return total
+
+    def _of(self, sums: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        n_first, n_second = self.sizes
+        if self.equal:
+            spread = (n_first + n_second) * self.squares - self.totals**2
+            scale = np.divide(1.0, spread, out=np.zeros(len(spread)), where=spread > 0)
+            result = sums[0] * self.kind(2)
+            result -= self.totals.astype(self.kind)[:, None]
+            result *= result
+            result *= scale.astype(self.kind)[:, None]
+            return result
+        # t^2 = difference^2 / variance, both polynomials of the first's sums: few passes over large arrays
+        first, squares = (each.astype(np.float64) for each in sums)
+        totals, all_squares = self.totals[:, None], self.squares[:, None]
+        one, other = (1 / (n * (n - 1)) for n in (n_first, n_second))
+        variance = first * -(one / n_first + other / n_second)
+        variance += totals * (2 * other / n_second)
+        variance *= first
+        squares *= one - other
+        variance += squares
+        variance += all_squares * other - totals**2 * (other / n_second)
+        first *= 1 / n_first + 1 / n_second
+        first -= totals / n_second
+        first *= first
+        # what rounding leaves of a variance of zero is zero
+        nothing = 1e-12 * all_squares * (one + other)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.divide(first, np.where(variance > nothing, variance, 0), out=first)
+        return np.nan_to_num(first, copy=False, nan=0.0, posinf=np.inf)
+
+
+def _interleaved(pair: tuple[IntArray, IntArray], blocks: Blocks) -> IntArray:
+    """Return the runs of both, (n, E), block by block: first, second, first, second."""
+    ends = np.cumsum(np.array(blocks), axis=0)
+    return np.concatenate(
+        [
+            side[end - size : end]
+            for row, block in zip(ends, blocks)
+            for side, end, size in zip(pair, row, block)
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TimesRule:
+    """Significant where the mean time below a threshold differs; all deltas of a threshold get its sign.
+
+    The statistic is Welch's t of the times T(eps) (see `qrlsuite.statistics.times`), with one critical value for
+    all E thresholds from relabelings of whole runs (see `MaxT`). It is computed from all runs of both entries,
+    which may differ in number. Sources: Westfall and Young 1993; Janssen 1997; Chung and Romano 2013.
+
+    Attributes
+    ----------
+    alpha:
+        Probability, for two entries of equal law, that any threshold is declared different.
+    """
+
+    alpha: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_probability(self.alpha, "alpha")
+
+    @property
+    def name(self) -> str:
+        """The rule's name."""
+        return "times"
+
+    @property
+    def promise(self) -> str:
+        """What the rule controls."""
+        return (
+            f"all tolerances of one pair: two entries of equal law differ significantly at any with probability "
+            f"{self.alpha:g} at most; for equal means but unequal laws about so, if both have many runs; not the "
+            "direction, and not the whole board of many pairs"
+        )
+
+    def __call__(self, first: Evidence, second: Evidence) -> Signs:
+        """Return the sign of every cell, shape (E, D)."""
+        signs: Signs = self.against(first, [second])[0]
+        return signs
+
+    def against(self, first: Evidence, others: Sequence[Evidence]) -> Signs:
+        """Return the signs of one entry against M others, shape (M, E, D)."""
+        own = times_of(first)
+        test = MaxT([(own, times_of(other)) for other in others], seed=first.resampling.seed)
+        test.extend(relabelings_for(self.alpha))
+        signs = np.where(test.p_each <= self.alpha, np.sign(test.t), 0).astype(np.int8)
+        return np.repeat(signs[:, :, None], first.grid.shape[1], axis=2)
+
+
+def times_of(evidence: Evidence) -> IntArray:
+    """Return the times below threshold in steps of all runs of an entry, shape (N, E)."""
+    return times_below(evidence.entry.values, evidence.grid, evidence.steps_per_epoch)
+
+
+@dataclass(frozen=True, slots=True)
+class PermutationRule:
+    """Significant where S_hat differs by more than relabeled runs make it differ, anywhere on the grid.
+
+    The difference of S_hat in a cell is divided by its standard error within both groups, for the observed and
+    for every relabeling, and |t| compared with the largest of each relabeling: single-step max-T over the cells
+    (Westfall and Young 1993), exact for independent runs of equal laws. The standard error is read off the
+    surface itself: S_hat rises with delta like a quantile, so a quarter of S_hat(delta + 2h) - S_hat(delta - 2h),
+    with h = sqrt(delta (1 - delta) / n) the standard error of P_hat, is that of S_hat (Woodruff 1952, Journal of
+    the American Statistical Association 47); 1/12 of the coarser epoch squared is added for the rounding to whole
+    epochs. Without it, two groups that both mix quick and slow runs would differ as much as the quick from the
+    slow. S_hat depends on the number of runs; of the larger entry the first n runs are taken.
+
+    Attributes
+    ----------
+    alpha:
+        Probability, for two entries of equal law, that any cell of the grid is declared different.
+    """
+
+    alpha: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_probability(self.alpha, "alpha")
+
+    @property
+    def name(self) -> str:
+        """The rule's name."""
+        return "permutation"
+
+    @property
+    def promise(self) -> str:
+        """What the rule controls."""
+        return (
+            f"the whole grid of one pair: two entries of equal law differ significantly in any cell with "
+            f"probability {self.alpha:g} at most; not unequal laws with equal sample complexity, not the "
+            "direction, and not the whole board of many pairs"
+        )
+
+    def __call__(self, first: Evidence, second: Evidence) -> Signs:
+        """Return the sign of every cell, shape (E, D).
+
+        Raises
+        ------
+        OptionError
+            If the epochs of both entries have no common measure that is fine enough to lay them side by side.
+        """
+        pair, resolution = _side_by_side(first, second)
+        if pair[0].tobytes() > pair[1].tobytes():
+            return -self._signs(pair[::-1], first.grid, resolution, first.resampling.seed)
+        return self._signs(pair, first.grid, resolution, first.resampling.seed)
+
+    def _signs(self, pair: Sequence[Curve], grid: Grid, resolution: int, seed: int) -> Signs:
+        full = relabelings_for(self.alpha)
+        for count in (_FIRST, full):
+            t, drawn = _cell_ratios(pair, grid, resolution, seed, count)
+            largest = np.abs(drawn).max(axis=(0, 1))
+            p = (1 + np.count_nonzero(largest >= np.abs(t)[..., None], axis=2)) / (count + 1)
+            if (np.abs(p - self.alpha) > 3 * np.sqrt(self.alpha * (1 - self.alpha) / count)).all():
+                break
+        signs: Signs = np.where((p <= self.alpha) & (t != 0), -np.sign(t), 0).astype(np.int8)
+        return signs
+
+
+def _side_by_side(first: Evidence, second: Evidence) -> tuple[list[Curve], int]:
+    """Return the first n runs of both in epochs of equal length, and the coarser epoch in these."""
+    common = math.gcd(first.steps_per_epoch, second.steps_per_epoch)
+    epochs = first.entry.horizon // common
+    if epochs > _FINEST:
+        raise OptionError(
+            f"'{first.entry.name}' ({first.steps_per_epoch} steps per epoch) and '{second.entry.name}' "
+            f"({second.steps_per_epoch}) cannot be laid side by side: take rule 'times'"
+        )
+    kind = np.result_type(first.entry.values.dtype, second.entry.values.dtype)
+    pair = [
+        np.repeat(each.entry.values[: each.n_runs], each.steps_per_epoch // common, axis=1).astype(kind)
+        for each in (first, second)
+    ]
+    return pair, max(first.steps_per_epoch, second.steps_per_epoch) // common
+
+
+def _cell_ratios(
+    pair: Sequence[Curve], grid: Grid, resolution: int, seed: int, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return (S_hat of the first - second) / standard error, (E, D), and that of `count` relabelings, (E, D, R)."""
+    n_runs = len(pair[0])
+    levels, inverse, scale = _levels(grid, n_runs)
+    indicators = np.concatenate([reached(each, grid) for each in pair], axis=2)
+    own, totals = np.count_nonzero(indicators[..., :n_runs], axis=2), np.count_nonzero(indicators, axis=2)
+    observed = np.zeros((*grid.shape, 1), dtype=np.float32)
+    drawn = np.zeros((*grid.shape, count), dtype=np.float32)
+    kind: Any = np.uint8 if 2 * n_runs <= BYTE else np.uint32
+    for row in range(grid.shape[0]):
+        # where no run or every run is there, the labels make no difference
+        mixed = (totals[row] > 0) & (totals[row] < 2 * n_runs)
+        if not mixed.any():
+            continue
+        matrix, total = indicators[row][mixed].astype(np.float32), totals[row][mixed]
+        counted = own[row][mixed][:, None].astype(kind)
+        observed[row] = _ratios(counted, total, levels, inverse, scale, resolution)
+        for begin in range(0, count, BLOCK):
+            part = slice(begin, min(begin + BLOCK, count))
+            counts = small_product(matrix, _relabelings_between(n_runs, seed, part)).astype(kind)
+            drawn[row, :, part] = _ratios(counts, total, levels, inverse, scale, resolution)
+    return observed[..., 0], drawn
+
+
+def _relabelings_between(n_runs: int, seed: int, part: slice) -> Weights:
+    """Return, shape (2 n_runs, r), relabelings part.start to part.stop of all chunks in a row."""
+    chunk, begin = divmod(part.start, CHUNK)
+    ready = relabelings(n_runs, n_runs, chunk, seed)[:, begin : begin + part.stop - part.start]
+    missing = part.stop - part.start - ready.shape[1]
+    if not missing:
+        return ready
+    return np.concatenate([ready, relabelings(n_runs, n_runs, chunk + 1, seed)[:, :missing]], axis=1)
+
+
+def _levels(grid: Grid, n_runs: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the counts at which S_hat is needed, where they stand for each delta, and a factor.
+
+    For each of D deltas three counts are needed, (3, D): the required one, and those two standard errors of P_hat
+    below and above, within 1 and n; their distance in S_hat times the factor (D,) is the standard error.
+    """
+    required = grid.required_counts(n_runs)
+    deltas = np.array([float(delta) for delta in grid.deltas])
+    step = np.maximum(1, np.rint(2 * np.sqrt(deltas * (1 - deltas) * n_runs))).astype(np.int64)
+    below, above = np.maximum(required - step, 1), np.minimum(required + step, n_runs)
+    levels, inverse = np.unique(np.stack([required, below, above]), return_inverse=True)
+    return levels, inverse.reshape(3, -1), step / np.maximum(above - below, 1) / 2
+
+
+def _ratios(
+    counts: NDArray[Any],
+    total: IntArray,
+    levels: IntArray,
+    inverse: IntArray,
+    scale: FloatArray,
+    resolution: int,
+) -> NDArray[np.float32]:
+    """Return the studentized differences, (D, R), for counts (T, R) of the first's runs that are there."""
+    first, second = (np.zeros((len(levels), counts.shape[1]), dtype=np.int32) for _ in range(2))
+    for index, level in enumerate(levels.tolist()):
+        add_epochs(counts < counts.dtype.type(level), first[index])
+        # the second is below where total - count < level
+        enough = np.maximum(total - level + 1, 0)[:, None].astype(counts.dtype)
+        add_epochs(counts >= enough, second[index])
+    difference = (first[inverse[0]] - second[inverse[0]]).astype(np.float32)
+    factor = scale.astype(np.float32)[:, None]
+    variance = np.full(difference.shape, resolution**2 / 12, dtype=np.float32)
+    for side in (first, second):
+        variance += ((side[inverse[2]] - side[inverse[1]]).astype(np.float32) * factor) ** 2
+    ratios: NDArray[np.float32] = difference / np.sqrt(variance)
+    return ratios

@@ -1,0 +1,254 @@
+"""Tests that exchange the labels of whole runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics import (
+    Evidence,
+    Grid,
+    LearningCurves,
+    MaxT,
+    PermutationRule,
+    Resampling,
+    SmoothedRuns,
+    TimesRule,
+    compare,
+    false_winners,
+    power,
+)
+from qrlsuite.statistics.estimator import complexity
+from qrlsuite.statistics.permutation import (
+    CHUNK,
+    _cell_ratios,
+    relabelings,
+    relabelings_for,
+    smallest,
+    welch_t,
+)
+from tests.statistics.conftest import DELTAS, SURFACE, entry
+
+
+def column(*values: int) -> np.ndarray:
+    return np.array(values, dtype=np.int64)[:, None]
+
+
+def relabeled(first: np.ndarray, second: np.ndarray, **options: object) -> MaxT:
+    test = MaxT([(first, second)], **options)  # type: ignore[arg-type]
+    test.extend(CHUNK)
+    return test
+
+
+def test_two_runs_against_two_by_hand() -> None:
+    """Six labelings, of which 1, 2 | 3, 4 and its reverse have the largest difference: p = 1/3."""
+    test = relabeled(column(1, 2), column(3, 4))
+    assert test.t.tolist() == [[pytest.approx(2 / 0.5**0.5)]], "positive: the first needs less"
+    assert test.p[0] == pytest.approx(1 / 3, abs=0.015)
+    assert test.n_relabelings.tolist() == [CHUNK]
+    assert test.p[0] == (1 + test.reached[0, 0]) / (1 + CHUNK)
+
+
+@pytest.mark.parametrize("sizes", [(4, 4), (3, 5), (5, 3)])
+@pytest.mark.parametrize("scale", [1, 10**7])
+def test_p_is_the_share_of_all_labelings(sizes: tuple[int, int], scale: int) -> None:
+    """All labelings counted one by one; large numbers take the way of double precision."""
+    generator = np.random.default_rng(3)
+    pooled = generator.integers(0, 40, size=(sum(sizes), 2)) * scale + generator.integers(0, 2, (8, 1))
+    first, second = pooled[: sizes[0]], pooled[sizes[0] :]
+    observed = np.abs(welch_t(first, second))
+    largest = []
+    for chosen in combinations(range(8), sizes[0]):
+        rest = np.setdiff1d(np.arange(8), chosen)
+        largest.append(np.abs(welch_t(pooled[list(chosen)], pooled[rest])).max())
+    expected = (np.array(largest)[:, None] >= observed - 1e-9).mean(axis=0)
+    assert relabeled(first, second).p_each[0] == pytest.approx(expected, abs=0.02)
+
+
+def test_one_relabeling_is_used_for_all_comparisons() -> None:
+    """A comparison repeated is no second comparison: p stays what it was."""
+    generator = np.random.default_rng(0)
+    first, second = generator.integers(0, 50, (10, 1)), generator.integers(10, 60, (10, 1))
+    alone = relabeled(first, second)
+    repeated = relabeled(np.repeat(first, 3, axis=1), np.repeat(second, 3, axis=1))
+    assert repeated.p_each.tolist() == [[alone.p[0]] * 3]
+    other = generator.integers(0, 50, (10, 1)), generator.integers(0, 50, (10, 1))
+    both = relabeled(np.hstack([first, other[0]]), np.hstack([second, other[1]]))
+    assert both.p_each[0, 0] > alone.p[0], "another comparison has its price"
+
+
+def test_degenerate_pairs() -> None:
+    same = relabeled(column(*[5] * 10), column(*[5] * 10))
+    assert (same.t[0, 0], same.p[0]) == (0, 1)
+    for n_second in (10, 12):
+        apart = relabeled(column(*[5] * 10), column(*[9] * n_second))
+        assert apart.t[0, 0] == np.inf
+        assert apart.p[0] < 0.001
+        assert relabeled(column(*[9] * n_second), column(*[5] * 10)).t[0, 0] == -np.inf
+    with pytest.raises(OptionError, match="two runs or more"):
+        MaxT([(column(1), column(2, 3))])
+
+
+@pytest.mark.parametrize("n_second", [25, 30])
+def test_swapping_a_pair_changes_the_sign_and_nothing_else(n_second: int) -> None:
+    generator = np.random.default_rng(1)
+    first, second = generator.integers(0, 50, (30, 4)), generator.integers(3, 53, (n_second, 4))
+    there, back = relabeled(first, second), relabeled(second, first)
+    assert (there.p_each == back.p_each).all()
+    assert (there.t == -back.t).all()
+
+
+def test_pairs_together_are_pairs_alone() -> None:
+    generator = np.random.default_rng(2)
+    pairs = [(generator.integers(0, 50, (n, 3)), generator.integers(5, 55, (m, 3))) for n, m in
+             [(20, 20), (20, 20), (20, 30), (25, 25)]]  # fmt: skip
+    together = MaxT(pairs)
+    together.extend(CHUNK)
+    for index, pair in enumerate(pairs):
+        assert (together.p_each[index] == relabeled(*pair).p_each[0]).all()
+    before = together.reached.copy()
+    together.extend(2 * CHUNK, np.array([1]))
+    assert together.n_relabelings.tolist() == [CHUNK, 2 * CHUNK, CHUNK, CHUNK]
+    assert (together.reached[[0, 2, 3]] == before[[0, 2, 3]]).all()
+    whole = MaxT(pairs[1:2])
+    whole.extend(2 * CHUNK)
+    assert (whole.reached[0] == together.reached[1]).all(), "to go on is to have begun with more"
+
+
+def test_labels_are_exchanged_within_blocks() -> None:
+    """Two blocks of one run each way: four labelings, two of them as far apart as the observed one."""
+    first, second = column(1, 11), column(2, 12)
+    assert relabeled(first, second, blocks=((1, 1), (1, 1))).p[0] == pytest.approx(0.5, abs=0.02)
+    assert relabeled(first, second).p[0] == pytest.approx(2 / 3, abs=0.02)
+    with pytest.raises(OptionError, match="do not add up"):
+        MaxT([(first, second)], blocks=((1, 1),))
+
+
+def test_relabelings_are_uniform_and_seeded() -> None:
+    labels = relabelings(3, 5)
+    assert labels.shape == (8, CHUNK)
+    assert (labels.sum(axis=0) == 3).all()
+    assert labels.mean(axis=1) == pytest.approx(np.full(8, 3 / 8), abs=0.02)
+    _, counts = np.unique(labels, axis=1, return_counts=True)
+    assert len(counts) == 56
+    assert ((counts - CHUNK / 56) ** 2 / (CHUNK / 56)).sum() < 100, "chi squared with 55 degrees of freedom"
+    others = [relabelings(3, 5, chunk=1), relabelings(3, 5, seed=1), relabelings(3, 5, block=1)]
+    assert all((labels != other).any() for other in others)
+    relabelings.cache_clear()
+    assert (labels == relabelings(3, 5)).all()
+
+
+def test_equal_keys_do_not_change_the_number_of_labels() -> None:
+    keys = np.array([[3, 1, 1, 1], [4, 3, 2, 1]], dtype=np.uint32)
+    assert smallest(keys, 2).tolist() == [[False, True, True, False], [False, False, True, True]]
+
+
+def test_twenty_over_the_level_and_ten_thousand_or_more() -> None:
+    assert [relabelings_for(level) for level in (0.5, 0.05, 0.002, 0.0019)] == [
+        CHUNK,
+        CHUNK,
+        CHUNK,
+        2 * CHUNK,
+    ]
+
+
+@pytest.mark.parametrize("copies", [1, 5], ids=["counts in bytes", "more than a byte"])
+def test_differences_of_cells_are_those_of_the_surface(copies: int) -> None:
+    """Each relabeling by itself: S_hat at delta, and two standard errors of P_hat below and above."""
+    first, second = (np.repeat(entry(index).values, copies, axis=0) for index in (0, 1))
+    n_runs = len(first)
+    found, drawn = _cell_ratios([first, second], SURFACE, 1, 0, 200)
+    pooled, labels = np.concatenate([first, second]), relabelings(n_runs, n_runs)
+
+    def expected(chosen: np.ndarray) -> np.ndarray:
+        counts = [round(delta * n_runs) for delta in DELTAS]
+        steps = [round(2 * (delta * (1 - delta) * n_runs) ** 0.5) for delta in DELTAS]
+        rows = []
+        for shift in (0, -1, 1):
+            deltas = [
+                Fraction(min(count + shift * step, n_runs), n_runs) for count, step in zip(counts, steps)
+            ]
+            cells = dataclasses.replace(SURFACE, deltas=tuple(deltas))
+            surfaces = [complexity(pooled[side], cells, 1) for side in (chosen, ~chosen)]
+            rows.append(np.stack(surfaces).astype(float))
+        reach = [min(count + step, n_runs) - count + step for count, step in zip(counts, steps)]
+        errors = (rows[2] - rows[1]) * np.array(steps) / np.array(reach) / 2
+        return (rows[0][0] - rows[0][1]) / np.sqrt(1 / 12 + (errors**2).sum(axis=0))
+
+    assert found == pytest.approx(expected(np.arange(2 * n_runs) < n_runs), rel=1e-5)
+    for index in (0, 199):
+        assert drawn[..., index] == pytest.approx(expected(labels[:, index] > 0), rel=1e-5)
+
+
+def test_epochs_of_different_length_are_laid_side_by_side() -> None:
+    fine = LearningCurves(np.repeat(entry(0).values, 2, axis=1), 1000, "fine")
+    coarse = entry(1)
+    expected = compare(entry(0), coarse, SURFACE, PermutationRule()).verdicts
+    assert compare(fine, coarse, SURFACE, PermutationRule()).verdicts == expected
+    many, few = (LearningCurves(np.ones((20, 101 - n)), 1000 + n, f"{n}") for n in (0, 1))
+    with pytest.raises(
+        OptionError, match=r"'0' .1000 steps per epoch. and '1' .1001. cannot.*take rule 'times'"
+    ):
+        PermutationRule()(*(Evidence(each, SURFACE, 20) for each in (many, few)))
+
+
+def test_times_takes_all_runs_of_both() -> None:
+    """Runs beyond the smaller number count: here 80 that never learn, behind 20 equal ones."""
+    few = SmoothedRuns(entry(0)).draw(20, np.random.default_rng(0))
+    many = LearningCurves(np.concatenate([few.values, np.zeros((80, 100))]), 2000, "many")
+    won = np.array(compare(few, many, SURFACE, TimesRule()).verdicts) == "win"
+    assert won.all()
+    assert (np.array(compare(many, few, SURFACE, TimesRule()).verdicts) == "loss").all()
+    assert not PermutationRule()(*(Evidence(each, SURFACE, 20) for each in (few, many))).any(), (
+        "equal numbers"
+    )
+
+
+def test_all_deltas_of_a_tolerance_have_its_sign() -> None:
+    signs = TimesRule()(*(Evidence(each, SURFACE, 30) for each in (entry(0), entry(1))))
+    assert (signs == signs[:, :1]).all()
+    assert (signs > 0).all()
+
+
+@pytest.mark.parametrize("rule", [TimesRule, PermutationRule])
+def test_alpha_and_seed_decide(rule: type) -> None:
+    with pytest.raises(OptionError, match="alpha"):
+        rule(0)
+    model, generator = SmoothedRuns(entry(0)), np.random.default_rng(5)
+    pair = [model.draw(30, generator) for _ in range(2)]
+    late = LearningCurves(np.concatenate([np.zeros((30, 4)), pair[1].values[:, :-4]], axis=1), 2000, "late")
+    found = [
+        np.count_nonzero(rule(alpha)(*(Evidence(each, SURFACE, 30) for each in (pair[0], late))))
+        for alpha in (0.9, 0.05, 1e-4)
+    ]
+    assert found[0] >= found[1] >= found[2]
+    assert found[0] > found[2]
+    seeded = [
+        [Evidence(each, SURFACE, 30, Resampling(10, seed)) for each in (pair[0], late)] for seed in (1, 1)
+    ]
+    assert (rule()(*seeded[0]) == rule()(*seeded[1])).all()
+
+
+@pytest.mark.parametrize("rule", [TimesRule(), PermutationRule()], ids=["times", "permutation"])
+@pytest.mark.parametrize("index", [0, 1])
+def test_equal_entries_rarely_differ_and_slow_ones_are_found(
+    rule: TimesRule | PermutationRule, index: int
+) -> None:
+    model = SmoothedRuns(entry(index))
+    rates = false_winners(model, 30, 30, SURFACE, rule, n_pairs=60)
+    assert rates.any_cell <= 0.1
+    late = LearningCurves(
+        np.concatenate([np.zeros((30, 20)), entry(index).values[:, :-20]], axis=1), 2000, "late"
+    )
+    assert power(model, SmoothedRuns(late), 30, 30, SURFACE, rule, n_pairs=20).first_wins >= 0.8
+
+
+def test_a_grid_of_one_cell() -> None:
+    grid = Grid.relative([0.1], [0.5])
+    pair = [Evidence(each, grid, 30) for each in (entry(0), entry(1))]
+    assert PermutationRule()(*pair).tolist() == TimesRule()(*pair).tolist() == [[1]]
