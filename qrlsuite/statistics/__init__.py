@@ -6,7 +6,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
-- `board` and `ranking`: all pairs, and tiers.
+- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times.
 - `calibration`: how often all this errs.
 """
 
@@ -48,12 +48,14 @@ from qrlsuite.statistics.significance import (
     paired_difference_rule,
 )
 from qrlsuite.statistics.times import MeanTime, mean_time, times_below
+from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board
 
 __all__ = [
     "MIN_RUNS",
     "Board",
     "Comparison",
     "DifferenceRule",
+    "Direction",
     "Evidence",
     "Grid",
     "IntervalRule",
@@ -68,6 +70,7 @@ __all__ = [
     "Resampling",
     "SignificanceRule",
     "SmoothedRuns",
+    "TimesBoard",
     "TimesRule",
     "Verdict",
     "at_cap",
@@ -79,17 +82,20 @@ __all__ = [
     "common_horizon",
     "compare",
     "false_winners",
+    "holm",
     "mean_time",
     "outperformance",
     "paired_difference_rule",
     "power",
     "printed",
     "rank",
+    "rank_ranges",
     "sample_complexity",
     "sample_complexity_at",
     "slower",
     "split_halves",
     "times_below",
+    "times_board",
     "unsettled",
     "unsettled_at",
 ]

@@ -128,7 +128,7 @@ class MaxT:
     @property
     def p(self) -> FloatArray:
         """Shape (P,): p of every pair, that of its largest |t|."""
-        smallest: FloatArray = self.p_each.min(axis=1)
+        smallest: FloatArray = self.p_each.min(axis=1, initial=1)
         return smallest
 
     def extend(self, n_relabelings: int, which: IntArray | None = None) -> None:
@@ -233,7 +233,7 @@ class _Statistics:
         if self.equal:
             spread = (n_first + n_second) * self.squares - self.totals**2
             scale = np.divide(1.0, spread, out=np.zeros(len(spread)), where=spread > 0)
-            result = sums[0] * self.kind(2)
+            result: NDArray[Any] = sums[0] * self.kind(2)
             result -= self.totals.astype(self.kind)[:, None]
             result *= result
             result *= scale.astype(self.kind)[:, None]
@@ -255,7 +255,8 @@ class _Statistics:
         nothing = 1e-12 * all_squares * (one + other)
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(first, np.where(variance > nothing, variance, 0), out=first)
-        return np.nan_to_num(first, copy=False, nan=0.0, posinf=np.inf)
+        first[np.isnan(first)] = 0
+        return first
 
 
 def _interleaved(pair: tuple[IntArray, IntArray], blocks: Blocks) -> IntArray:

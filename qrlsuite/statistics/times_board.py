@@ -1,0 +1,310 @@
+"""All pairs of a board by their mean time below threshold: what is decided, by how much, and which ranks remain.
+
+Beside the tiers of the paper's definition (`qrlsuite.statistics.board`). The order is by mean time M. A pair is
+decided if Holm's procedure over all pairs of the board rejects its max-T permutation test (`MaxT`): for entries of
+equal laws the probability of any false decision on the whole board is alpha at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.compare import MIN_RUNS
+from qrlsuite.statistics.curves import LearningCurves
+from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, whole
+from qrlsuite.statistics.permutation import CHUNK, MaxT, relabelings_for
+from qrlsuite.statistics.times import MeanTime, check_probability, mean_time, student_quantile, times_below
+
+FEW_RUNS = 50
+"""Unequal numbers are marked where the smaller is below this: the test then errs more often than alpha says."""
+_CERTAIN = 2.5  # standard errors from its level, beyond which a p is not refined
+
+
+class Direction(StrEnum):
+    """A pair of a board, from the first entry's side."""
+
+    FEWER = "needs fewer"
+    MORE = "needs more"
+    TRADE_OFF = "trade-off"
+    NOT_TOLD_APART = "not told apart"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TimesBoard:
+    """The result of `times_board`, for M entries and E thresholds; matrices are from the row's side.
+
+    Attributes
+    ----------
+    names, n_runs:
+        The entries in the order given, and their numbers of runs.
+    horizon:
+        In environment steps.
+    alpha:
+        Probability of any false decision on a board of entries of equal laws.
+    means:
+        M of each, see `MeanTime`; intervals at level 1 - alpha, each by itself.
+    p:
+        Shape (M, M): max-T p of each pair by itself; NaN where undecided, and on the diagonal.
+    adjusted:
+        Shape (M, M): the same, adjusted for all pairs of the board (Holm 1979).
+    directions:
+        M rows of M: what is decided.
+    signs:
+        Shape (M, M, E): +1 where the row's entry needs significantly fewer steps at this threshold, at level
+        alpha / number of pairs; -1 where more.
+    difference:
+        Shape (M, M): M of the row's entry over that of the column's, minus 1; NaN where the latter is 0.
+    difference_interval:
+        Shape (M, M, 2): at level 1 - alpha for each pair by itself (Welch's t of the log ratio, delta method).
+    ranks:
+        Shape (M, 2): best and worst rank that the decisions leave; 0 for entries that stand apart.
+    few:
+        Shape (M, M): whether the numbers of runs are unequal and the smaller is below 50.
+    """
+
+    names: tuple[str, ...]
+    n_runs: tuple[int, ...]
+    horizon: int
+    alpha: float
+    means: tuple[MeanTime, ...]
+    p: FloatArray = field(repr=False)
+    adjusted: FloatArray = field(repr=False)
+    directions: tuple[tuple[Direction, ...], ...] = field(repr=False)
+    signs: IntArray = field(repr=False)
+    difference: FloatArray = field(repr=False)
+    difference_interval: FloatArray = field(repr=False)
+    ranks: IntArray = field(repr=False)
+    few: BoolArray = field(repr=False)
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Indices of the ranked entries by M, least first, equal ones by name; then those below 20 runs."""
+        return self._by([mean.mean for mean in self.means])
+
+    @property
+    def order_at_half(self) -> tuple[int, ...]:
+        """The same by M at half the horizon: where it differs, the order depends on the horizon."""
+        return self._by([mean.half for mean in self.means])
+
+    @property
+    def neighbors_told_apart(self) -> tuple[bool, ...]:
+        """For each two that follow each other in `order`: whether the pair is decided."""
+        decided = (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
+        return tuple(self.directions[i][j] in decided for i, j in zip(self.order, self.order[1:]))
+
+    def _by(self, values: Sequence[float]) -> tuple[int, ...]:
+        def key(index: int) -> tuple[bool, float, str]:
+            return self.n_runs[index] < MIN_RUNS, values[index], self.names[index]
+
+        return tuple(sorted(range(len(self.names)), key=key))
+
+
+def times_board(
+    entries: Sequence[LearningCurves],
+    grid: Grid,
+    alpha: float = 0.05,
+    horizon: int | None = None,
+    seed: int = 0,
+) -> TimesBoard:
+    """Compare all pairs of M entries by their mean time below threshold.
+
+    Entries with fewer than 20 runs stand apart: no pair with them is tested or counted. Numbers of runs may
+    differ. A decided pair has the direction of its largest |t|, unless thresholds of both signs are significant
+    at alpha / number of pairs: that is a trade-off.
+
+    Parameters
+    ----------
+    entries:
+        The entries; their names must differ.
+    grid:
+        Its E thresholds count; its deltas do not.
+    alpha:
+        In (0, 1).
+    horizon:
+        Environment steps beyond which no entry is looked at; None means the horizon that all have.
+    seed:
+        Of the relabelings.
+
+    Raises
+    ------
+    OptionError
+        If names repeat, the horizons differ and none is given, or the horizon is not a whole number of epochs.
+
+    References
+    ----------
+    Holm 1979, Scandinavian Journal of Statistics 6; Westfall and Young 1993; Mogstad, Romano, Shaikh and Wilhelm
+    2024, Review of Economic Studies 91 (ranges of ranks from decided pairs).
+    """
+    check_probability(alpha, "alpha")
+    names = tuple(entry.name for entry in entries)
+    if len(set(names)) != len(names):
+        raise OptionError(f"two entries are called '{next(n for n in names if names.count(n) > 1)}'")
+    end = _common_end(entries, horizon)
+    cut = [entry.cut(end) for entry in entries]
+    times = [times_below(entry.values, grid, entry.steps_per_epoch) for entry in cut]
+    size = len(entries)
+    ranked = [index for index in range(size) if entries[index].n_runs >= MIN_RUNS]
+    pairs = [(i, j) for place, i in enumerate(ranked) for j in ranked[place + 1 :]]
+    test = MaxT([(times[i], times[j]) for i, j in pairs], seed=seed)
+    refine(test, alpha)
+    p, adjusted = (np.full((size, size), np.nan) for _ in range(2))
+    signs = np.zeros((size, size, grid.shape[0]), dtype=np.int64)
+    directions = [[Direction.UNDECIDED] * size for _ in range(size)]
+    corrected = holm(test.p)
+    for index, (i, j) in enumerate(pairs):
+        p[i, j] = p[j, i] = test.p[index]
+        adjusted[i, j] = adjusted[j, i] = corrected[index]
+        found = np.where(test.p_each[index] <= alpha / len(pairs), np.sign(test.t[index]), 0).astype(np.int64)
+        signs[i, j], signs[j, i] = found, -found
+        sign = direction(test.t[index], found) if corrected[index] <= alpha else None
+        directions[i][j], directions[j][i] = _named(sign), _named(None if sign is None else -sign)
+    difference, interval = _differences(times, 1 - alpha)
+    better = np.array([[each is Direction.FEWER for each in row] for row in directions], bool).reshape(
+        size, -1
+    )
+    counts = np.array([entry.n_runs for entry in entries], dtype=np.int64)
+    return TimesBoard(
+        names=names,
+        n_runs=tuple(counts.tolist()),
+        horizon=end,
+        alpha=alpha,
+        means=tuple(mean_time(entry, grid, 1 - alpha) for entry in cut),
+        p=p,
+        adjusted=adjusted,
+        directions=tuple(tuple(row) for row in directions),
+        signs=signs,
+        difference=difference,
+        difference_interval=interval,
+        ranks=rank_ranges(better, counts >= MIN_RUNS),
+        few=(counts[:, None] != counts) & (np.minimum.outer(counts, counts) < FEW_RUNS),
+    )
+
+
+def _common_end(entries: Sequence[LearningCurves], horizon: int | None) -> int:
+    if not entries:
+        raise OptionError("a board needs an entry")
+    if horizon is not None:
+        return whole(horizon, "horizon", at_least=1)
+    first = entries[0]
+    for entry in entries:
+        if entry.horizon != first.horizon:
+            raise OptionError(
+                f"'{first.name}' ends at {first.horizon} steps, '{entry.name}' at {entry.horizon}: "
+                "give a horizon that both have"
+            )
+    return first.horizon
+
+
+def refine(test: MaxT, alpha: float) -> None:
+    """Relabel until Holm's decisions over all pairs of a test are clear, or 20 / smallest level times.
+
+    Ten thousand relabelings for every pair; more for those whose p is within 2.5 standard errors of the level
+    that Holm's procedure compares it with, or whose sign at a threshold may make the pair a trade-off.
+    """
+    n_pairs = len(test.t)
+    if not n_pairs:
+        return
+    most = relabelings_for(alpha / n_pairs)
+    count, which = CHUNK, np.arange(n_pairs)
+    while len(which):
+        test.extend(count, which)
+        order = np.argsort(test.p, kind="stable")
+        levels = np.empty(n_pairs)
+        levels[order] = alpha / np.arange(n_pairs, 0, -1)
+        unclear = _near(test.reached.min(axis=1), test.n_relabelings, levels)
+        leading = np.sign(test.t[np.arange(n_pairs), test.reached.argmin(axis=1)])
+        against = np.sign(test.t) * leading[:, None] < 0
+        opposed = _near(test.reached, test.n_relabelings[:, None], np.full((n_pairs, 1), alpha / n_pairs))
+        unclear |= (against & opposed).any(axis=1)
+        which = np.flatnonzero(unclear & (test.n_relabelings < most))
+        count = min(2 * count, most)
+
+
+def _near(reached: IntArray, count: IntArray, level: FloatArray) -> BoolArray:
+    """Return whether a level lies in the score interval of the share reached / count (Wilson 1927)."""
+    share = reached / count
+    near: BoolArray = np.abs(share - level) <= _CERTAIN * np.sqrt(level * (1 - level) / count)
+    return near
+
+
+def direction(t: FloatArray, signs: IntArray) -> int:
+    """Return 1 or -1, the sign of the largest |t| of (E,), or 0 if significant signs of (E,) are of both kinds."""
+    if (signs > 0).any() and (signs < 0).any():
+        return 0
+    return int(np.sign(t[np.abs(t).argmax()]))
+
+
+def _named(sign: int | None) -> Direction:
+    if sign is None:
+        return Direction.NOT_TOLD_APART
+    return {1: Direction.FEWER, -1: Direction.MORE, 0: Direction.TRADE_OFF}[sign]
+
+
+def holm(p: ArrayLike) -> FloatArray:
+    """Return p values adjusted for their number, shape (m,): at most alpha where Holm's procedure rejects.
+
+    >>> holm([0.01, 0.04, 0.03]).tolist()
+    [0.03, 0.06, 0.06]
+    """
+    values = np.asarray(p, dtype=np.float64)
+    order = np.argsort(values, kind="stable")
+    steps = values[order] * np.arange(len(values), 0, -1)
+    adjusted = np.empty(len(values))
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1)
+    return adjusted
+
+
+def rank_ranges(better: ArrayLike, ranked: ArrayLike | None = None) -> IntArray:
+    """Return best and worst rank that decided pairs leave, shape (M, 2).
+
+    1 + the number of entries that are significantly better, to m - the number that are significantly worse. If
+    no decision is false, every entry's true rank is in its range (Mogstad et al. 2024).
+
+    Parameters
+    ----------
+    better:
+        Shape (M, M): whether the row's entry is significantly better than the column's.
+    ranked:
+        Shape (M,): which m entries are ranked; the others get 0. None means all.
+    """
+    relation = np.asarray(better, dtype=bool)
+    member = np.ones(len(relation), bool) if ranked is None else np.asarray(ranked, bool)
+    ranges = np.stack([1 + relation.sum(axis=0), member.sum() - relation.sum(axis=1)], axis=1)
+    ranges[~member] = 0
+    return ranges.astype(np.int64)
+
+
+def log_ratios(times: Sequence[IntArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return log(M_row / M_column), its standard error and degrees of freedom, each (M, M).
+
+    Delta method with Welch's degrees of freedom. NaN where a mean is 0 and the ratio is not defined; the
+    error is 0 and the freedom infinite where neither entry varies.
+    """
+    of_runs = [each.mean(axis=1) for each in times]
+    counts = np.array([len(each) for each in of_runs])
+    means = np.array([each.mean() for each in of_runs])
+    variances = np.array([each.var(ddof=1) if len(each) > 1 else np.nan for each in of_runs])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = variances / means**2 / counts
+        logs = np.log(means)
+        ratio = logs[:, None] - logs
+        both = parts[:, None] + parts
+        slack = parts**2 / (counts - 1)
+        freedom = np.where(both == 0, np.inf, both**2 / (slack[:, None] + slack))
+    undefined = (means == 0)[:, None] | (means == 0)
+    ratio[undefined] = np.nan
+    return ratio, np.sqrt(both), freedom
+
+
+def _differences(times: Sequence[IntArray], level: float) -> tuple[FloatArray, FloatArray]:
+    ratio, error, freedom = log_ratios(times)
+    reach = student_quantile((1 + level) / 2, freedom) * error
+    np.fill_diagonal(reach, 0)
+    return np.expm1(ratio), np.expm1(np.stack([ratio - reach, ratio + reach], axis=2))

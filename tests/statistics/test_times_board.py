@@ -1,0 +1,154 @@
+"""A board by mean times: what is decided among all pairs, and which ranks remain."""
+
+from __future__ import annotations
+
+import doctest
+import sys
+
+import numpy as np
+import pytest
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics import (
+    Direction,
+    Grid,
+    LearningCurves,
+    MaxT,
+    SmoothedRuns,
+    holm,
+    rank_ranges,
+    times_board,
+)
+from qrlsuite.statistics.permutation import CHUNK
+from qrlsuite.statistics.times_board import direction, log_ratios, refine
+from tests.statistics.conftest import SURFACE, entry
+
+CELL = Grid.relative([0.1, 0.5], [0.5])
+
+
+def learner(
+    name: str, *first_good: int, n_runs: int = 30, epochs: int = 10, steps: int = 100
+) -> LearningCurves:
+    """Runs that reach the goal at given epochs, in turn, and stay there."""
+    starts = np.resize(first_good, n_runs)
+    return LearningCurves((np.arange(epochs) >= starts[:, None]).astype(float), steps, name)
+
+
+def test_holm_by_hand() -> None:
+    # .01 x 3, .03 x 2 and .04 x 1, never falling
+    assert holm([0.01, 0.04, 0.03]).tolist() == [0.03, 0.06, 0.06]
+    assert holm([0.5, 0.6]).tolist() == [1, 1]
+    assert holm([]).size == 0
+    assert doctest.testmod(sys.modules[times_board.__module__]).attempted
+
+
+def test_rank_ranges_by_hand() -> None:
+    # a before c, b before c; nothing known about a and b
+    better = np.zeros((3, 3), bool)
+    better[0, 2] = better[1, 2] = True
+    assert rank_ranges(better).tolist() == [[1, 2], [1, 2], [3, 3]]
+    assert rank_ranges(np.zeros((3, 3), bool)).tolist() == [[1, 3]] * 3
+    assert rank_ranges(np.zeros((3, 3), bool), [True, False, True]).tolist() == [[1, 2], [0, 0], [1, 2]]
+
+
+def test_a_board_by_hand() -> None:
+    """Nothing varies: times of 200, 400 and 400 steps; the first is before both others, which are equal."""
+    board = times_board([learner("c", 4), learner("a", 2), learner("b", 4)], CELL)
+    assert [board.names[index] for index in board.order] == ["a", "b", "c"]
+    assert [mean.mean for mean in board.means] == [400, 200, 400]
+    assert board.directions[1] == (Direction.FEWER, Direction.UNDECIDED, Direction.FEWER)
+    assert board.directions[0] == (Direction.UNDECIDED, Direction.MORE, Direction.NOT_TOLD_APART)
+    assert board.ranks.tolist() == [[2, 3], [1, 1], [2, 3]]
+    assert board.difference[1].tolist() == pytest.approx([-0.5, 0, -0.5])
+    assert board.difference_interval[0, 1].tolist() == pytest.approx([1, 1]), "400 is 100 percent over 200"
+    assert board.p[0, 2] == board.adjusted[0, 2] == 1
+    assert board.p[0, 1] == pytest.approx(1e-4, abs=1e-4)
+    assert np.isnan(board.p.diagonal()).all()
+    assert board.signs[1, 0].tolist() == [1, 1]
+    assert board.neighbors_told_apart == (True, False)
+    assert board.order_at_half == board.order
+    assert not board.few.any()
+
+
+def test_the_difference_and_its_interval_by_hand() -> None:
+    # means 2 and 4, standard deviations 1 of two runs each: parts (1/2)/4 and (1/2)/16
+    times = [np.array([[1], [3]]) * 100, np.array([[3], [5]]) * 100]
+    ratio, error, freedom = log_ratios(times)
+    assert ratio[1, 0] == pytest.approx(np.log(2))
+    assert error[1, 0] ** 2 == pytest.approx(2 / 2 / 4 + 2 / 2 / 16)
+    assert freedom[1, 0] == pytest.approx((1 / 4 + 1 / 16) ** 2 / (1 / 16 + 1 / 256))
+
+
+def test_thresholds_of_both_signs_are_a_trade_off() -> None:
+    """The first is half good early and never fully; the second is fully good late."""
+    half, late = np.zeros((40, 10)), np.zeros((40, 10))
+    half[:, 2:], late[:, 6:] = 0.6, 1
+    noise = np.random.default_rng(0).integers(0, 2, 40)
+    half[noise == 1, 2] = 0
+    board = times_board([LearningCurves(half, 1, "half"), LearningCurves(late, 1, "late")], CELL)
+    assert board.signs[0, 1].tolist() == [-1, 1]
+    assert board.directions[0][1] is board.directions[1][0] is Direction.TRADE_OFF
+    assert board.ranks.tolist() == [[1, 2], [1, 2]]
+    assert direction(np.array([-2.0, 3.0]), np.array([0, 0])) == 1
+
+
+def test_degenerate_boards() -> None:
+    capped = times_board([learner("a", 10), learner("b", 10)], CELL)
+    assert capped.directions[0][1] is Direction.NOT_TOLD_APART
+    assert capped.means[0].at_cap.tolist() == [1, 1]
+    assert capped.difference[0, 1] == 0
+    at_once = times_board([learner("a", 0), learner("b", 4)], CELL)
+    assert at_once.directions[0][1] is Direction.FEWER
+    assert np.isnan(at_once.difference[1, 0]), "nothing is so many percent more than no steps at all"
+    alone = times_board([learner("a", 3)], CELL)
+    assert alone.ranks.tolist() == [[1, 1]]
+    few = times_board([learner("a", 3), learner("b", 8), learner("few", 1, n_runs=19)], CELL)
+    assert few.directions[2] == (Direction.UNDECIDED,) * 3
+    assert few.ranks.tolist() == [[1, 1], [2, 2], [0, 0]]
+    assert [few.names[index] for index in few.order] == ["a", "b", "few"]
+    assert few.adjusted[0, 1] == few.p[0, 1], "an entry that stands apart is no part of the family"
+
+
+def test_unequal_numbers_are_marked_where_the_smaller_is_below_fifty() -> None:
+    counts = (20, 50, 100)
+    board = times_board([learner(str(n), 3, 5, n_runs=n) for n in counts], CELL)
+    assert board.few.tolist() == [[False, True, True], [True, False, False], [True, False, False]]
+
+
+def test_bad_boards_are_named() -> None:
+    with pytest.raises(OptionError, match="two entries are called 'a'"):
+        times_board([learner("a", 3), learner("a", 4)], CELL)
+    with pytest.raises(OptionError, match="'a' ends at 1000 steps, 'b' at 900: give a horizon"):
+        times_board([learner("a", 3), learner("b", 4, epochs=9)], CELL)
+    assert times_board([learner("a", 3), learner("b", 4, epochs=9)], CELL, horizon=900).horizon == 900
+    with pytest.raises(OptionError, match="alpha = 1 is outside"):
+        times_board([learner("a", 3)], CELL, alpha=1)
+    with pytest.raises(OptionError, match="a board needs an entry"):
+        times_board([], CELL)
+
+
+def test_only_pairs_near_their_level_are_relabeled_further() -> None:
+    generator = np.random.default_rng(0)
+    base = generator.integers(0, 50, (20, 30, 1))
+    pairs = [(each, generator.integers(0, 50, (30, 1))) for each in base[:18]]
+    pairs += [(base[18], base[18] + 100), (base[19], generator.integers(14, 64, (30, 1)))]
+    test = MaxT(pairs)
+    refine(test, 0.05)
+    assert (test.n_relabelings[:18] == CHUNK).all()
+    assert test.n_relabelings.max() <= 20 * 20 / 0.05 + CHUNK
+    again = MaxT(pairs)
+    refine(again, 0.05)
+    assert (test.reached == again.reached).all()
+
+
+def test_equals_are_rarely_told_apart_and_seeds_decide() -> None:
+    model, generator = SmoothedRuns(entry(0)), np.random.default_rng(1)
+    found = 0
+    for _ in range(20):
+        entries = [LearningCurves(model.draw(30, generator).values, 2000, str(k)) for k in range(4)]
+        board = times_board(entries, SURFACE)
+        found += any(Direction.FEWER in row for row in board.directions)
+    assert found <= 4
+    seeded = [times_board(entries, SURFACE, seed=seed).p for seed in (0, 0, 1)]
+    assert np.array_equal(seeded[0], seeded[1], equal_nan=True)
+    assert not np.array_equal(seeded[0], seeded[2], equal_nan=True)
