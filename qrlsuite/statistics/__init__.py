@@ -7,6 +7,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
 - `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times.
+- `sequential`: as many runs as it takes to decide, at one error for all looks.
 - `calibration`: how often all this errs.
 """
 
@@ -39,6 +40,15 @@ from qrlsuite.statistics.estimator import (
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
+from qrlsuite.statistics.sequential import (
+    Decided,
+    Decision,
+    DecisionPlan,
+    PairDecision,
+    Spending,
+    decide,
+    nominal_levels,
+)
 from qrlsuite.statistics.significance import (
     DifferenceRule,
     Evidence,
@@ -54,6 +64,9 @@ __all__ = [
     "MIN_RUNS",
     "Board",
     "Comparison",
+    "Decided",
+    "Decision",
+    "DecisionPlan",
     "DifferenceRule",
     "Direction",
     "Evidence",
@@ -63,6 +76,7 @@ __all__ = [
     "MaxT",
     "MeanTime",
     "Outcome",
+    "PairDecision",
     "PermutationRule",
     "Ranked",
     "Ranking",
@@ -70,6 +84,7 @@ __all__ = [
     "Resampling",
     "SignificanceRule",
     "SmoothedRuns",
+    "Spending",
     "TimesBoard",
     "TimesRule",
     "Verdict",
@@ -81,9 +96,11 @@ __all__ = [
     "bootstrap_interval_at",
     "common_horizon",
     "compare",
+    "decide",
     "false_winners",
     "holm",
     "mean_time",
+    "nominal_levels",
     "outperformance",
     "paired_difference_rule",
     "power",

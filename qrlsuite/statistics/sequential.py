@@ -1,0 +1,470 @@
+"""As many seeds as it takes: a plan with several looks at growing numbers of runs, at one error for all of them.
+
+Whoever looks at the data again and again and stops at the first p below .05 errs far more often than that. Here
+alpha is spent over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over
+the pairs by a group-sequential Holm procedure (Maurer and Bretz 2013, Statistics in Biopharmaceutical Research 5;
+Ye, Li, Liu and Yao 2013, Statistics in Medicine 32): every pair that is not yet decided is tested at the levels that
+belong to alpha / number of such pairs, and after a rejection again with one less. The family is all pairs that were
+planned. A pair that is closed as equal is not rejected: it keeps its share of alpha.
+
+The test is that of rule `times` (`MaxT`); labels are exchanged within the block of seeds that each look added.
+A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
+1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
+
+`decide` is a function of the plan and the runs so far: nothing else is remembered between looks, so that an
+interrupted study goes on where it was.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import combinations
+
+import numpy as np
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.compare import MIN_RUNS
+from qrlsuite.statistics.curves import LearningCurves
+from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
+from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for
+from qrlsuite.statistics.times import check_probability, student_quantile, times_below
+from qrlsuite.statistics.times_board import direction, log_ratios
+
+MOST_RELABELINGS = 200_000
+"""At levels below 1e-4 a decision needs p = 1 / 200,001 or so; at levels below that there is none."""
+_POINTS = 1001  # of the numerical integration
+_TAIL = 9.0  # standard deviations beyond which a density is nothing
+
+
+class Spending(StrEnum):
+    """How alpha is spent over the looks (Lan and DeMets 1983): t is the share of all planned runs."""
+
+    POCOCK = "pocock"
+    OBRIEN_FLEMING = "obrien-fleming"
+
+    def spent(self, t: Sequence[float], alpha: float) -> FloatArray:
+        """Return, shape (K,), what one side has spent at shares t in (0, 1] of the runs: alpha at t = 1."""
+        from scipy.special import ndtr, ndtri
+
+        share = np.asarray(t, dtype=np.float64)
+        if self is Spending.POCOCK:
+            result: FloatArray = alpha * np.log1p((math.e - 1) * share)
+        else:
+            result = 2 * ndtr(ndtri(alpha / 2) / np.sqrt(share))
+        return result
+
+
+@functools.lru_cache(maxsize=256)
+def nominal_levels(
+    looks: tuple[int, ...], alpha: float, spending: Spending, sides: int = 2
+) -> tuple[float, ...]:
+    """Return the level at which a p is significant at each look, so that all looks together err at alpha.
+
+    By numerical integration over the looks of the density of the statistic among studies that go on (Armitage,
+    McPherson and Rowe 1969; Jennison and Turnbull 2000, chapter 19).
+
+    Parameters
+    ----------
+    looks:
+        Numbers of runs, rising.
+    alpha:
+        What is spent when all are done.
+    spending:
+        The function.
+    sides:
+        2 for two-sided p, 1 for one-sided.
+
+    Examples
+    --------
+    >>> [round(level, 4) for level in nominal_levels((20, 40, 60, 80, 100), 0.05, Spending.POCOCK)]
+    [0.0148, 0.0152, 0.0159, 0.0165, 0.017]
+    """
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    shares = np.array(looks) / looks[-1]
+    increments = sides * np.diff(spending.spent(shares.tolist(), alpha / sides), prepend=0.0)
+    # B_k = Z_k sqrt(t_k) has independent increments; `points` and `density` describe B where the study goes on
+    points, density = np.zeros(1), np.ones(1)
+    levels, before = [], 0.0
+    for share, increment in zip(shares.tolist(), increments.tolist()):
+        scale, step = math.sqrt(share), math.sqrt(share - before)
+
+        stopped = functools.partial(_stopped, points, density, scale, step, sides, increment)
+        bound = float(brentq(stopped, 0.0 if sides == 2 else -_TAIL, 40.0, xtol=1e-10))
+        levels.append(float(sides * ndtr(-bound)))
+        lower = -bound if sides == 2 else -_TAIL
+        edges = max(lower, -_TAIL) * scale, min(bound, _TAIL) * scale
+        fresh, weights = _simpson(*edges)
+        kernel = np.exp(-(((fresh[:, None] - points) / step) ** 2) / 2) / (step * math.sqrt(2 * math.pi))
+        points, density = fresh, weights * (kernel @ density)
+        before = share
+    return tuple(levels)
+
+
+def _stopped(
+    points: FloatArray,
+    density: FloatArray,
+    scale: float,
+    step: float,
+    sides: int,
+    increment: float,
+    bound: float,
+) -> float:
+    """Return the probability that a study stops at this look at a bound on |Z|, minus what it may spend."""
+    from scipy.special import ndtr
+
+    beyond = ndtr((points - bound * scale) / step)
+    if sides == 2:
+        beyond = beyond + ndtr((-points - bound * scale) / step)
+    return float((density * beyond).sum()) - increment
+
+
+def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Return points and weights of Simpson's rule."""
+    points = np.linspace(low, high, _POINTS)
+    weights = np.full(_POINTS, 2.0)
+    weights[1::2] = 4
+    weights[[0, -1]] = 1
+    return points, weights * (points[1] - points[0]) / 3
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionPlan:
+    """What is fixed before the first run: who is compared, when, and at which error.
+
+    Attributes
+    ----------
+    entries:
+        Names of two or more entries.
+    looks:
+        Runs of each entry at each look, rising. Below 20 only with a `reason`: rare failures that have not
+        occurred yet would decide.
+    alpha:
+        Probability of any false difference, over all pairs and looks, for entries of equal laws.
+    spending:
+        How alpha is spent over the looks.
+    margin:
+        Ratios of mean times within 1 / (1 + margin) and 1 + margin are equal enough.
+    equal_from:
+        Runs from which a pair may be found equal.
+    pairs:
+        The pairs of names that are compared; None means all.
+    seed:
+        Of the relabelings.
+    reason:
+        Why the first look comes before 20 runs.
+
+    Raises
+    ------
+    OptionError
+        If something is out of its range, a name is repeated or unknown, or looks do not rise.
+    """
+
+    entries: tuple[str, ...]
+    looks: tuple[int, ...] = (20, 40, 60, 80, 100)
+    alpha: float = 0.05
+    spending: Spending = Spending.POCOCK
+    margin: float = 0.10
+    equal_from: int = 40
+    pairs: tuple[tuple[str, str], ...] | None = None
+    seed: int = 0
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.entries) < 2:
+            raise OptionError(f"entries = {list(self.entries)}: a decision needs two or more")
+        if len(set(self.entries)) != len(self.entries):
+            raise OptionError(f"entries = {list(self.entries)}: a name is repeated")
+        for look in self.looks:
+            whole(look, "looks", at_least=2)
+        if not self.looks or any(after <= before for before, after in zip(self.looks, self.looks[1:])):
+            raise OptionError(f"looks = {list(self.looks)}: each must be at more runs than the one before")
+        if self.looks[0] < MIN_RUNS and not self.reason.strip():
+            raise OptionError(
+                f"looks = {list(self.looks)}: the first is below {MIN_RUNS} runs, where rare failures that have not "
+                "occurred yet would decide; begin later, or give a reason"
+            )
+        check_probability(self.alpha, "alpha")
+        if self.spending not in tuple(Spending):
+            known = " or ".join(f"'{each}'" for each in Spending)
+            raise OptionError(f"spending = '{self.spending}': expected {known}")
+        object.__setattr__(self, "spending", Spending(self.spending))
+        if not 0 < self.margin < math.inf:
+            raise OptionError(f"margin = {self.margin!r} is not a positive number")
+        for first, second in self.pairs or ():
+            for name in (first, second):
+                if name not in self.entries:
+                    raise OptionError(f"pairs: '{name}' is not one of the entries {list(self.entries)}")
+            if first == second:
+                raise OptionError(f"pairs: '{first}' is compared with itself")
+        if len({frozenset(pair) for pair in self.family}) != len(self.family) or not self.family:
+            raise OptionError("pairs: a pair is repeated, or there is none")
+
+    @property
+    def family(self) -> tuple[tuple[str, str], ...]:
+        """The pairs that are compared."""
+        return self.pairs if self.pairs is not None else tuple(combinations(self.entries, 2))
+
+    @property
+    def blocks(self) -> Blocks:
+        """Runs that each look adds, of the first and the second entry."""
+        added = np.diff(self.looks, prepend=0).tolist()
+        return tuple((each, each) for each in added)
+
+    def level(self, look: int, undecided: int) -> float:
+        """Return the level of a p at look 0, 1, ... while so many pairs are not decided."""
+        return nominal_levels(self.looks, self.alpha / undecided, self.spending)[look]
+
+    def equal_level(self, look: int) -> float | None:
+        """Return the level of each one-sided test of equality at a look; None before `equal_from`."""
+        allowed = tuple(each for each in self.looks if each >= self.equal_from)
+        if self.looks[look] not in allowed:
+            return None
+        levels = nominal_levels(allowed, self.alpha, Spending.OBRIEN_FLEMING, 1)
+        return levels[allowed.index(self.looks[look])]
+
+
+class Decided(StrEnum):
+    """How a pair was closed."""
+
+    FIRST = "first needs fewer"
+    SECOND = "second needs fewer"
+    TRADE_OFF = "trade-off"
+    EQUAL = "equal"
+    NOT_TOLD_APART = "not told apart"
+
+
+@dataclass(frozen=True, slots=True)
+class PairDecision:
+    """One pair after its last look.
+
+    Attributes
+    ----------
+    first, second:
+        The entries.
+    decided:
+        None while the pair is open.
+    n_runs:
+        Runs of each at its last look, 0 before the first.
+    p, levels:
+        Max-T p and the level it was compared with last, at each look so far.
+    difference:
+        Mean time of the second over that of the first, minus 1, at the last look. After an early stop it is
+        biased away from 0.
+    interval:
+        Of the difference: repeated confidence interval (Jennison and Turnbull 1989). All pairs at all looks
+        together are covered with probability about 1 - alpha, whatever made the study stop.
+    within_margin:
+        Whether the difference is significantly smaller than the margin, either way.
+    margin:
+        As in the plan.
+    """
+
+    first: str
+    second: str
+    decided: Decided | None = None
+    n_runs: int = 0
+    p: tuple[float, ...] = ()
+    levels: tuple[float, ...] = ()
+    difference: float = math.nan
+    interval: tuple[float, float] = (-1.0, math.inf)
+    within_margin: bool = False
+    margin: float = 0.10
+
+    @property
+    def verdict(self) -> str:
+        """The decision in words; `open` while there is none."""
+        under = f"{100 * self.margin:g} percent"
+        match self.decided:
+            case None:
+                return "open"
+            case Decided.FIRST | Decided.SECOND:
+                name = self.first if self.decided is Decided.FIRST else self.second
+                return f"{name} needs fewer" + (f", by under {under}" if self.within_margin else "")
+            case Decided.TRADE_OFF:
+                return "trade-off"
+            case Decided.EQUAL:
+                return f"equal within {under}"
+            case Decided.NOT_TOLD_APART:
+                largest = max(abs(end) for end in self.interval)
+                bound = f": no difference above {100 * largest:.0f} percent" if math.isfinite(largest) else ""
+                return f"not told apart by {self.n_runs} seeds{bound}"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """All pairs of a plan after the looks for which there are runs.
+
+    Attributes
+    ----------
+    plan:
+        The plan.
+    pairs:
+        The planned pairs, in order.
+    wanted:
+        For each entry with an open pair: the runs that the next look needs. Empty when all is decided.
+    """
+
+    plan: DecisionPlan
+    pairs: tuple[PairDecision, ...]
+    wanted: Mapping[str, int]
+
+    @property
+    def finished(self) -> bool:
+        """Whether every pair is closed."""
+        return not self.wanted
+
+
+def decide(plan: DecisionPlan, runs: Mapping[str, LearningCurves], grid: Grid) -> Decision:
+    """Return what a plan decides from the runs so far.
+
+    Parameters
+    ----------
+    plan:
+        The plan.
+    runs:
+        For each entry of the plan its runs so far, in the order of their seeds; entries without any may be
+        absent. A look takes place once every entry with an open pair has the runs for it. Runs beyond a look
+        count for later ones only; runs that come after all pairs of an entry are closed are not looked at.
+    grid:
+        Its E thresholds count; its deltas do not.
+
+    Raises
+    ------
+    OptionError
+        If a name is not in the plan, or entries end at different horizons.
+    """
+    for name in runs:
+        if name not in plan.entries:
+            raise OptionError(f"'{name}' is not one of the plan's entries {list(plan.entries)}")
+    ends = {name: entry.horizon for name, entry in runs.items()}
+    if len(set(ends.values())) > 1:
+        raise OptionError(f"the entries end at different horizons: {ends}; cut them to one")
+    times = {name: times_below(each.values, grid, each.steps_per_epoch) for name, each in runs.items()}
+    return decide_times(plan, times)
+
+
+def decide_times(plan: DecisionPlan, times: Mapping[str, IntArray]) -> Decision:
+    """Return what a plan decides from times below threshold, (N, E) for each entry: see `decide`."""
+    pairs = [PairDecision(first, second, margin=plan.margin) for first, second in plan.family]
+    for look, n_runs in enumerate(plan.looks):
+        wanted = wanted_at(pairs, n_runs)
+        if any(name not in times or len(times[name]) < n_runs for name in wanted):
+            return Decision(plan, tuple(pairs), wanted)
+        [pairs] = next_look(plan, look, [pairs], [times])
+    return Decision(plan, tuple(pairs), {})
+
+
+def wanted_at(pairs: Sequence[PairDecision], n_runs: int) -> dict[str, int]:
+    """Return `n_runs` for each entry with an open pair."""
+    return {name: n_runs for pair in pairs if pair.decided is None for name in (pair.first, pair.second)}
+
+
+def next_look(
+    plan: DecisionPlan,
+    look: int,
+    studies: Sequence[Sequence[PairDecision]],
+    times: Sequence[Mapping[str, IntArray]],
+) -> list[list[PairDecision]]:
+    """Return the pairs of several studies of one plan after look 0, 1, ...; closed ones stay as they are.
+
+    Parameters
+    ----------
+    plan, look:
+        The plan, and which of its looks.
+    studies:
+        For each study the planned pairs as the look before left them.
+    times:
+        For each study the times of its entries, (N, E) with N at least the look's runs.
+    """
+    n_runs = plan.looks[look]
+    todo = [
+        (study, index)
+        for study, pairs in enumerate(studies)
+        for index, pair in enumerate(pairs)
+        if pair.decided is None
+    ]
+    if not todo:
+        return [list(pairs) for pairs in studies]
+    data = []
+    for study, index in todo:
+        pair = studies[study][index]
+        data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
+    test = MaxT(data, plan.blocks[: look + 1], plan.seed)
+    test.extend(min(relabelings_for(plan.level(look, len(plan.family))), MOST_RELABELINGS))
+    p, p_each = test.p, test.p_each
+    result = [list(pairs) for pairs in studies]
+    rows: dict[int, dict[int, int]] = {}  # of each study: the row of the test for each open pair
+    for row, (study, index) in enumerate(todo):
+        result[study][index] = _looked(plan, look, studies[study][index], data[row], float(p[row]))
+        rows.setdefault(study, {})[index] = row
+    for study, of_study in rows.items():
+        _reject(plan, look, result[study], of_study, test.t, p_each)
+        _close(plan, look, result[study])
+    return result
+
+
+def _looked(
+    plan: DecisionPlan, look: int, pair: PairDecision, data: tuple[IntArray, IntArray], p: float
+) -> PairDecision:
+    """Return a pair with its p, difference, interval and test of equality at a look."""
+    ratios, errors, freedoms = log_ratios(data)
+    ratio, error, freedom = float(ratios[1, 0]), float(errors[1, 0]), float(freedoms[1, 0])
+    interval = (-1.0, math.inf)
+    within = False
+    if math.isfinite(ratio):
+        reach = error * float(student_quantile(1 - plan.level(look, len(plan.family)) / 2, freedom))
+        interval = (math.expm1(ratio - reach), math.expm1(ratio + reach))
+        level = plan.equal_level(look)
+        if level is not None:
+            reach = error * float(student_quantile(1 - level, freedom))
+            within = abs(ratio) + reach < math.log1p(plan.margin)
+    return replace(
+        pair,
+        n_runs=plan.looks[look],
+        p=(*pair.p, p),
+        difference=math.expm1(ratio),
+        interval=interval,
+        within_margin=within,
+    )
+
+
+def _reject(
+    plan: DecisionPlan,
+    look: int,
+    pairs: list[PairDecision],
+    rows: Mapping[int, int],
+    t: FloatArray,
+    p_each: FloatArray,
+) -> None:
+    """Group-sequential Holm: decide open pairs at the level for those that are left, until none follows."""
+    differ = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
+    strictest = plan.level(look, len(pairs))
+    while True:
+        undecided = sum(pair.decided not in differ for pair in pairs)
+        level = plan.level(look, max(1, undecided))
+        rejected = [index for index in rows if pairs[index].decided is None and pairs[index].p[-1] <= level]
+        if not rejected:
+            break
+        for index in rejected:
+            row = rows[index]
+            signs = np.where(p_each[row] <= strictest, np.sign(t[row]), 0).astype(np.int64)
+            sign = direction(t[row], signs)
+            decided = {1: Decided.FIRST, -1: Decided.SECOND, 0: Decided.TRADE_OFF}[sign]
+            pairs[index] = replace(pairs[index], decided=decided)
+    for index in rows:
+        pairs[index] = replace(pairs[index], levels=(*pairs[index].levels, level))
+
+
+def _close(plan: DecisionPlan, look: int, pairs: list[PairDecision]) -> None:
+    """Close open pairs that are equal, and at the last look all."""
+    for index, pair in enumerate(pairs):
+        if pair.decided is None and pair.within_margin:
+            pairs[index] = replace(pair, decided=Decided.EQUAL)
+        elif pair.decided is None and look == len(plan.looks) - 1:
+            pairs[index] = replace(pair, decided=Decided.NOT_TOLD_APART)
