@@ -19,13 +19,17 @@ from qrlsuite.statistics.bootstrap import (
     bootstrap_interval_at,
 )
 from qrlsuite.statistics.calibration import (
+    DecisionRates,
     Rates,
     SmoothedRuns,
+    TimesRates,
     board_false_winners,
+    decision_rates,
     false_winners,
     power,
     slower,
     split_halves,
+    times_rates,
 )
 from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
@@ -67,6 +71,7 @@ __all__ = [
     "Decided",
     "Decision",
     "DecisionPlan",
+    "DecisionRates",
     "DifferenceRule",
     "Direction",
     "Evidence",
@@ -86,6 +91,7 @@ __all__ = [
     "SmoothedRuns",
     "Spending",
     "TimesBoard",
+    "TimesRates",
     "TimesRule",
     "Verdict",
     "at_cap",
@@ -97,6 +103,7 @@ __all__ = [
     "common_horizon",
     "compare",
     "decide",
+    "decision_rates",
     "false_winners",
     "holm",
     "mean_time",
@@ -113,6 +120,7 @@ __all__ = [
     "split_halves",
     "times_below",
     "times_board",
+    "times_rates",
     "unsettled",
     "unsettled_at",
 ]

@@ -5,7 +5,8 @@ A significance rule's promise is only worth what a simulation of it shows. Two w
 - `split_halves`: cut one entry's runs at random into two halves and compare them. Real curves, but only at
   N/2 runs, and the splits of one entry share its runs: quote the spread over entries, never over splits.
 - `false_winners` and `board_false_winners`: draw independent runs from a smoothed model of an entry's curves
-  (`SmoothedRuns`), at any numbers of runs. `power` draws from two models.
+  (`SmoothedRuns`), at any numbers of runs. `power` draws from two models. `times_rates` does both for rule
+  `times`, many pairs at a time, and `decision_rates` plays whole decision plans.
 
 Rates are reported per cell, per grid (any cell of a pair; and: a pair with an overall winner) and per board
 (any pair among M entries).
@@ -23,6 +24,8 @@ from qrlsuite.statistics.board import outperformance
 from qrlsuite.statistics.compare import Outcome, overall
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
+from qrlsuite.statistics.permutation import MaxT, relabelings_for
+from qrlsuite.statistics.sequential import Decided, DecisionPlan, begin, next_look
 from qrlsuite.statistics.significance import (
     Evidence,
     IntervalRule,
@@ -30,6 +33,9 @@ from qrlsuite.statistics.significance import (
     SignificanceRule,
     check_signs,
 )
+from qrlsuite.statistics.times import times_below
+
+_DRAWN = 5_000  # runs that are drawn at a time
 
 
 class SmoothedRuns:
@@ -286,6 +292,150 @@ def slower(entry: LearningCurves, factor: float) -> LearningCurves:
     epochs = np.arange(1, entry.values.shape[1] + 1)
     values = np.array([np.interp(epochs / factor, epochs, run) for run in entry.values])
     return LearningCurves(values, entry.steps_per_epoch, f"{entry.name}, {factor:g} times slower")
+
+
+def draw_times(
+    model: SmoothedRuns, n_runs: int, n_entries: int, grid: Grid, generator: np.random.Generator
+) -> IntArray:
+    """Return the times below threshold in steps of independent entries, shape (n_entries, n_runs, E)."""
+    entries, runs = whole(n_entries, "n_entries", at_least=1), whole(n_runs, "n_runs", at_least=1)
+    drawn = []
+    for done in range(0, entries * runs, _DRAWN):
+        part = model.draw(min(_DRAWN, entries * runs - done), generator)
+        drawn.append(times_below(part.values, grid, part.steps_per_epoch))
+    return np.concatenate(drawn).reshape(entries, runs, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class TimesRates:
+    """How often rule `times` found what, over many simulated pairs.
+
+    Attributes
+    ----------
+    n_runs:
+        Runs of the first and the second entry.
+    n_pairs:
+        Simulated pairs.
+    first, second, trade_off:
+        Fraction of pairs in which the first, the second needs fewer, and with thresholds of both signs.
+    """
+
+    n_runs: tuple[int, int]
+    n_pairs: int
+    first: float
+    second: float
+    trade_off: float
+
+    @property
+    def found(self) -> float:
+        """Fraction of pairs with a difference at any threshold: the error between equals."""
+        return self.first + self.second + self.trade_off
+
+
+def times_rates(
+    first: SmoothedRuns,
+    second: SmoothedRuns,
+    n_first: int,
+    n_second: int,
+    grid: Grid,
+    alpha: float = 0.05,
+    n_pairs: int = 200,
+    seed: int = 0,
+) -> TimesRates:
+    """Judge simulated pairs by rule `times`, from one model (error) or two (power).
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range.
+    """
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    count = whole(n_pairs, "n_pairs", at_least=1)
+    ours = draw_times(first, n_first, count, grid, generator)
+    theirs = draw_times(second, n_second, count, grid, generator)
+    return judge_times(ours, theirs, alpha)
+
+
+def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesRates:
+    """Return what rule `times` finds in P pairs of times, (P, N_A, E) and (P, N_B, E)."""
+    test = MaxT(list(zip(ours, theirs)))
+    test.extend(relabelings_for(alpha))
+    signs = np.where(test.p_each <= alpha, np.sign(test.t), 0)
+    fewer, more = (signs > 0).any(axis=1), (signs < 0).any(axis=1)
+    return TimesRates(
+        n_runs=(ours.shape[1], theirs.shape[1]),
+        n_pairs=len(ours),
+        first=float((fewer & ~more).mean()),
+        second=float((more & ~fewer).mean()),
+        trade_off=float((fewer & more).mean()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionRates:
+    """What a decision plan comes to, over many simulated studies.
+
+    Attributes
+    ----------
+    n_studies:
+        Simulated studies.
+    verdicts:
+        For each pair of the plan: fraction of studies with each verdict.
+    within_margin:
+        For each pair: fraction of studies that found the difference within the margin, of either verdict.
+    mean_runs:
+        For each pair: mean number of runs of each of its entries when it was closed.
+    any_difference:
+        Fraction of studies in which any pair was found to differ: the error between equals.
+    """
+
+    n_studies: int
+    verdicts: tuple[dict[Decided, float], ...]
+    within_margin: tuple[float, ...]
+    mean_runs: tuple[float, ...]
+    any_difference: float
+
+
+def decision_rates(
+    models: Sequence[SmoothedRuns],
+    plan: DecisionPlan,
+    grid: Grid,
+    n_studies: int = 200,
+    seed: int = 0,
+) -> DecisionRates:
+    """Play a decision plan many times, its entries drawn from as many models, in the plan's order.
+
+    Raises
+    ------
+    OptionError
+        If there are not as many models as entries, or an argument is out of its range.
+    """
+    if len(models) != len(plan.entries):
+        raise OptionError(f"{len(models)} models for the {len(plan.entries)} entries of the plan")
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    count = whole(n_studies, "n_studies", at_least=1)
+    drawn = [draw_times(model, plan.looks[-1], count, grid, generator) for model in models]
+    return play(plan, drawn)
+
+
+def play(plan: DecisionPlan, drawn: Sequence[IntArray]) -> DecisionRates:
+    """Return what a plan comes to on times of each entry, (studies, N, E) with N the runs of the last look."""
+    count = len(drawn[0])
+    times = [{name: each[k] for name, each in zip(plan.entries, drawn)} for k in range(count)]
+    studies = [list(begin(plan)) for _ in range(count)]
+    for look in range(len(plan.looks)):
+        studies = next_look(plan, look, studies, times)
+    by_pair = list(zip(*studies))
+    return DecisionRates(
+        n_studies=count,
+        verdicts=tuple(
+            {kind: sum(pair.decided is kind for pair in pairs) / count for kind in Decided}
+            for pairs in by_pair
+        ),
+        within_margin=tuple(sum(pair.within_margin for pair in pairs) / count for pairs in by_pair),
+        mean_runs=tuple(sum(pair.n_runs for pair in pairs) / count for pairs in by_pair),
+        any_difference=sum(any(pair.differs for pair in study) for study in studies) / count,
+    )
 
 
 def _rates(

@@ -277,6 +277,11 @@ class PairDecision:
     margin: float = 0.10
 
     @property
+    def differs(self) -> bool:
+        """Whether the pair was found to differ."""
+        return self.decided in (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
+
+    @property
     def verdict(self) -> str:
         """The decision in words; `open` while there is none."""
         under = f"{100 * self.margin:g} percent"
@@ -351,13 +356,18 @@ def decide(plan: DecisionPlan, runs: Mapping[str, LearningCurves], grid: Grid) -
 
 def decide_times(plan: DecisionPlan, times: Mapping[str, IntArray]) -> Decision:
     """Return what a plan decides from times below threshold, (N, E) for each entry: see `decide`."""
-    pairs = [PairDecision(first, second, margin=plan.margin) for first, second in plan.family]
+    pairs = begin(plan)
     for look, n_runs in enumerate(plan.looks):
         wanted = wanted_at(pairs, n_runs)
         if any(name not in times or len(times[name]) < n_runs for name in wanted):
             return Decision(plan, tuple(pairs), wanted)
         [pairs] = next_look(plan, look, [pairs], [times])
     return Decision(plan, tuple(pairs), {})
+
+
+def begin(plan: DecisionPlan) -> list[PairDecision]:
+    """Return a plan's pairs before the first look: all open."""
+    return [PairDecision(first, second, margin=plan.margin) for first, second in plan.family]
 
 
 def wanted_at(pairs: Sequence[PairDecision], n_runs: int) -> dict[str, int]:
@@ -443,10 +453,9 @@ def _reject(
     p_each: FloatArray,
 ) -> None:
     """Group-sequential Holm: decide open pairs at the level for those that are left, until none follows."""
-    differ = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
     strictest = plan.level(look, len(pairs))
     while True:
-        undecided = sum(pair.decided not in differ for pair in pairs)
+        undecided = sum(not pair.differs for pair in pairs)
         level = plan.level(look, max(1, undecided))
         rejected = [index for index in rows if pairs[index].decided is None and pairs[index].p[-1] <= level]
         if not rejected:

@@ -1,0 +1,282 @@
+"""How often permutation tests, boards by mean times and decision plans err, and how much they find.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/verdicts_calibration.py [--pairs 10000] [PART ...]
+
+Fresh runs are drawn from smoothed models (`SmoothedRuns`) of the published entries of task beam6g, on the 49 cells of
+its surface grid. `--pairs` is the number of simulated pairs per line where pairs are judged many at a time (times,
+unequal, decisions, equality); a fifth of it for power, a tenth for five entries, a fiftieth for rules that judge cells
+pair by pair, a hundredth for boards and coverage. The tables of docs/statistics.md are its output.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from qrlsuite.leaderboard.published import SHIPPED, read
+from qrlsuite.statistics import (
+    Decided,
+    DecisionPlan,
+    DifferenceRule,
+    Direction,
+    Grid,
+    IntervalRule,
+    LearningCurves,
+    PermutationRule,
+    SmoothedRuns,
+    bootstrap_interval,
+    false_winners,
+    mean_time,
+    outperformance,
+    power,
+    sample_complexity,
+    slower,
+    times_board,
+    times_rates,
+)
+from qrlsuite.statistics.calibration import draw_times, judge_times, play
+
+EPSILONS, DELTAS = [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+GRID = Grid.relative(EPSILONS, DELTAS)
+W16, W32, W64, W128 = (f"ddqn mlp width={width}" for width in (16, 32, 64, 128))
+Q6, Q8, Q10 = (f"ddqn vqc-native qubits={qubits}" for qubits in (6, 8, 10))
+POPULATIONS = (W64, W16, Q10)
+SIZES = (20, 50, 100)
+HORIZON = 200_000
+
+
+def published() -> dict[str, LearningCurves]:
+    """Return the published entries of beam6g by name."""
+    entries = [read(folder).entry_curves() for folder in sorted((SHIPPED / "beam6g").iterdir())]
+    return {each.label: LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries}
+
+
+ENTRIES = published()
+MODELS = {name: SmoothedRuns(entry) for name, entry in ENTRIES.items()}
+
+
+def line(*cells: object) -> None:
+    """Print a row of a table; fractions as percentages."""
+    shown = [f"{100 * cell:.2f}%" if isinstance(cell, float) else str(cell) for cell in cells]
+    print(f"| {' | '.join(shown)} |", flush=True)
+
+
+def head(title: str, *columns: str) -> None:
+    print(f"\n{title}\n")
+    line(*columns)
+    print("|" + "---|" * len(columns), flush=True)
+
+
+def print_times(pairs: int) -> None:
+    head(f"Rule times, equals, {pairs} pairs", "entry", "runs", "any difference")
+    for name in POPULATIONS:
+        generator = np.random.default_rng(0)
+        for n_runs in SIZES:
+            ours, theirs = (draw_times(MODELS[name], n_runs, pairs, GRID, generator) for _ in range(2))
+            line(name, n_runs, judge_times(ours, theirs).found)
+
+
+def print_unequal(pairs: int) -> None:
+    """One population in which 15 percent fail, one without, of the same mean at every tolerance."""
+    head(
+        f"Rule times, equal means, unequal laws, {pairs} pairs",
+        "runs that fail",
+        "other runs",
+        "any difference",
+    )
+    generator = np.random.default_rng(0)
+    large = draw_times(MODELS[W64], 1000, 100, GRID, generator).reshape(-1, len(EPSILONS))
+    factor = 0.85 + 0.15 * HORIZON / large.mean(axis=0)
+    for n_fail, n_other in ((20, 100), (100, 20), (50, 100), (100, 50), (20, 20), (50, 50), (100, 100)):
+        ours = draw_times(MODELS[W64], n_fail, pairs, GRID, generator)
+        ours[generator.random(ours.shape[:2]) < 0.15] = HORIZON
+        theirs = np.rint(draw_times(MODELS[W64], n_other, pairs, GRID, generator) * factor).astype(np.int64)
+        line(n_fail, n_other, judge_times(ours, theirs).found)
+
+
+def print_decisions(pairs: int) -> None:
+    plan = DecisionPlan(("a", "b"))
+    head(f"Decision plan, two equals, {pairs} studies", "entry", "differ", "equal within 10%", "mean runs")
+    for name in (*POPULATIONS, W128, Q8):
+        generator = np.random.default_rng(1)
+        count = pairs if name in POPULATIONS else pairs // 10
+        rates = play(plan, [draw_times(MODELS[name], 100, count, GRID, generator) for _ in range(2)])
+        line(name, rates.any_difference, rates.verdicts[0][Decided.EQUAL], f"{rates.mean_runs[0]:.0f}")
+
+
+def print_five(pairs: int) -> None:
+    plan = DecisionPlan(tuple("abcde"))
+    head(f"Decision plan, five equals, {pairs // 10} studies", "entry", "any pair differs", "mean runs")
+    for name in POPULATIONS:
+        generator = np.random.default_rng(2)
+        drawn = [draw_times(MODELS[name], 100, pairs // 10, GRID, generator) for _ in range(5)]
+        rates = play(plan, drawn)
+        line(name, rates.any_difference, f"{np.mean(rates.mean_runs):.0f}")
+
+
+def print_equality(pairs: int) -> None:
+    """The second's times are the first's law times 1.1: differences are not looked for (alpha is next to nothing)."""
+    plan = DecisionPlan(("a", "b"))
+    head(f"Equality at a true ratio of 1.1, {pairs} studies", "entry", "wrongly within 10%")
+    for name in POPULATIONS:
+        generator = np.random.default_rng(3)
+        first, second = (draw_times(MODELS[name], 100, pairs, GRID, generator) for _ in range(2))
+        rates = play(plan, [first, second * 11 // 10])
+        line(name, rates.within_margin[0])
+
+
+def rivals(entries: dict[str, LearningCurves]) -> list[tuple[str, SmoothedRuns, SmoothedRuns]]:
+    """Return pairs of known direction: the first needs fewer."""
+    late = {factor: SmoothedRuns(slower(entries[W64], factor)) for factor in (1.1, 1.25, 1.5)}
+    return [
+        *((f"{W64}, {100 * (f - 1):.0f}% slower", MODELS[W64], late[f]) for f in late),
+        ("10 against 8 qubits", MODELS[Q10], MODELS[Q8]),
+        ("width 32 against 10 qubits", MODELS[W32], MODELS[Q10]),
+        ("width 64 against 32", MODELS[W64], MODELS[W32]),
+        ("10 qubits against width 16", MODELS[Q10], MODELS[W16]),
+    ]
+
+
+def print_power(pairs: int) -> None:
+    count = pairs // 5
+    head(f"Rule times, {count} pairs", "pair", "runs", "first needs fewer", "trade-off", "wrong direction")
+    for name, first, second in rivals(ENTRIES)[:5]:
+        for n_runs in SIZES:
+            found = times_rates(first, second, n_runs, n_runs, GRID, n_pairs=count, seed=4)
+            line(name, n_runs, found.first, found.trade_off, found.second)
+
+
+def print_seeds(pairs: int) -> None:
+    count = pairs // 10
+    plan = DecisionPlan(("a", "b"))
+    head(f"Decision plan, {count} studies", "pair", "first", "second", "trade-off", "equal", "mean runs")
+    for name, first, second in rivals(ENTRIES):
+        generator = np.random.default_rng(5)
+        rates = play(plan, [draw_times(model, 100, count, GRID, generator) for model in (first, second)])
+        found = rates.verdicts[0]
+        kinds = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF, Decided.EQUAL)
+        line(name, *(found[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")
+
+
+def print_rules(pairs: int) -> None:
+    count = max(10, pairs // 50)
+    head(f"Rules by cells, equals, {count} pairs", "entry", "runs", "rule", "any cell", "a winner")
+    for name in POPULATIONS:
+        for n_runs in SIZES:
+            for rule in (IntervalRule(), DifferenceRule(), PermutationRule()):
+                rates = false_winners(MODELS[name], n_runs, n_runs, GRID, rule, count, seed=6)
+                line(name, n_runs, rule.name, rates.any_cell, rates.winner)
+    head(f"Rules by cells, {count} pairs", "pair", "runs", "rule", "first wins", "second wins")
+    for pair, first, second in [rivals(ENTRIES)[0], *rivals(ENTRIES)[3:5]]:
+        for n_runs in SIZES:
+            for rule in (IntervalRule(), PermutationRule()):
+                rates = power(first, second, n_runs, n_runs, GRID, rule, count, seed=7)
+                line(pair, n_runs, rule.name, rates.first_wins, rates.second_wins)
+
+
+def print_boards(pairs: int) -> None:
+    count, generator = max(10, pairs // 100), np.random.default_rng(8)
+    equals = sum(
+        (board.adjusted <= 0.05).any()
+        for board in (
+            times_board([_named(MODELS[W64].draw(100, generator), k) for k in range(8)], GRID)
+            for _ in range(count)
+        )
+    )
+    print(f"\nBoards of eight equals with any decided pair, of {count}: {equals}", flush=True)
+    entries = list(ENTRIES.values())
+    now, tiers = times_board(entries, GRID), _tiers(entries)
+    same, again, total, tiering = 0, 0, 0, 0
+    size = range(len(entries))
+    decided = [(i, j) for i in size for j in size if i < j and now.adjusted[i, j] <= 0.05]
+    for _ in range(count):
+        fresh = [model.draw(100, generator) for model in MODELS.values()]
+        board = times_board(fresh, GRID)
+        same += all(board.directions[i][j] is now.directions[i][j] for i, j in decided)
+        again += sum(board.directions[i][j] is now.directions[i][j] for i, j in decided)
+        total += len(decided)
+        tiering += _tiers(fresh) == tiers
+    print(
+        f"Published board: {len(decided)} of 28 pairs decided by times; of {count} replications with 100 fresh"
+    )
+    print(
+        f"runs each, {again / total:.1%} of these decisions came out again, all of them in {same / count:.1%};"
+    )
+    print(f"the tiers of the paper's rule in {tiering / count:.1%}", flush=True)
+    for i in now.order:
+        mean = now.means[i]
+        low, high = (f"{end:.0f}" for end in mean.interval)
+        places = f"{now.ranks[i, 0]} to {now.ranks[i, 1]}"
+        tier = next(k for k, names in enumerate(tiers, 1) if now.names[i] in names)
+        line(now.names[i], tier, f"{mean.mean:.0f}", f"{low} to {high}", float(mean.at_cap.mean()), places)
+    kinds = [now.directions[i][j] for i in size for j in size if i < j]
+    print(f"trade-offs: {kinds.count(Direction.TRADE_OFF)}; order at half the horizon: "
+          f"{[now.names[i] for i in now.order_at_half]}")  # fmt: skip
+
+
+def _named(entry: LearningCurves, index: int) -> LearningCurves:
+    return LearningCurves(entry.values, entry.steps_per_epoch, str(index))
+
+
+def _tiers(entries: list[LearningCurves]) -> list[set[str]]:
+    ranking = outperformance(entries, GRID).ranking
+    return [{each.name for each in tier} for tier in ranking.tiers]
+
+
+def print_coverage(pairs: int) -> None:
+    """Of the S and M that 20,000 runs of the model have."""
+    count = max(10, pairs // 25)
+    columns = ("entry", "runs", "S, mean over cells", "S, worst cell", "M (95%)")
+    head(
+        f"Coverage of the 5 to 95 percentile interval of S_hat and of the interval of M, {count} entries",
+        *columns,
+    )
+    for name in POPULATIONS:
+        generator = np.random.default_rng(9)
+        many = MODELS[name].draw(20_000, generator)
+        true = sample_complexity(many.values, EPSILONS, DELTAS, many.steps_per_epoch)
+        true_mean = mean_time(many, GRID).mean
+        for n_runs in SIZES:
+            inside, means = np.zeros(GRID.shape), 0
+            for _ in range(count):
+                entry = MODELS[name].draw(n_runs, generator)
+                interval = bootstrap_interval(entry.values, EPSILONS, DELTAS, entry.steps_per_epoch)
+                inside += (interval[..., 0] <= true) & (true <= interval[..., 1])
+                low, high = mean_time(entry, GRID).interval
+                means += low <= true_mean <= high
+            line(name, n_runs, float(inside.mean() / count), float(inside.min() / count), means / count)
+
+
+PARTS: dict[str, Callable[[int], None]] = {
+    "times": print_times,
+    "unequal": print_unequal,
+    "equality": print_equality,
+    "power": print_power,
+    "decisions": print_decisions,
+    "seeds": print_seeds,
+    "boards": print_boards,
+    "coverage": print_coverage,
+    "five": print_five,
+    "rules": print_rules,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all by default")
+    parser.add_argument("--pairs", type=int, default=10_000)
+    arguments = parser.parse_args()
+    for part in arguments.parts or PARTS:
+        if part not in PARTS:
+            parser.error(f"part '{part}': expected one of {', '.join(PARTS)}")
+    for part in arguments.parts or PARTS:
+        begun = time.process_time()
+        PARTS[part](arguments.pairs)
+        print(f"\n({part}: {time.process_time() - begun:.0f} seconds of one core)", flush=True)
+
+
+if __name__ == "__main__":
+    main()
