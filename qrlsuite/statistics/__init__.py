@@ -8,9 +8,18 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
 - `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times.
 - `sequential`: as many runs as it takes to decide, at one error for all looks.
-- `calibration`: how often all this errs.
+- `calibration`: how often all this errs. `planning`: how many runs it takes.
+- `across`: several tasks at once.
 """
 
+from qrlsuite.statistics.across import (
+    AcrossTasks,
+    across_tasks,
+    horizon_shares,
+    interquartile_mean,
+    probability_of_improvement,
+    rliable_arrays,
+)
 from qrlsuite.statistics.board import Board, outperformance
 from qrlsuite.statistics.bootstrap import (
     bootstrap_draws,
@@ -43,6 +52,7 @@ from qrlsuite.statistics.estimator import (
 )
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
+from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.sequential import (
     Decided,
@@ -66,6 +76,7 @@ from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ra
 
 __all__ = [
     "MIN_RUNS",
+    "AcrossTasks",
     "Board",
     "Comparison",
     "Decided",
@@ -80,6 +91,7 @@ __all__ = [
     "LearningCurves",
     "MaxT",
     "MeanTime",
+    "Need",
     "Outcome",
     "PairDecision",
     "PermutationRule",
@@ -94,6 +106,7 @@ __all__ = [
     "TimesRates",
     "TimesRule",
     "Verdict",
+    "across_tasks",
     "at_cap",
     "board_false_winners",
     "bootstrap_draws",
@@ -106,14 +119,20 @@ __all__ = [
     "decision_rates",
     "false_winners",
     "holm",
+    "horizon_shares",
+    "interquartile_mean",
     "mean_time",
     "nominal_levels",
     "outperformance",
     "paired_difference_rule",
     "power",
     "printed",
+    "probability_of_improvement",
     "rank",
     "rank_ranges",
+    "rliable_arrays",
+    "runs_needed",
+    "runs_to_detect",
     "sample_complexity",
     "sample_complexity_at",
     "slower",

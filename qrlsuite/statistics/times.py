@@ -105,7 +105,9 @@ def mean_time(entry: LearningCurves, grid: Grid, level: float = 0.95) -> MeanTim
     horizon, n_runs = entry.horizon, entry.n_runs
     interval = (0.0, float(horizon))
     if n_runs > 1:
-        reach = float(student_quantile((1 + level) / 2, n_runs - 1)) * float(of_runs.std(ddof=1)) / n_runs**0.5
+        reach = (
+            float(student_quantile((1 + level) / 2, n_runs - 1)) * float(of_runs.std(ddof=1)) / n_runs**0.5
+        )
         interval = (max(0.0, mean - reach), min(float(horizon), mean + reach))
     epochs = entry.values.shape[1] // 2
     half = 0.0

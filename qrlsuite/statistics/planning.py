@@ -1,0 +1,155 @@
+"""How many runs it takes to tell two entries apart: by rule `times`, all at once or as a decision plan.
+
+Entries are drawn from smoothed models of pilot runs, or of a published entry that is alike (`SmoothedRuns`), and
+judged as they would be. What comes out holds for entries like the pilot, within the simulation's error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics.calibration import SmoothedRuns, draw_times, judge_times, play, slower
+from qrlsuite.statistics.compare import MIN_RUNS
+from qrlsuite.statistics.grid import Grid, IntArray, whole
+from qrlsuite.statistics.sequential import Decided, DecisionPlan, Spending
+from qrlsuite.statistics.times import check_probability
+
+LADDER = (20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400)
+"""Numbers of runs that are tried, up to the most allowed."""
+_INFLATION = (1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0)  # of runs that looks cost, at most, beyond all at once
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Runs that find a difference with a power.
+
+    Attributes
+    ----------
+    power:
+        The power asked for.
+    fixed:
+        Runs of each entry if all are made before they are compared; None if more than allowed.
+    looks:
+        Numbers of runs at which a decision plan of the same power looks; empty if more than allowed.
+    mean_runs:
+        Runs of each entry that the plan needs on average; NaN without a plan.
+    """
+
+    power: float
+    fixed: int | None
+    looks: tuple[int, ...]
+    mean_runs: float
+
+
+def runs_needed(
+    first: SmoothedRuns,
+    second: SmoothedRuns,
+    grid: Grid,
+    powers: Sequence[float] = (0.8, 0.9),
+    alpha: float = 0.05,
+    most: int = LADDER[-1],
+    spending: Spending = Spending.POCOCK,
+    n_pairs: int = 400,
+    seed: int = 0,
+) -> tuple[Need, ...]:
+    """Return, for each power, how many runs it takes to find that the first needs fewer steps than the second.
+
+    Parameters
+    ----------
+    first, second:
+        What the entries are drawn from; the first should be the better one.
+    grid:
+        Its E thresholds count; its deltas do not.
+    powers:
+        In (0, 1).
+    alpha:
+        Of the test and of the plan.
+    most:
+        Runs of an entry that are allowed at most, 20 or more.
+    spending:
+        Of the plan.
+    n_pairs:
+        Simulated pairs: the power at each number of runs has a standard error of sqrt(power (1 - power) / n_pairs).
+    seed:
+        Of the simulation.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range or the models end at different horizons.
+    """
+    if first.entry.horizon != second.entry.horizon:
+        raise OptionError(
+            f"'{first.entry.name}' ends at {first.entry.horizon} steps, '{second.entry.name}' at "
+            f"{second.entry.horizon}: cut them to one horizon"
+        )
+    for power in powers:
+        check_probability(power, "power")
+    largest, count = whole(most, "most", at_least=MIN_RUNS), whole(n_pairs, "n_pairs", at_least=1)
+    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
+    drawn = [draw_times(model, largest, count, grid, generator) for model in (first, second)]
+    fixed = _fixed(drawn, powers, alpha, largest)
+    return tuple(_with_plan(drawn, power, runs, alpha, spending) for power, runs in zip(powers, fixed))
+
+
+def runs_to_detect(pilot: SmoothedRuns, grid: Grid, slower_by: float, **options: object) -> tuple[Need, ...]:
+    """Return how many runs it takes to detect that an entry like the pilot is slower by a fraction (.1: 10 percent).
+
+    Options and errors as of `runs_needed`.
+    """
+    other = SmoothedRuns(slower(pilot.entry, 1 + slower_by), pilot.jitter, pilot.bounds)
+    return runs_needed(pilot, other, grid, **options)  # type: ignore[arg-type]  # checked there
+
+
+def _fixed(drawn: Sequence[IntArray], powers: Sequence[float], alpha: float, most: int) -> list[int | None]:
+    """Return, for each power, the runs that reach it, interpolated between two rungs of the ladder."""
+    tried, found = [0], [0.0]
+    for n_runs in sorted({*(rung for rung in LADDER if rung < most), most}):
+        rates = judge_times(drawn[0][:, :n_runs], drawn[1][:, :n_runs], alpha)
+        tried.append(n_runs)
+        found.append(max(rates.first, found[-1]))
+        if found[-1] >= max(powers):
+            break
+    needed: list[int | None] = []
+    for power in powers:
+        if found[-1] < power:
+            needed.append(None)
+            continue
+        rung = int(np.argmax(np.array(found) >= power))
+        low, high = found[rung - 1], found[rung]
+        between = tried[rung - 1] + (tried[rung] - tried[rung - 1]) * (power - low) / (high - low)
+        needed.append(max(MIN_RUNS, math.ceil(between)))
+    return needed
+
+
+def even_looks(most: int, count: int = 5) -> tuple[int, ...]:
+    """Return up to `count` looks in equal steps to `most` runs, the first at 20 or more.
+
+    >>> even_looks(100)
+    (20, 40, 60, 80, 100)
+    >>> even_looks(30)
+    (20, 30)
+    """
+    even = {math.ceil(most * (index + 1) / count) for index in range(count)}
+    return tuple(sorted({max(MIN_RUNS, look) for look in even if look > MIN_RUNS} | {MIN_RUNS, most}))
+
+
+def _with_plan(
+    drawn: Sequence[IntArray], power: float, fixed: int | None, alpha: float, spending: Spending
+) -> Need:
+    """Return a need with the smallest plan of its power, at most twice as long as all at once."""
+    for factor in _INFLATION if fixed is not None else ():
+        assert fixed is not None
+        most = math.ceil(factor * fixed)
+        if most > drawn[0].shape[1]:
+            break
+        plan = DecisionPlan(("first", "second"), even_looks(most), alpha, spending)
+        rates = play(plan, [each[:, :most] for each in drawn])
+        if rates.verdicts[0][Decided.FIRST] >= power:
+            return Need(power, fixed, plan.looks, rates.mean_runs[0])
+    return Need(power, fixed, (), math.nan)

@@ -1,0 +1,89 @@
+"""How many runs it takes: by simulation, at fixed seeds."""
+
+from __future__ import annotations
+
+import doctest
+import math
+
+import numpy as np
+import pytest
+
+from qrlsuite.errors import OptionError
+from qrlsuite.statistics import (
+    Decided,
+    DecisionPlan,
+    LearningCurves,
+    SmoothedRuns,
+    TimesRule,
+    decision_rates,
+    planning,
+    power,
+    runs_needed,
+    runs_to_detect,
+    times_rates,
+)
+from qrlsuite.statistics.calibration import draw_times, judge_times
+from tests.statistics.conftest import SURFACE, entry
+
+PILOT = SmoothedRuns(entry(0))
+
+
+def test_times_rates_are_the_rates_of_the_rule() -> None:
+    """Many at a time, or pair by pair as `power` does: the same test."""
+    other = SmoothedRuns(entry(1))
+    generator = np.random.default_rng(0)
+    ours, theirs = (draw_times(model, 20, 30, SURFACE, generator) for model in (PILOT, other))
+    together = judge_times(ours, theirs)
+    alone = [judge_times(ours[[k]], theirs[[k]]) for k in range(30)]
+    assert together.first == pytest.approx(np.mean([each.first for each in alone]))
+    rates = power(PILOT, PILOT, 20, 20, SURFACE, TimesRule(), n_pairs=40)
+    assert times_rates(PILOT, PILOT, 20, 20, SURFACE, n_pairs=40).found == pytest.approx(
+        rates.any_cell, abs=0.1
+    )
+
+
+def test_larger_differences_need_fewer_runs_and_more_power_needs_more() -> None:
+    [ten, more] = runs_to_detect(PILOT, SURFACE, 0.25, n_pairs=60, most=200)
+    [fifty] = runs_to_detect(PILOT, SURFACE, 0.5, powers=(0.8,), n_pairs=60, most=200)
+    assert ten.fixed is not None
+    assert more.fixed is not None
+    assert fifty.fixed is not None
+    assert fifty.fixed <= ten.fixed <= more.fixed
+    assert ten.looks[-1] >= ten.fixed
+    assert 20 <= ten.mean_runs <= ten.looks[-1]
+    assert runs_to_detect(PILOT, SURFACE, 0.25, n_pairs=60, most=200) == (ten, more), "seeded"
+
+
+def test_what_cannot_be_had_is_said() -> None:
+    [need] = runs_to_detect(PILOT, SURFACE, 0.01, powers=(0.9,), n_pairs=20, most=25)
+    assert (need.fixed, need.looks) == (None, ())
+    assert math.isnan(need.mean_runs)
+
+
+def test_even_looks() -> None:
+    assert doctest.testmod(planning).attempted
+    assert planning.even_looks(20) == (20,)
+    assert planning.even_looks(45) == (20, 27, 36, 45)
+
+
+def test_a_plan_played_many_times() -> None:
+    plan = DecisionPlan(("a", "b"), looks=(20, 40))
+    rates = decision_rates([PILOT, PILOT], plan, SURFACE, n_studies=40)
+    assert sum(rates.verdicts[0].values()) == pytest.approx(1)
+    assert rates.any_difference <= 0.15
+    assert 20 <= rates.mean_runs[0] <= 40
+    apart = decision_rates([PILOT, SmoothedRuns(entry(1))], plan, SURFACE, n_studies=10)
+    assert apart.verdicts[0][Decided.FIRST] == 1
+    assert apart.mean_runs == (20,)
+
+
+def test_bad_arguments_are_named() -> None:
+    with pytest.raises(OptionError, match="3 models for the 2 entries"):
+        decision_rates([PILOT] * 3, DecisionPlan(("a", "b")), SURFACE)
+    short = SmoothedRuns(LearningCurves(entry(1).values[:, :50], 2000, "short"))
+    with pytest.raises(OptionError, match="cut them to one horizon"):
+        runs_needed(PILOT, short, SURFACE)
+    with pytest.raises(OptionError, match="power = 1 is outside"):
+        runs_needed(PILOT, PILOT, SURFACE, powers=(1,))
+    with pytest.raises(OptionError, match="most = 10"):
+        runs_needed(PILOT, PILOT, SURFACE, most=10)
