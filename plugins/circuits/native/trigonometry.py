@@ -2,8 +2,9 @@
 
 x is reduced by the nearest multiple k of pi to r in [-pi/2, pi/2]. Pi is written in three parts, of which the first
 two have so few bits that their products with k are exact (Cody & Waite 1980, "Software Manual for the Elementary
-Functions"): no fused multiplication is needed. Then, with z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and both
-change sign with odd k. S and C interpolate at Chebyshev nodes; their largest errors are 2e-8 and 1e-9 (float32), 2e-17 and 9e-18 (float64).
+Functions"): no fused multiplication is needed. Then, with z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and
+both change sign with odd k. S and C interpolate at Chebyshev nodes; their largest errors are 2e-8 and 1e-9
+(float32), 2e-17 and 9e-18 (float64).
 """
 
 from __future__ import annotations
