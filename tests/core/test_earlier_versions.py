@@ -1,9 +1,9 @@
 """What earlier versions wrote: hashes stay, and their interrupted runs end with the bytes they would have ended with.
 
 `tests/golden/make.py` wrote the files, once per version. On the kind of machine and with the versions of torch, numpy
-and numba that made them, results are compared byte for byte. Elsewhere, and where the CHANGELOG says that a later version
-rounds differently, the same runs are compared with a tolerance: that finds another stream, option or formula, not
-another order of a sum.
+and numba that made them, results are compared byte for byte. Elsewhere, and where the CHANGELOG says that a later
+version rounds differently, the same runs are compared with a tolerance: that finds another stream, option or formula,
+not another order of a sum.
 """
 
 from __future__ import annotations
