@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from qrlsuite.hookspecs import hookimpl as hookimpl
 
-__version__ = "0.1.1"
+__version__ = "0.1.0"
 
 __all__ = ["__version__", "hookimpl", "register_environments"]
 

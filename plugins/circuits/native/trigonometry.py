@@ -1,10 +1,10 @@
 """Sine and cosine of a vector, by polynomials: scalar library calls would cost more than the gates.
 
-x is reduced by the nearest multiple k of pi to r in [-pi/2, pi/2]. Pi is written in three parts, of which the first
-two have so few bits that their products with k are exact (Cody & Waite 1980, "Software Manual for the Elementary
-Functions"): no fused multiplication is needed. Then, with z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and
-both change sign with odd k. S and C interpolate at Chebyshev nodes; their largest errors are 2e-8 and 1e-9
-(float32), 2e-17 and 9e-18 (float64).
+x is reduced by the nearest multiple k of pi to r in [-pi/2, pi/2]. Where the processor fuses multiplication and
+addition, pi is written in two parts. Elsewhere it is written in three, of which the first two have so few bits that
+their products with k are exact (Cody & Waite 1980, "Software Manual for the Elementary Functions"). Then, with
+z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and both change sign with odd k. S and C interpolate at Chebyshev
+nodes; their largest errors are 2e-8 and 1e-9 (float32), 2e-17 and 9e-18 (float64).
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from numba import types
 from numba.extending import overload
 
 from qrlsuite.plugins.circuits.native.cache import inlined
-from qrlsuite.plugins.circuits.native.vectors import Vector, constant, floor, fma, nearest
+from qrlsuite.plugins.circuits.native.vectors import FUSED, Vector, constant, floor, fma, nearest
 
 INVERSE_PI = 0.3183098861837907
-PI32 = (3.140625, 0.0009675025939941406, 1.5099580252808664e-07)
-PI64 = (3.1415926534682512, 1.2154201013012384e-10, 0.0)
+PI32 = (3.1415927410125732, -8.742277657347586e-08, 0.0)
+PI64 = (3.141592653589793, 1.2246467991473532e-16, 0.0)
+if not FUSED:
+    PI32 = (3.140625, 0.0009675025939941406, 1.5099580252808664e-07)
+    PI64 = (3.1415926534682512, 1.2154201013012384e-10, 0.0)
 
 S32 = (-0.16666665958226323, 0.008333241592520583, -0.00019822666349960692, 2.6345196812009277e-06)
 C32 = (

@@ -26,21 +26,27 @@ intrinsic: Any = extending.intrinsic
 """Untyped on purpose: inside kernels its products are called without the typing context."""
 
 
-def _register_bytes() -> int:
-    """Return the size of a vector register of the processor that numba compiles for: what LLVM uses for an addition."""
+def _target() -> tuple[int, bool]:
+    """Return what numba compiles for: bytes of a vector register, and whether it fuses a * b + c.
+
+    Both are read off the assembly of one multiplication and addition of 16 floats.
+    """
     row = ir.VectorType(ir.FloatType(), 16)
     module = ir.Module()
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [row.as_pointer()]), "add")
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [row.as_pointer()]), "multiply_add")
     builder = ir.IRBuilder(function.append_basic_block())
     value = builder.load(function.args[0])
-    builder.store(builder.fadd(value, value), function.args[0])
+    fused = ir.Function(module, ir.FunctionType(row, [row] * 3), "llvm.fmuladd.v16f32")
+    builder.store(builder.call(fused, [value] * 3), function.args[0])
     builder.ret_void()
     machine = cpu_target.target_context.codegen()._tm
     assembly = machine.emit_assembly(llvmlite.binding.parse_assembly(str(module)))
-    return 64 if "zmm" in assembly else 32 if "ymm" in assembly else 16
+    size = 64 if "zmm" in assembly else 32 if "ymm" in assembly else 16
+    return size, "fmadd" in assembly or "fmla" in assembly
 
 
-LANES = {types.float32: _register_bytes() // 4, types.float64: _register_bytes() // 8}
+_BYTES, FUSED = _target()
+LANES = {types.float32: _BYTES // 4, types.float64: _BYTES // 8}
 """Lanes of a vector by element type."""
 
 
