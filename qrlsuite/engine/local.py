@@ -36,6 +36,13 @@ class _Job:
     output: IO[bytes] | None = field(default=None, repr=False)
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may use; where the system does not say, that of the machine."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # macOS
+
+
 class LocalEngine:
     """Supervises worker processes on this machine."""
 
@@ -44,7 +51,7 @@ class LocalEngine:
 
     def workers(self, asked: int | None) -> int:
         """Return the number asked for, else one per core that this process may use."""
-        return asked or len(os.sched_getaffinity(0))
+        return asked or usable_cores()
 
     def queued(self, store: EntryStore) -> set[int]:
         """Return nothing: what waits for a local process waits in that process."""

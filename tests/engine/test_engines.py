@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from qrlsuite import registry
 from qrlsuite.cli.app import build
-from qrlsuite.engine import api, worker
+from qrlsuite.engine import api, local, worker
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.slurm import Options, SlurmEngine, minutes
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
@@ -243,3 +243,11 @@ def test_groups_that_failed_alike_are_named_together() -> None:
         "3 group(s) failed, finished epochs are kept: groups a, b: no such device; group c: another reason"
     )
     api.raise_failures(api.Outcome())
+
+
+def test_cores_are_counted_where_the_system_does_not_say_which_may_be_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert local.usable_cores() == len(os.sched_getaffinity(0))
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert local.usable_cores() == os.cpu_count()
