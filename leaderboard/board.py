@@ -16,6 +16,7 @@ from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
     Board,
@@ -370,11 +371,6 @@ def untiered_reason(row: Row) -> str:
     if len(row.entry.seeds) < MIN_RUNS:
         return f"undecided: fewer than {MIN_RUNS} seeds"
     return "undecided: nothing to compare with"
-
-
-def steps_text(steps: int) -> str:
-    """Write steps in thousands where that is exact: 44000 as 44k."""
-    return f"{steps // 1000}k" if steps % 1000 == 0 else str(steps)
 
 
 def complexity_text(complexity: Complexity) -> str:

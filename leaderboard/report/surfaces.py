@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.report.words import in_unit, short
+from qrlsuite.leaderboard.report.words import in_unit
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled, unsettled_at
 
 LEVELS = 10
@@ -41,7 +42,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
         cells = []
         for j, delta in enumerate(grid.deltas):
             sign = "≥ " if open_end[i, j] else ""
-            low, high = (short(float(v)) for v in interval[i, j])
+            low, high = (steps_text(float(v)) for v in interval[i, j])
             mark = ", at cap" if capped[i, j] else ""
             share = float(point[i, j]) / horizon
             cells.append(
@@ -51,7 +52,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
                     capped=bool(capped[i, j]),
                     unsettled=bool(open_end[i, j]),
                     reference=value == wanted and float(delta) == ranking.reference.delta,
-                    title=f"{sign}{short(float(point[i, j]))} ({low} to {high}{mark})",
+                    title=f"{sign}{steps_text(float(point[i, j]))} ({low} to {high}{mark})",
                 )
             )
         lines.append(tuple(cells))

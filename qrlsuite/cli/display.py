@@ -12,10 +12,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from qrlsuite import registry
-from qrlsuite.cli.terminal import command, counted
+from qrlsuite.cli.terminal import command
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.seeds import Group
 from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import counted, duration
 
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
@@ -32,22 +33,6 @@ SILENCE_SECONDS = 20.0
 DAY = 86400.0
 
 FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
-
-
-def hours_text(hours: float) -> str:
-    """Write core-hours to two digits, large ones as whole numbers."""
-    return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
-
-
-def duration(seconds: float) -> str:
-    """Write a duration as people say it."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    if seconds < 36 * 3600:
-        return f"{seconds / 3600:.1f} h"
-    return f"{seconds / 86400:.1f} days"
 
 
 class _Clock:

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from qrlsuite.cli.display import RunDisplay, duration
+from qrlsuite.cli.display import RunDisplay
 from qrlsuite.cli.training import Place, Plan, plan, train
 from qrlsuite.engine.api import Outcome
 from qrlsuite.errors import OptionError
 from qrlsuite.results.speed import BASES, Estimate, Speeds
+from qrlsuite.results.text import duration
 from qrlsuite.studies.study import Member
 
 

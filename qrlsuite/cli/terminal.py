@@ -44,11 +44,6 @@ def _program() -> str:
     return shlex.quote(str(own.relative_to(here) if own.is_relative_to(here) else own))
 
 
-def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return a number of things: `1 seed`, `2 seeds`, `2 processes`."""
-    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
-
-
 def printable(text: object) -> str:
     r"""Return one line in which nothing controls a terminal.
 

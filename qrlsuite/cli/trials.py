@@ -13,12 +13,12 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.cli.display import duration, hours_text
-from qrlsuite.cli.terminal import command, counted, table_console
+from qrlsuite.cli.terminal import command, table_console
 from qrlsuite.cli.training import Place, Plan
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import counted, duration, hours_text, steps_text
 from qrlsuite.tuning.objective import cell_text
 from qrlsuite.tuning.samplers import NAMES
 from qrlsuite.tuning.search import Search, Trial, as_dict
@@ -30,14 +30,6 @@ SHOWN = 10
 def plain(search: Search) -> dict[str, Any]:
     """Return a search as plain values."""
     return as_dict(search)
-
-
-def steps_text(steps: float) -> str:
-    """Write environment steps: 44k, 8.6 billion."""
-    for size, unit in ((1e9, " billion"), (1e6, " million"), (1e3, "k")):
-        if steps >= size:
-            return f"{steps / size:.3g}{unit}"
-    return f"{steps:.0f}"
 
 
 class TuneDisplay:

@@ -16,7 +16,6 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
-from qrlsuite.cli.display import duration
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import calibration, collect, rules
 from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
@@ -24,6 +23,7 @@ from qrlsuite.leaderboard.calibration import Finding, Job
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
 from qrlsuite.results import lookup
+from qrlsuite.results.text import duration
 
 
 class PartName(StrEnum):

@@ -9,7 +9,6 @@ from typing import Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.display import duration
 from qrlsuite.cli.terminal import printable
 from qrlsuite.engine.api import Queues
 from qrlsuite.errors import QrlSuiteError
@@ -17,6 +16,7 @@ from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import entries
 from qrlsuite.results.survey import GroupStatus, groups, look
+from qrlsuite.results.text import duration
 
 
 def status(

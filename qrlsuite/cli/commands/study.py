@@ -16,9 +16,8 @@ from rich.text import Text
 from qrlsuite import options, registry
 from qrlsuite.cli import budget as budgets
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.display import duration, hours_text
 from qrlsuite.cli.studying import Item, Session, cheapest_first, check_budget, fitting, survey
-from qrlsuite.cli.terminal import counted, table_console
+from qrlsuite.cli.terminal import table_console
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -36,6 +35,7 @@ from qrlsuite.results import speed
 from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.results.speed import BASES, Speeds
 from qrlsuite.results.store import write_atomically
+from qrlsuite.results.text import counted, duration, hours_text
 from qrlsuite.studies.study import Member, Study
 
 app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: list, show, run, draw.")
