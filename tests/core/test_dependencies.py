@@ -33,7 +33,7 @@ ROOMS = (
     ("engine",),
     ("tuning",),
     ("studies",),
-    ("leaderboard", "testing", "scaffold"),
+    ("leaderboard", "testing", "scaffold", "installation"),
     ("api",),
     ("cli",),
 )
