@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.terminal import printable
+from qrlsuite.engine.terminal import printable
 from qrlsuite.installation.diagnosis import Diagnosis, diagnose
 from qrlsuite.installation.report import rows
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.terminal import command
+from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.export import export as write

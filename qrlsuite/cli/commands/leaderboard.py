@@ -25,7 +25,7 @@ from qrlsuite.cli.arguments import (
     TaskOption,
 )
 from qrlsuite.cli.commands import verify
-from qrlsuite.cli.terminal import table_console
+from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import board as boards
 from qrlsuite.leaderboard import collect, report, rules

@@ -11,7 +11,7 @@ import typer
 
 from qrlsuite import hookspecs, registry
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.cli.terminal import printable
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import UnknownNameError, nearest
 from qrlsuite.registry import Registry
 

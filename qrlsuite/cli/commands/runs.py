@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.terminal import printable
 from qrlsuite.engine.api import Queues
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds

@@ -13,7 +13,7 @@ from qrlsuite import circuit, options, registry, specs
 from qrlsuite.circuit import drawing
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.commands.listing import hooks
-from qrlsuite.cli.terminal import printable_lines
+from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard import pictures, rules
