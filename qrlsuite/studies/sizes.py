@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from qrlsuite import population, specs
+from qrlsuite import specs
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 
@@ -15,8 +15,10 @@ LARGEST_SIZE = 4096
 
 def parameters(entry: Entry) -> int:
     """Return the number of parameters of an entry's first network, classical and quantum together."""
-    import torch  # heavy: a study without models of equal size does without it
+    # torch is slow to import, and needed only where models of equal size are looked for
+    import torch
 
+    from qrlsuite import population
     from qrlsuite.training.trainer import build_envs
 
     envs = build_envs(entry, 1, lambda: None)
