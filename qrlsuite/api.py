@@ -2,7 +2,11 @@
 
     from qrlsuite import api
 
-    entry = api.train("beam6g", "mlp", options={"width": 16}, seeds=8, epochs=10)
+    small = api.train("beam6g", "mlp", options={"width": 16}, seeds=8, epochs=10)
+    large = api.load("mlp width=64", task="beam6g", published=True)
+    api.compare(large, small)
+    api.board("beam6g", published=True)
+    api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
 
 What they return shows itself: as a table in a notebook, and printed by rich in a terminal. Their errors are those of
@@ -11,12 +15,14 @@ What they return shows itself: as a table in a notebook, and printed by rich in 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from matplotlib.figure import Figure
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from qrlsuite.engine import execution
@@ -25,11 +31,14 @@ from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import collect, studies
+from qrlsuite.leaderboard import board as boards
+from qrlsuite.leaderboard import collect, rules, studies
+from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.studies import Drawn
 from qrlsuite.options import from_mapping
-from qrlsuite.results import speed
+from qrlsuite.results import lookup, speed
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
@@ -42,10 +51,218 @@ from qrlsuite.tuning.search import Request, Search, tuning_seeds
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
-__all__ = ["evaluate", "run_study", "train", "tune"]
+__all__ = ["board", "compare", "evaluate", "load", "plot", "run_study", "train", "tune"]
 
 Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
+
+
+def load(
+    entry: str, *, task: str | None = None, runs: str | PathLike[str] = "runs", published: bool = False
+) -> EntryCurves:
+    """Read an entry: the learning curves of its seeds, and how they were made.
+
+    Parameters
+    ----------
+    entry:
+        Its name or label, `TASK/` before it or not, or the beginning of one of them; or its folder.
+    task:
+        Look among the entries of this task only; None looks among all.
+    runs:
+        The results folder.
+    published:
+        Look among the published entries that come with the suite, too. Of an entry that is in both, the copy that
+        gets further, then that with more seeds, is read.
+
+    Returns
+    -------
+    EntryCurves
+        With `curves` of shape (N, T): the mean validation score of N seeds after each of T epochs, in the task's
+        units ([0, 1] where scores are fractions of the optimum); `steps_per_epoch` environment steps each;
+        `records` by seed; `to_table()` for pandas and polars.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry or several have the name, or no epoch of it is finished; the message says what to type.
+    StoreError
+        If there is no results folder, or a file is damaged.
+
+    Examples
+    --------
+    >>> load("mlp width=64", task="beam6g", runs="none-yet", published=True).curves.shape
+    (100, 100)
+    """
+    folder = Path(runs)
+    lookup.check_tasks(folder, task)
+    return collect.find(folder, entry, published, _several(task))
+
+
+def board(
+    tasks: str | Sequence[str] | None = None,
+    *,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str = rules.DEFAULT,
+    horizon: int | None = None,
+    entries: Sequence[str | EntryCurves] = (),
+    min_seeds: int = 1,
+) -> Leaderboard:
+    """Rank entries by significant outperformance, task by task.
+
+    Parameters
+    ----------
+    tasks:
+        A task or several; None means all.
+    runs, published:
+        As for `load`.
+    rule:
+        What counts as significant: a name of `qrlsuite list significance-tests`.
+    horizon:
+        Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
+    entries:
+        Rank these only: what `load` accepts, or what it returns.
+    min_seeds:
+        Leave out entries with fewer seeds.
+
+    Returns
+    -------
+    Leaderboard
+        `sections`, one per task and horizon, with a row per entry; `refused`, one line for each entry that was left
+        out and why; `as_dict()`. Without any entry it has no section.
+
+    Raises
+    ------
+    UnknownNameError
+        If a task, an entry or the rule is unknown, or no entry is left.
+    OptionError
+        If the horizon is no whole number of epochs, or a paired rule meets entries of different seeds.
+    StoreError
+        If there is no results folder, and `published` is false.
+    PluginError
+        If a plugin's rule fails.
+
+    Examples
+    --------
+    >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
+    >>> [(row.tier, row.entry.label) for row in found.sections[0].rows]
+    [(1, 'ddqn mlp width=64'), (2, 'ddqn mlp width=16')]
+    """
+    folder, wanted = Path(runs), _several(tasks)
+    lookup.check_tasks(folder, *wanted)
+    found, left_out = collect.select(folder, wanted, entries, published, horizon, min_seeds)
+    return boards.build(found, left_out, rules.load(rule), horizon)
+
+
+def compare(
+    first: str | EntryCurves,
+    second: str | EntryCurves,
+    *,
+    task: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str = rules.DEFAULT,
+) -> EntryComparison:
+    """Say whether the first of two entries outperforms the second, cell by cell of the task's ranking grid.
+
+    Both are compared at equal numbers of seeds and equal horizons.
+
+    Parameters
+    ----------
+    first, second:
+        What `load` accepts, or what it returns.
+    task, runs, published:
+        As for `load`.
+    rule:
+        As for `board`.
+
+    Returns
+    -------
+    EntryComparison
+        `verdicts`, E rows of D cells; `points` of shape (2, E, D) and `intervals` of shape (2, E, D, 2), in
+        environment steps; `outcome`, and the same as a `sentence`; `as_dict()`.
+
+    Raises
+    ------
+    UnknownNameError
+        If an entry, the task or the rule is unknown.
+    QrlSuiteError
+        If the entries belong to different tasks, their lengths have no common horizon, or a paired rule finds no
+        common seed.
+
+    Examples
+    --------
+    >>> found = compare("mlp width=64", "mlp width=16", task="beam6g", runs="none-yet", published=True)
+    >>> str(found.outcome)
+    'outperforms'
+    """
+    one, other = (
+        entry if isinstance(entry, EntryCurves) else load(entry, task=task, runs=runs, published=published)
+        for entry in (first, second)
+    )
+    return boards.compare_entries(one, other, rules.load(rule))
+
+
+def plot(
+    kind: str,
+    *,
+    tasks: str | Sequence[str] | None = None,
+    entries: Sequence[str | EntryCurves] = (),
+    horizon: int | None = None,
+    min_seeds: int = 1,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    environment: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Figure:
+    """Draw a picture of entries, of a task's environment, or of the estimator.
+
+    Entries that would cut the others to their own length are left out, unless `entries` names them. A warning names
+    each entry that was left out.
+
+    Parameters
+    ----------
+    kind:
+        What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
+    tasks, entries, horizon, min_seeds, runs, published:
+        As for `board`. Without `entries` all of the task are drawn, the smallest model first.
+    environment:
+        For a picture of an environment: options that replace the task's.
+    settings:
+        The picture's own settings: `qrlsuite plot KIND --settings` lists them.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To show, change, or save with `figure.savefig`.
+
+    Raises
+    ------
+    UnknownNameError
+        If the kind, a task or an entry is unknown, or there are no entries.
+    OptionError
+        If a setting is unknown or has a bad value, or the picture cannot be made of these entries or tasks.
+    StoreError
+        If there is no results folder, and `published` is false.
+
+    Examples
+    --------
+    >>> plot("tiers", tasks="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
+    """
+    drawn = compose(
+        kind,
+        _several(tasks),
+        entries,
+        horizon=horizon,
+        min_seeds=min_seeds,
+        runs=Path(runs),
+        published=published,
+        settings=settings,
+        environment=environment or {},
+    )
+    for line in drawn.left_out:
+        warnings.warn(f"left out: {line}", stacklevel=2)
+    return drawn.figure
 
 
 def train(
@@ -439,3 +656,8 @@ def _execution(engine: str | Execution, workers: int | None, device: str) -> Exe
 def _check_positive(name: str, value: int | None) -> None:
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise OptionError(f"{name} = {value!r}: give a whole number, 1 or more")
+
+
+def _several(names: str | Sequence[str] | None) -> Sequence[str]:
+    """Return names as a sequence."""
+    return [names] if isinstance(names, str) else names or []

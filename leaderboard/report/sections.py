@@ -8,7 +8,7 @@ from typing import Any
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.absent import absent
-from qrlsuite.leaderboard.board import Row, Section, ranking_of, untiered_reason
+from qrlsuite.leaderboard.board import Row, Section, ranking_of
 from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
@@ -149,7 +149,7 @@ def _row(place: int, row: Row, entry: EntryView, judgement: Judgement) -> RowVie
         high=100 * reference.high / horizon,
         wins=int(beats[place].sum()),
         losses=int(beats[:, place].sum()),
-        reason="" if row.tier is not None else untiered_reason(row),
+        reason=row.reason,
     )
 
 

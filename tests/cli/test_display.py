@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.cli.commands.leaderboard import COLUMNS
 from qrlsuite.engine.display import CostEstimate, RunDisplay
 from qrlsuite.engine.execution import Plan, summarize
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.leaderboard.tables import COLUMNS
 from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import Group
