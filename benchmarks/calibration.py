@@ -42,7 +42,9 @@ def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, 
     for _ in range(pairs):
         first, second = (
             bootstrap_interval(
-                model.draw(n, generator).values, grid.epsilons or (), deltas, model.entry.steps_per_epoch
+                model.draw(n, generator).values,
+                Grid.relative(grid.epsilons or (), deltas),
+                model.entry.steps_per_epoch,
             )
             for n in (n_first, n_second)
         )
@@ -57,7 +59,11 @@ def print_bias(entry: LearningCurves, draws: int) -> None:
     deltas = [0.5, 0.75, 0.9]
     for n_runs in (5, 10, 20, 50, 100, 1000):
         found = [
-            sample_complexity(model.draw(n_runs, generator).values, [0.2], deltas, entry.steps_per_epoch)[0]
+            sample_complexity(
+                model.draw(n_runs, generator).values,
+                Grid.relative([0.2], deltas),
+                entry.steps_per_epoch,
+            )[0]
             for _ in range(draws)
         ]
         means = " | ".join(f"{value / 1000:.1f}" for value in np.mean(found, axis=0))

@@ -79,7 +79,7 @@ def main() -> None:
     curves = learning_curves(100, seed=0)
     fast, slow = median_seconds(
         arguments.repeats,
-        lambda: bootstrap_interval(curves, EPSILONS, DELTAS, STEPS),
+        lambda: bootstrap_interval(curves, Grid.relative(EPSILONS, DELTAS), STEPS),
         lambda: loop_over_resamples(curves),
     )
     print("1000-fold bootstrap, 49 cells, 100 runs x 100 epochs")

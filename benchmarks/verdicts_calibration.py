@@ -237,13 +237,15 @@ def print_coverage(pairs: int) -> None:
     for name in POPULATIONS:
         generator = np.random.default_rng(9)
         many = MODELS[name].draw(20_000, generator)
-        true = sample_complexity(many.values, EPSILONS, DELTAS, many.steps_per_epoch)
+        true = sample_complexity(many.values, Grid.relative(EPSILONS, DELTAS), many.steps_per_epoch)
         true_mean = mean_time(many, GRID).mean
         for n_runs in SIZES:
             inside, means = np.zeros(GRID.shape), 0
             for _ in range(count):
                 entry = MODELS[name].draw(n_runs, generator)
-                interval = bootstrap_interval(entry.values, EPSILONS, DELTAS, entry.steps_per_epoch)
+                interval = bootstrap_interval(
+                    entry.values, Grid.relative(EPSILONS, DELTAS), entry.steps_per_epoch
+                )
                 inside += (interval[..., 0] <= true) & (true <= interval[..., 1])
                 low, high = mean_time(entry, GRID).interval
                 means += low <= true_mean <= high

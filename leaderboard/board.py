@@ -24,19 +24,15 @@ from qrlsuite.statistics import (
     MIN_RUNS,
     Board,
     Comparison,
-    Grid,
     IntervalRule,
     LearningCurves,
     SignificanceRule,
     at_cap,
     bootstrap_interval,
-    bootstrap_interval_at,
     compare,
     outperformance,
     sample_complexity,
-    sample_complexity_at,
     unsettled,
-    unsettled_at,
 )
 
 
@@ -198,13 +194,6 @@ class EntryComparison(Comparison):
         return tables.comparison_html(self, self.headline, self.remarks)
 
 
-def grid_of(ranking: RankingSection) -> Grid:
-    """Return a task's ranking grid."""
-    if ranking.epsilons is not None:
-        return Grid.relative(ranking.epsilons, ranking.deltas)
-    return Grid.absolute(ranking.thresholds or [], ranking.deltas)
-
-
 def learning_curves(entry: EntryCurves) -> LearningCurves:
     """Return an entry's curves as the statistics take them."""
     return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
@@ -295,9 +284,7 @@ def _section(
     ranking = ranking_of(entries)
     if getattr(rule, "paired", False):
         _require_equal_seeds(entries, rule.name)
-    board = outperformance(
-        [learning_curves(entry) for entry in entries], grid_of(ranking), rule, horizon=horizon
-    )
+    board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
     by_name = {entry.name: entry for entry in entries}
     labels = {entry.name: entry.label for entry in entries}
     wanted = entries[0].task_file.protocol.seeds
@@ -357,18 +344,12 @@ def complexity_at(
     values:
         (N, T) learning curves, cut to the horizon.
     """
-    cell = ranking.reference
-    if cell.epsilon is not None:
-        steps = sample_complexity(values, [cell.epsilon], [cell.delta], steps_per_epoch)
-        interval = bootstrap_interval(values, [cell.epsilon], [cell.delta], steps_per_epoch)
-        open_end = unsettled(values, [cell.epsilon], [cell.delta])
-    else:
-        steps = sample_complexity_at(values, [cell.threshold], [cell.delta], steps_per_epoch)
-        interval = bootstrap_interval_at(values, [cell.threshold], [cell.delta], steps_per_epoch)
-        open_end = unsettled_at(values, [cell.threshold], [cell.delta])
+    cell = ranking.reference_grid
+    steps = sample_complexity(values, cell, steps_per_epoch)
+    interval = bootstrap_interval(values, cell, steps_per_epoch)
     low, high = (round(float(v)) for v in interval[0, 0])
-    capped = bool(at_cap(interval, horizon)[0, 0])
-    return Complexity(int(steps[0, 0]), low, high, capped, bool(open_end[0, 0]))
+    capped, open_end = at_cap(interval, horizon)[0, 0], unsettled(values, cell)[0, 0]
+    return Complexity(int(steps[0, 0]), low, high, bool(capped), bool(open_end))
 
 
 def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
@@ -410,9 +391,8 @@ def compare_entries(
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
-    found = compare(
-        learning_curves(first), learning_curves(second), grid_of(ranking_of([first, second])), rule
-    )
+    grid = ranking_of([first, second]).grid
+    found = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(found, field.name) for field in fields(found)}
     remarks = [
         f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import collect
-from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
+from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
 from qrlsuite.results import lookup
@@ -200,7 +200,7 @@ def prepare(entries: Sequence[EntryCurves]) -> Setup:
         names = [entry.name for entry in entries]
     cut = (learning_curves(entry).cut(horizon) for entry in entries)
     curves = tuple(replace(curve, name=name) for curve, name in zip(cut, names))
-    return Setup(curves, grid_of(ranking_of(entries)), horizon)
+    return Setup(curves, ranking_of(entries).grid, horizon)
 
 
 def plan(

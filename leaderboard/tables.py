@@ -263,9 +263,8 @@ SYMBOLS = {
 def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
     """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
     grid = comparison.grid
-    name = "epsilon" if grid.epsilons is not None else "threshold"
-    rows = [f"{float(level):g}" for level in grid.epsilons or grid.thresholds]
-    return f"{name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]
+    rows = [f"{float(level):g}" for level in grid.levels]
+    return f"{grid.level_name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]
 
 
 def comparison_table(comparison: Comparison) -> Table:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.board import grid_of, learning_curves
+from qrlsuite.leaderboard.board import learning_curves
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled_at
+from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 from qrlsuite.statistics.grid import BoolArray, FloatArray
 
 
@@ -39,7 +39,7 @@ def measure(entry: EntryCurves, grid: Grid, horizon: int) -> Cells:
     curves = learning_curves(entry).cut(horizon)
     evidence = Evidence(curves, grid, curves.n_runs)
     intervals = evidence.interval()
-    marks = unsettled_at(curves.values, grid.thresholds, [float(delta) for delta in grid.deltas])
+    marks = unsettled(curves.values, grid)
     return Cells(evidence.point, intervals, at_cap(intervals, horizon), marks)
 
 
@@ -81,7 +81,7 @@ def choose_grid(
                 f"task '{entry.task}' has no known maximum: give thresholds instead of epsilons"
             )
         return Grid.relative(epsilons, wanted)
-    own = grid_of(ranking)
+    own = ranking.grid
     if deltas is None:
         return own
     if ranking.epsilons is not None:

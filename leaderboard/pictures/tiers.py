@@ -13,7 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
+from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
@@ -49,7 +49,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     chosen: Options = options.build(Options, settings, "picture 'tiers'")
     cells.one_task(entries, "tiers")
     horizon = cells.choose_horizon(entries, chosen.horizon)
-    grid = grid_of(ranking_of(entries))
+    grid = ranking_of(entries).grid
     board = outperformance([learning_curves(entry) for entry in entries], grid, horizon=horizon)
     shown = style.labels(entries)
     longest = max(map(len, shown))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.leaderboard.board import grid_of, learning_curves, ranking_of
+from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.statistics import (
     MIN_RUNS,
@@ -102,7 +102,7 @@ def judge(entries: Sequence[EntryCurves], horizon: int, rule: SignificanceRule |
         None means the paper's, as for the board.
     """
     chosen = rule or IntervalRule()
-    grid = grid_of(ranking_of(entries))
+    grid = ranking_of(entries).grid
     curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)
     evidence = {(i, curve.n_runs): Evidence(curve, grid, curve.n_runs) for i, curve in enumerate(curves)}
     nothing = [never_reached(curve, grid) for curve in curves]

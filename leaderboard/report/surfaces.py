@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.report.words import in_unit
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled, unsettled_at
+from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 
 LEVELS = 10
 """Shades of a surface."""
@@ -35,10 +32,10 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
     grid, horizon = evidence.grid, evidence.entry.horizon
     point, interval = evidence.point, evidence.interval()
     capped = at_cap(interval, horizon)
-    open_end = _unsettled(evidence)
+    open_end = unsettled(evidence.entry.values, grid)
     wanted = ranking.reference.epsilon if grid.epsilons else ranking.reference.threshold
     lines = []
-    for i, value in enumerate(grid.epsilons or grid.thresholds):
+    for i, value in enumerate(grid.levels):
         cells = []
         for j, delta in enumerate(grid.deltas):
             sign = "≥ " if open_end[i, j] else ""
@@ -57,13 +54,6 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
             )
         lines.append(tuple(cells))
     return tuple(lines)
-
-
-def _unsettled(evidence: Evidence) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    grid, values = evidence.grid, evidence.entry.values
-    if grid.epsilons is not None:
-        return unsettled(values, grid.epsilons, [float(d) for d in grid.deltas])
-    return unsettled_at(values, grid.thresholds, [float(d) for d in grid.deltas])
 
 
 def bar_grid(ranking: RankingSection) -> Grid:

@@ -88,7 +88,7 @@ class Options:
     ] = ()
 
 
-class Task:
+class ArrayTask:
     """What a task of the array does; submitit pickles it for its own job, by reference to this class."""
 
     def __init__(self, folder: str, seeds: tuple[int, ...], epochs: int, device: str) -> None:
@@ -120,7 +120,9 @@ class Task:
 
         if self._engine is not None:
             self._engine.stop()
-        return submitit.helpers.DelayedSubmission(Task(self.folder, self.seeds, self.epochs, self.device))
+        return submitit.helpers.DelayedSubmission(
+            ArrayTask(self.folder, self.seeds, self.epochs, self.device)
+        )
 
 
 def _canceled(number: int, frame: FrameType | None) -> None:
@@ -183,7 +185,7 @@ class SlurmEngine:
             "additional_parameters": {"requeue": True},
         }
         tasks = [
-            Task(str(work.store.path.absolute()), g.seeds, work.epochs, work.device) for g in work.groups
+            ArrayTask(str(work.store.path.absolute()), g.seeds, work.epochs, work.device) for g in work.groups
         ]
         try:
             folder.mkdir(parents=True, exist_ok=True)

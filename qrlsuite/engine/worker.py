@@ -29,7 +29,7 @@ from qrlsuite.results.store import EntryStore
 _PR_SET_PDEATHSIG = 1
 
 
-class Heart(threading.Thread):
+class ClaimHeartbeat(threading.Thread):
     """Refreshes the claim; interrupts this process when the claim or the parent process `parent` is lost."""
 
     def __init__(self, claim: Claim, parent: int | None) -> None:
@@ -75,8 +75,8 @@ def train_group(
     store = EntryStore(folder)
     progress = ProgressFile(store, group_id(seeds))
     claim = acquire(store, seeds)
-    heart = Heart(claim, parent)
-    heart.start()
+    heartbeat = ClaimHeartbeat(claim, parent)
+    heartbeat.start()
     state = Progress(epochs=epochs)
     try:
         entry = store.entry()
@@ -91,7 +91,7 @@ def train_group(
             progress.write(state, error=str(error), force=True)
         raise
     finally:
-        heart.stopped.set()
+        heartbeat.stopped.set()
         claim.release()
 
 
@@ -99,7 +99,7 @@ def _end_with(parent: int) -> bool:
     """Have SIGTERM sent to this process when its parent ends; returns False where it has ended already."""
     with contextlib.suppress(
         OSError, AttributeError
-    ):  # elsewhere than on Linux, the heart looks now and then
+    ):  # elsewhere than on Linux, the heartbeat looks now and then
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     return os.getppid() == parent
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite.statistics.grid import Grid
 
 FORMAT_VERSION = 1
 
@@ -118,6 +119,20 @@ class RankingSection(_Section):
             kind = "epsilon" if relative else "threshold"
             raise ValueError(f"the reference cell needs {kind} and delta, as the grid has {kind}s")
         return self
+
+    @property
+    def grid(self) -> Grid:
+        """The cells on which entries are compared."""
+        return self._grid(self.epsilons, self.thresholds, self.deltas)
+
+    @property
+    def reference_grid(self) -> Grid:
+        """The reference cell alone."""
+        epsilon, threshold = self.reference.epsilon, self.reference.threshold
+        return self._grid([epsilon], [threshold], [self.reference.delta])
+
+    def _grid(self, epsilons: Any, thresholds: Any, deltas: list[float]) -> Grid:
+        return Grid.absolute(thresholds, deltas) if self.epsilons is None else Grid.relative(epsilons, deltas)
 
 
 Family = Literal["all", "classical", "quantum"]

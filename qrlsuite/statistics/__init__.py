@@ -23,9 +23,7 @@ from qrlsuite.statistics.across import (
 from qrlsuite.statistics.board import Board, outperformance
 from qrlsuite.statistics.bootstrap import (
     bootstrap_draws,
-    bootstrap_draws_at,
     bootstrap_interval,
-    bootstrap_interval_at,
 )
 from qrlsuite.statistics.calibration import (
     DecisionRates,
@@ -46,9 +44,7 @@ from qrlsuite.statistics.estimator import (
     at_cap,
     printed,
     sample_complexity,
-    sample_complexity_at,
     unsettled,
-    unsettled_at,
 )
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
@@ -110,9 +106,7 @@ __all__ = [
     "at_cap",
     "board_false_winners",
     "bootstrap_draws",
-    "bootstrap_draws_at",
     "bootstrap_interval",
-    "bootstrap_interval_at",
     "common_horizon",
     "compare",
     "decide",
@@ -134,12 +128,10 @@ __all__ = [
     "runs_needed",
     "runs_to_detect",
     "sample_complexity",
-    "sample_complexity_at",
     "slower",
     "split_halves",
     "times_below",
     "times_board",
     "times_rates",
     "unsettled",
-    "unsettled_at",
 ]

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,8 +32,7 @@ _TILE = 2**18  # rows x columns x depth up to which OpenBLAS multiplies float32 
 
 def bootstrap_interval(
     curves: ArrayLike,
-    epsilons: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
+    grid: Grid,
     steps_per_epoch: int,
     n_resamples: int = 1000,
     percentiles: tuple[float, float] = (5, 95),
@@ -46,7 +43,7 @@ def bootstrap_interval(
 
     Parameters
     ----------
-    curves, epsilons, deltas, steps_per_epoch:
+    curves, grid, steps_per_epoch:
         As in `qrlsuite.statistics.sample_complexity`.
     n_resamples:
         How often the runs are redrawn.
@@ -69,33 +66,16 @@ def bootstrap_interval(
     OptionError
         If an argument is out of its range, or `n_runs` exceeds N.
     """
-    values = checked(curves, relative=True)
-    grid = Grid.relative(epsilons, deltas)
-    return _interval(values, grid, steps_per_epoch, n_resamples, percentiles, seed, n_runs)
-
-
-def bootstrap_interval_at(
-    curves: ArrayLike,
-    thresholds: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
-    steps_per_epoch: int,
-    n_resamples: int = 1000,
-    percentiles: tuple[float, float] = (5, 95),
-    seed: int = 0,
-    n_runs: int | None = None,
-) -> FloatArray:
-    """Return percentile intervals, shape (E, D, 2), at thresholds given directly.
-
-    Otherwise as `bootstrap_interval`.
-    """
-    grid = Grid.absolute(thresholds, deltas)
-    return _interval(checked(curves), grid, steps_per_epoch, n_resamples, percentiles, seed, n_runs)
+    values = checked(curves, relative=grid.is_relative)
+    steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
+    drawn = draw_epochs(values, grid, n_resamples, seed, n_runs)
+    center = central_epochs(values, grid, drawn, n_runs)
+    return widened_percentiles(drawn, center, percentiles, steps)
 
 
 def bootstrap_draws(
     curves: ArrayLike,
-    epsilons: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
+    grid: Grid,
     steps_per_epoch: int,
     n_resamples: int = 1000,
     seed: int = 0,
@@ -106,49 +86,11 @@ def bootstrap_draws(
     Arguments and errors as in `bootstrap_interval`. Two entries with equal N, drawn with the same seed, are
     resampled by the same weights: draw r of both then uses the same runs.
     """
-    values = checked(curves, relative=True)
-    return _draws(values, Grid.relative(epsilons, deltas), steps_per_epoch, n_resamples, seed, n_runs)
-
-
-def bootstrap_draws_at(
-    curves: ArrayLike,
-    thresholds: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
-    steps_per_epoch: int,
-    n_resamples: int = 1000,
-    seed: int = 0,
-    n_runs: int | None = None,
-) -> IntArray:
-    """Return S_hat of every resample, shape (R, E, D), at thresholds given directly.
-
-    Otherwise as `bootstrap_draws`.
-    """
-    grid = Grid.absolute(thresholds, deltas)
-    return _draws(checked(curves), grid, steps_per_epoch, n_resamples, seed, n_runs)
-
-
-def _draws(
-    values: Curve, grid: Grid, steps_per_epoch: int, n_resamples: int, seed: int, n_runs: int | None
-) -> IntArray:
+    values = checked(curves, relative=grid.is_relative)
     steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
     drawn = draw_epochs(values, grid, n_resamples, seed, n_runs)
     in_steps: IntArray = np.ascontiguousarray(np.moveaxis(drawn, 2, 0), dtype=np.int64) * steps
     return in_steps
-
-
-def _interval(
-    values: Curve,
-    grid: Grid,
-    steps_per_epoch: int,
-    n_resamples: int,
-    percentiles: tuple[float, float],
-    seed: int,
-    n_runs: int | None,
-) -> FloatArray:
-    steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
-    drawn = draw_epochs(values, grid, n_resamples, seed, n_runs)
-    center = central_epochs(values, grid, drawn, n_runs)
-    return widened_percentiles(drawn, center, percentiles, steps)
 
 
 def central_epochs(curves: Curve, grid: Grid, drawn: EpochDraws, n_runs: int | None) -> FloatArray:

@@ -9,9 +9,6 @@ horizon, so an unreached goal is a lower bound and not infinity.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,53 +16,30 @@ from qrlsuite.statistics.curves import Curve, checked, reached
 from qrlsuite.statistics.grid import BoolArray, Grid, IntArray, whole
 
 
-def sample_complexity(
-    curves: ArrayLike,
-    epsilons: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
-    steps_per_epoch: int,
-) -> IntArray:
-    """Return S_hat in environment steps, shape (E, D), for scores with a known maximum of 1.
+def sample_complexity(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray:
+    """Return S_hat in environment steps, shape (E, D).
 
     Parameters
     ----------
     curves:
-        Shape (N, T), scores in [0, 1].
-    epsilons:
-        E tolerances in [0, 1): the threshold is 1 - epsilon, computed in decimal.
-    deltas:
-        D probabilities in (0, 1], compared as counts: 0.7 of 100 runs means 70.
+        Shape (N, T): scores in [0, 1] where the grid is relative to a known maximum, else any numbers, infinities
+        included.
+    grid:
+        The E x D cells: `Grid.relative(epsilons, deltas)` or `Grid.absolute(thresholds, deltas)`.
     steps_per_epoch:
         Environment steps per epoch.
 
     Raises
     ------
     OptionError
-        If an argument is out of its range or the curves are empty, of the wrong shape or not numbers.
+        If the curves are empty, of the wrong shape, not numbers or outside [0, 1], or the steps are not positive.
+
+    >>> import numpy as np
+    >>> sample_complexity(np.array([[0.5, 0.9, 0.9]]), Grid.relative([0.2], [1.0]), 1000).tolist()
+    [[1000]]
     """
-    values = checked(curves, relative=True)
     steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
-    return complexity(values, Grid.relative(epsilons, deltas), steps)
-
-
-def sample_complexity_at(
-    curves: ArrayLike,
-    thresholds: ArrayLike | Sequence[Any],
-    deltas: ArrayLike | Sequence[Any],
-    steps_per_epoch: int,
-) -> IntArray:
-    """Return S_hat in environment steps, shape (E, D), at thresholds V* given directly (the general case).
-
-    The curves, shape (N, T), may hold any numbers, infinities included; otherwise as `sample_complexity`.
-
-    Raises
-    ------
-    OptionError
-        If a threshold is not finite; otherwise as `sample_complexity`.
-    """
-    values = checked(curves)
-    steps = whole(steps_per_epoch, "steps_per_epoch", at_least=1)
-    return complexity(values, Grid.absolute(thresholds, deltas), steps)
+    return complexity(checked(curves, relative=grid.is_relative), grid, steps)
 
 
 def complexity(curves: Curve, grid: Grid, steps_per_epoch: int) -> IntArray:
@@ -83,25 +57,13 @@ def epochs_below(curves: Curve, grid: Grid) -> IntArray:
     return epochs
 
 
-def unsettled(
-    curves: ArrayLike, epsilons: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]
-) -> BoolArray:
+def unsettled(curves: ArrayLike, grid: Grid) -> BoolArray:
     """Return, shape (E, D), where P_hat < delta at the last epoch: there S_hat is only a lower bound.
 
     Parameters and errors as in `sample_complexity`.
     """
-    return _below_at_end(checked(curves, relative=True), Grid.relative(epsilons, deltas))
-
-
-def unsettled_at(
-    curves: ArrayLike, thresholds: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]
-) -> BoolArray:
-    """Return, shape (E, D), where P_hat < delta at the last epoch, at thresholds given directly."""
-    return _below_at_end(checked(curves), Grid.absolute(thresholds, deltas))
-
-
-def _below_at_end(curves: Curve, grid: Grid) -> BoolArray:
-    return epochs_below(curves[:, -1:], grid) > 0
+    values = checked(curves, relative=grid.is_relative)
+    return epochs_below(values[:, -1:], grid) > 0
 
 
 def at_cap(intervals: ArrayLike, horizon: int) -> BoolArray:

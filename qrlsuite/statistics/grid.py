@@ -130,6 +130,21 @@ class Grid:
         return cls(levels, _probabilities(deltas))
 
     @property
+    def is_relative(self) -> bool:
+        """Whether thresholds are 1 - epsilon, and scores therefore in [0, 1]."""
+        return self.epsilons is not None
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """The E epsilons of a relative grid, the E thresholds of an absolute one: how its rows are called."""
+        return self.thresholds if self.epsilons is None else self.epsilons
+
+    @property
+    def level_name(self) -> str:
+        """`epsilon` or `threshold`: what `levels` are."""
+        return "threshold" if self.epsilons is None else "epsilon"
+
+    @property
     def shape(self) -> tuple[int, int]:
         """(E, D)."""
         return len(self.thresholds), len(self.deltas)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.group import ACTIONS, ROUNDS, E, Group, array, differs
+from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, array, differs
 
 S = 5
 
@@ -53,7 +53,7 @@ def check(subject: Subject) -> list[Finding]:
 
 
 def _builds(subject: Subject) -> None:
-    made = Group(subject, range(S))
+    made = ToyGroup(subject, range(S))
     require(
         ACTIONS in made.outputs,
         f"build_model was called with {made.outputs} outputs, and there are {ACTIONS} actions: take "
@@ -62,7 +62,7 @@ def _builds(subject: Subject) -> None:
 
 
 def _trains(subject: Subject) -> None:
-    metrics = Group(subject, range(S)).start().train()
+    metrics = ToyGroup(subject, range(S)).start().train()
     require(
         isinstance(metrics, dict), f"train_epoch returned {type(metrics).__name__}, not a dict of metrics"
     )
@@ -76,7 +76,7 @@ def _trains(subject: Subject) -> None:
 
 
 def _interactions(subject: Subject) -> None:
-    made = Group(subject, range(S)).start()
+    made = ToyGroup(subject, range(S)).start()
     for epoch in (1, 2):
         made.train()
         require(
@@ -87,7 +87,7 @@ def _interactions(subject: Subject) -> None:
 
 
 def _acts(subject: Subject) -> None:
-    made = Group(subject, range(S)).start()
+    made = ToyGroup(subject, range(S)).start()
     made.train()
     before = made.save()
     first, second = made.act(), made.act()
@@ -110,7 +110,7 @@ def _acts(subject: Subject) -> None:
     )
     name = differs(before, made.save())
     require(name is None, f"act changes the state '{name}': validation must leave no trace in training")
-    never = Group(subject, range(S)).start()
+    never = ToyGroup(subject, range(S)).start()
     never.train(2)
     made.train()
     name = differs(never.save(), made.save())
@@ -122,7 +122,7 @@ def _acts(subject: Subject) -> None:
 
 
 def _learns(subject: Subject) -> None:
-    made = Group(subject, range(S)).start()
+    made = ToyGroup(subject, range(S)).start()
     before = {k: v.detach().clone() for k, v in made.algorithm.policy_state().items()}
     require(bool(before), "policy_state() is empty: it is what is published as the trained agents")
     for name, value in before.items():
@@ -138,7 +138,7 @@ def _learns(subject: Subject) -> None:
             f"after three epochs, {3 * ROUNDS * E} interactions, the policy of seed {s} is as it was: is the optimizer "
             "stepped, is policy_state() the network that act uses, and does learning begin so late by default?",
         )
-    other = Group(subject, range(S), lanes=1)
+    other = ToyGroup(subject, range(S), lanes=1)
     with torch.no_grad():
         for name, value in other.algorithm.policy_state().items():
             value.copy_(after[name])
@@ -156,7 +156,7 @@ def _trained(subject: Subject, seeds: Sequence[int], noise: int = 0) -> dict[str
         state = np.random.get_state()  # noqa: NPY002
         np.random.seed(noise)  # noqa: NPY002
         try:
-            made = Group(subject, seeds).start()
+            made = ToyGroup(subject, seeds).start()
             metrics = made.train(2)
             return {
                 **made.save(),
@@ -177,7 +177,7 @@ def _same(subject: Subject) -> None:
 
 
 def _different(subject: Subject) -> None:
-    made = Group(subject, [0, 1]).start()
+    made = ToyGroup(subject, [0, 1]).start()
     made.train(2)
     policy = made.algorithm.policy_state()
     require(
@@ -187,7 +187,7 @@ def _different(subject: Subject) -> None:
 
 
 def _seed_first(subject: Subject) -> None:
-    made = Group(subject, range(S)).start()
+    made = ToyGroup(subject, range(S)).start()
     made.train()
     state = made.algorithm.state_dict()
     require(bool(state), "state_dict() is empty: what training depends on is lost when a run is resumed")
@@ -213,13 +213,13 @@ def _independence(subject: Subject) -> None:
 
 
 def _state(subject: Subject) -> None:
-    straight = Group(subject, range(S)).start()
+    straight = ToyGroup(subject, range(S)).start()
     straight.train(2)
     saved = straight.save()
     metrics = straight.train(2)
     expected = {**straight.save(), **{f"metric {k}": v for k, v in metrics.items()}}
     for members in (list(range(S)), [3], [4, 1]):
-        other = Group(subject, members).load({key: value[members] for key, value in saved.items()})
+        other = ToyGroup(subject, members).load({key: value[members] for key, value in saved.items()})
         metrics = other.train(2)
         got = {**other.save(), **{f"metric {k}": v for k, v in metrics.items()}}
         name = differs(got, {key: value[members] for key, value in expected.items()})

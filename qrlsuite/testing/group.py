@@ -103,7 +103,7 @@ class _Linear(nn.Module):
         return population.linear(x, self.weight, self.bias)
 
 
-class Group:
+class ToyGroup:
     """An algorithm with a group of seeds, as the core runs it."""
 
     def __init__(self, subject: Subject, seeds: Sequence[int], lanes: int = E) -> None:
@@ -122,7 +122,7 @@ class Group:
         self.outputs.append(out_dim)
         return _Linear(out_dim, [s.torch("init", call) for s in self.streams])
 
-    def start(self) -> Group:
+    def start(self) -> ToyGroup:
         """Begin."""
         self.algorithm.start()
         return self
@@ -148,7 +148,7 @@ class Group:
         saved["streams"] = pack(self.envs.streams).reshape(size, E, -1)
         return saved
 
-    def load(self, saved: Mapping[str, NDArray[Any]]) -> Group:
+    def load(self, saved: Mapping[str, NDArray[Any]]) -> ToyGroup:
         """Restore what `save` returned, or slices of it."""
         lanes = len(self.seeds) * E
         self.envs.load_state_dict({"kept": saved["environment"].reshape(lanes, -1)})

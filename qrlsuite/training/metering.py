@@ -14,7 +14,7 @@ from qrlsuite.experiment.task import ScoreSection
 
 
 class MeteredEnv(LaneEnv):
-    """A lane environment seen through: it behaves as the one inside, and is counted.
+    """Wraps a LaneEnv: passes everything through, and counts episodes, returns and scores.
 
     Attributes
     ----------

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.statistics import sample_complexity, sample_complexity_at, unsettled, unsettled_at
-from qrlsuite.statistics.grid import BoolArray, IntArray
+from qrlsuite.statistics import sample_complexity, unsettled
 
 Objective = Literal["cell", "area"]
 
@@ -70,30 +69,16 @@ def merit(
     OptionError
         If the curves cannot be read as scores.
     """
-    cell, grid = ranking.reference, ranking.epsilons or ranking.thresholds or []
-    level = cell.epsilon if cell.epsilon is not None else cell.threshold
-    at_cell, open_end = _measure(curves, [level], [cell.delta], steps_per_epoch, ranking)
-    everywhere, _ = _measure(curves, grid, ranking.deltas, steps_per_epoch, ranking)
+    at_cell = sample_complexity(curves, ranking.reference_grid, steps_per_epoch)
+    everywhere = sample_complexity(curves, ranking.grid, steps_per_epoch)
     return Merit(
         objective=objective,
         cell=int(at_cell[0, 0]),
         area=float(everywhere.mean()),
-        unsettled=bool(open_end[0, 0]),
+        unsettled=bool(unsettled(curves, ranking.reference_grid)[0, 0]),
         score=float(curves.mean()),
         quantum=float(steps_per_epoch) / (1 if objective == "cell" else everywhere.size),
     )
-
-
-def _measure(
-    curves: NDArray[np.float64],
-    levels: list[float] | list[float | None],
-    deltas: list[float],
-    steps: int,
-    ranking: RankingSection,
-) -> tuple[IntArray, BoolArray]:
-    if ranking.epsilons is not None:
-        return sample_complexity(curves, levels, deltas, steps), unsettled(curves, levels, deltas)
-    return sample_complexity_at(curves, levels, deltas, steps), unsettled_at(curves, levels, deltas)
 
 
 def cell_text(ranking: RankingSection, objective: Objective) -> str:
@@ -102,5 +87,4 @@ def cell_text(ranking: RankingSection, objective: Objective) -> str:
     level = f"epsilon {cell.epsilon:g}" if cell.epsilon is not None else f"return {cell.threshold:g}"
     if objective == "cell":
         return f"S_hat at {level}, delta {cell.delta:g}"
-    count = len(ranking.epsilons or ranking.thresholds or []) * len(ranking.deltas)
-    return f"mean of S_hat over the {count} cells of the ranking grid"
+    return f"mean of S_hat over the {ranking.grid.size} cells of the ranking grid"

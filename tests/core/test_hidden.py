@@ -19,7 +19,7 @@ from qrlsuite import registry
 from qrlsuite.errors import PluginError
 from qrlsuite.registry import Registered
 from qrlsuite.results.checkpoint import group_id
-from qrlsuite.results.seeds import ProgressFile
+from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import ModelSpec
 from qrlsuite.testing import model as rules

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -313,15 +313,3 @@ def test_bad_grid_files(tmp_path: Path) -> None:
         path.write_text(content)
         with pytest.raises(TaskError, match=r"g\.toml"):
             space.load(str(path))
-
-
-def test_pace_is_measured_on_runs_that_are_alike(
-    tiny_task: str, tmp_path: Path, train: Callable[..., Path]
-) -> None:
-    entry = resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
-    assert search.pace([tmp_path / "nothing"], entry) is None
-    train("runs", [0], 1)
-    seconds = search.pace([tmp_path / "nothing", tmp_path / "runs"], entry)
-    assert seconds is not None
-    assert seconds > 0
-    assert search.pace([tmp_path / "runs"], resolve(tiny_task, "vqc-native")) is None

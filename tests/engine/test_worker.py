@@ -1,4 +1,4 @@
-"""The heart of a worker: it ends its process when the claim is lost, and only then."""
+"""A worker's heartbeat ends its process when the claim is lost, and only then."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def test_a_claim_that_was_given_back_is_not_lost(
     released: bool, killed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     claim = claims.acquire(EntryStore(tmp_path), [0])
-    heart = worker.Heart(claim, None)
+    heartbeat = worker.ClaimHeartbeat(claim, None)
 
     def refresh(self: claims.Claim) -> bool:
         """The training ends between two lines of a refresh; or another worker takes over."""
         if released:
-            heart.stopped.set()
+            heartbeat.stopped.set()
         claim.path.unlink()
         return False
 
     monkeypatch.setattr(claims.Claim, "refresh", refresh)
-    heart.start()
-    heart.join(10)
-    assert not heart.is_alive()
+    heartbeat.start()
+    heartbeat.join(10)
+    assert not heartbeat.is_alive()
     assert killed == ([] if released else [signal.SIGTERM])

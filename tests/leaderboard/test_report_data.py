@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli import app
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.board import grid_of, learning_curves
+from qrlsuite.leaderboard.board import learning_curves
 from qrlsuite.leaderboard.report import encode, entries, ladder, render, words
 from qrlsuite.leaderboard.report.judge import judge
 from qrlsuite.statistics import Outcome, Verdict, compare
@@ -38,7 +38,7 @@ def test_pairs_are_those_of_the_statistics() -> None:
         boards.entry("few", 8),
     ]
     found = judge(members, 200_000)
-    grid = grid_of(members[0].task_file.ranking)
+    grid = members[0].task_file.ranking.grid
     for pair in found.pairs:
         one, other = (learning_curves(members[place]) for place in (pair.first, pair.second))
         wanted = compare(one, other, grid, horizon=200_000)

@@ -11,9 +11,7 @@ from qrlsuite.statistics import (
     Grid,
     LearningCurves,
     bootstrap_draws,
-    bootstrap_draws_at,
     bootstrap_interval,
-    bootstrap_interval_at,
     sample_complexity,
 )
 from qrlsuite.statistics.bootstrap import weighted_epochs
@@ -52,17 +50,19 @@ def test_blocks_of_resamples_are_joined_in_order() -> None:
 
 def test_one_run_has_no_spread() -> None:
     curves = [[0.1, 0.9, 0.5, 0.95]]
-    assert bootstrap_interval(curves, [0.1], [0.5], 10, n_resamples=50).tolist() == [[[20, 20]]]
+    assert bootstrap_interval(curves, Grid.relative([0.1], [0.5]), 10, n_resamples=50).tolist() == [
+        [[20, 20]]
+    ]
 
 
 def test_all_censored_is_the_horizon_and_all_there_is_zero() -> None:
-    assert bootstrap_interval(np.zeros((5, 4)), [0.1], [0.5], 10).tolist() == [[[40, 40]]]
-    assert bootstrap_interval(np.ones((5, 4)), [0.1], [0.5], 10).tolist() == [[[0, 0]]]
+    assert bootstrap_interval(np.zeros((5, 4)), Grid.relative([0.1], [0.5]), 10).tolist() == [[[40, 40]]]
+    assert bootstrap_interval(np.ones((5, 4)), Grid.relative([0.1], [0.5]), 10).tolist() == [[[0, 0]]]
 
 
 def test_two_runs_of_which_one_learns_is_a_coin() -> None:
     # delta = 1: S_hat is 0 only where both draws are the good run, a quarter of the resamples
-    draws = bootstrap_draws([[1.0], [0.0]], [0.5], [1.0, 0.5], 1, n_resamples=40_000)
+    draws = bootstrap_draws([[1.0], [0.0]], Grid.relative([0.5], [1.0, 0.5]), 1, n_resamples=40_000)
     assert draws.shape == (40_000, 1, 2)
     assert draws[:, 0, 0].mean() == pytest.approx(0.75, abs=0.01)
     assert draws[:, 0, 1].mean() == pytest.approx(0.25, abs=0.01)
@@ -70,19 +70,19 @@ def test_two_runs_of_which_one_learns_is_a_coin() -> None:
 
 def test_fewer_runs_per_resample_are_fewer_runs() -> None:
     # one of four runs learns; a single drawn run is good with probability 1/4, and delta .5 means that run
-    draws = bootstrap_draws(np.eye(4)[:, :1], [0.5], [0.5], 1, n_resamples=40_000, n_runs=1)
+    draws = bootstrap_draws(np.eye(4)[:, :1], Grid.relative([0.5], [0.5]), 1, n_resamples=40_000, n_runs=1)
     assert draws.mean() == pytest.approx(0.75, abs=0.01)
 
 
 def test_whole_runs_are_drawn() -> None:
     # two kinds of runs, good at alternating epochs: any resample of one run has exactly half of its epochs
     curves = np.tile([[1.0, 0.0], [0.0, 1.0]], (5, 8))
-    draws = bootstrap_draws(curves, [0.5], [1.0], 1, n_runs=1)
+    draws = bootstrap_draws(curves, Grid.relative([0.5], [1.0]), 1, n_runs=1)
     assert (draws == 8).all()
 
 
 def test_the_interval_is_widened_to_the_estimate(wide: LearningCurves) -> None:
-    arguments = (wide.values, EPSILONS, DELTAS, wide.steps_per_epoch)
+    arguments = (wide.values, Grid.relative(EPSILONS, DELTAS), wide.steps_per_epoch)
     estimate = sample_complexity(*arguments)
     narrow = bootstrap_interval(*arguments, percentiles=(49.9, 50.1))
     draws = np.percentile(bootstrap_draws(*arguments), [49.9, 50.1], axis=0)
@@ -92,7 +92,7 @@ def test_the_interval_is_widened_to_the_estimate(wide: LearningCurves) -> None:
 
 
 def test_at_fewer_runs_the_interval_is_not_widened_to_the_full_estimate(narrow: LearningCurves) -> None:
-    arguments = (narrow.values, EPSILONS, DELTAS, narrow.steps_per_epoch)
+    arguments = (narrow.values, Grid.relative(EPSILONS, DELTAS), narrow.steps_per_epoch)
     interval = bootstrap_interval(*arguments, percentiles=(30, 70), n_runs=3)
     draws = bootstrap_draws(*arguments, n_runs=3)
     low, median, high = np.percentile(draws, [30, 50, 70], axis=0)
@@ -103,7 +103,7 @@ def test_at_fewer_runs_the_interval_is_not_widened_to_the_full_estimate(narrow: 
 
 
 def test_seeds_decide(wide: LearningCurves) -> None:
-    arguments = (wide.values, EPSILONS, DELTAS, wide.steps_per_epoch)
+    arguments = (wide.values, Grid.relative(EPSILONS, DELTAS), wide.steps_per_epoch)
     first, again, other = (bootstrap_draws(*arguments, n_resamples=100, seed=seed) for seed in (3, 3, 4))
     assert (first == again).all()
     assert (first != other).any()
@@ -114,12 +114,12 @@ def test_seeds_decide(wide: LearningCurves) -> None:
 
 def test_thresholds_give_what_epsilons_give(wide: LearningCurves) -> None:
     thresholds = [round(1 - epsilon, 2) for epsilon in EPSILONS]
-    relative = (wide.values, EPSILONS, DELTAS, 2000)
-    absolute = (wide.values, thresholds, DELTAS, 2000)
-    assert (bootstrap_interval(*relative) == bootstrap_interval_at(*absolute)).all()
-    assert (bootstrap_draws(*relative) == bootstrap_draws_at(*absolute)).all()
-    scaled = (wide.values * 8 - 4, [8 * value - 4 for value in thresholds], DELTAS, 2000)
-    assert (bootstrap_draws(*relative) == bootstrap_draws_at(*scaled)).all()
+    relative = (wide.values, Grid.relative(EPSILONS, DELTAS), 2000)
+    absolute = (wide.values, Grid.absolute(thresholds, DELTAS), 2000)
+    assert (bootstrap_interval(*relative) == bootstrap_interval(*absolute)).all()
+    assert (bootstrap_draws(*relative) == bootstrap_draws(*absolute)).all()
+    scaled = (wide.values * 8 - 4, Grid.absolute([8 * value - 4 for value in thresholds], DELTAS), 2000)
+    assert (bootstrap_draws(*relative) == bootstrap_draws(*scaled)).all()
 
 
 @settings(deadline=None, max_examples=50)
@@ -128,7 +128,7 @@ def test_intervals_are_ordered_contain_the_estimate_and_stay_in_range(
     n_runs: int, n_epochs: int, seed: int, n_resamples: int, lower: float
 ) -> None:
     curves = smooth_curves(n_runs, n_epochs, seed)
-    arguments = (curves, [0.1, 0.5, 0.9], [0.1, 0.5, 0.9], 7)
+    arguments = (curves, Grid.relative([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), 7)
     interval = bootstrap_interval(*arguments, n_resamples, (lower, 100 - lower / 2), seed)
     estimate = sample_complexity(*arguments)
     assert (interval[..., 0] <= estimate).all()

@@ -50,7 +50,8 @@ def test_their_own_intervals_would_make_a_winner_of_the_smaller_entry_often(inde
     found = 0
     for _ in range(50):
         small, large = (
-            bootstrap_interval(model.draw(n, generator).values, EPSILONS, DELTAS, 2000, 300) for n in (10, 40)
+            bootstrap_interval(model.draw(n, generator).values, Grid.relative(EPSILONS, DELTAS), 2000, 300)
+            for n in (10, 40)
         )
         fewer, more = small[..., 1] < large[..., 0], small[..., 0] > large[..., 1]
         found += fewer.any() != more.any()

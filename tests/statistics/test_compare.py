@@ -153,7 +153,7 @@ def test_golden_wide_outperforms_narrow(wide: LearningCurves, narrow: LearningCu
     result = compare(wide, narrow, SURFACE)
     assert result.outcome is Outcome.OUTPERFORMS
     for side, entry in enumerate((wide, narrow)):
-        arguments = (entry.values, EPSILONS, DELTAS, entry.steps_per_epoch)
+        arguments = (entry.values, SURFACE, entry.steps_per_epoch)
         assert (result.points[side] == sample_complexity(*arguments)).all()
         assert (result.intervals[side] == bootstrap_interval(*arguments)).all()
     won = np.array(result.verdicts) == Verdict.WIN
@@ -166,10 +166,12 @@ def test_the_larger_entry_is_judged_by_draws_of_the_smaller_number(
     small = LearningCurves(narrow.values[:22], 2000, "small")
     result = compare(wide, small, SURFACE)
     assert result.n_runs == 22
-    expected = bootstrap_interval(wide.values, EPSILONS, DELTAS, 2000, n_runs=22)
+    expected = bootstrap_interval(wide.values, Grid.relative(EPSILONS, DELTAS), 2000, n_runs=22)
     assert (result.intervals[0] == expected).all()
-    assert (result.intervals[1] == bootstrap_interval(small.values, EPSILONS, DELTAS, 2000)).all()
-    assert (result.points[1] == sample_complexity(small.values, EPSILONS, DELTAS, 2000)).all()
+    assert (
+        result.intervals[1] == bootstrap_interval(small.values, Grid.relative(EPSILONS, DELTAS), 2000)
+    ).all()
+    assert (result.points[1] == sample_complexity(small.values, Grid.relative(EPSILONS, DELTAS), 2000)).all()
 
 
 def test_pairs_are_cut_to_the_shorter_horizon() -> None:

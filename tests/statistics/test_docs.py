@@ -27,7 +27,7 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "sample_complexity_at",
+        "sample_complexity",
         "SignificanceRule",
         "split_halves",
         "false_winners",

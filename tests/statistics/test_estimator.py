@@ -16,30 +16,28 @@ from qrlsuite.statistics import (
     at_cap,
     printed,
     sample_complexity,
-    sample_complexity_at,
     unsettled,
-    unsettled_at,
 )
 
 
 def test_one_run_counts_its_epochs_below_the_threshold() -> None:
     curve = [[0.1, 0.9, 0.5, 0.95]]
-    assert sample_complexity(curve, [0.1], [0.5], 10).tolist() == [[20]]
+    assert sample_complexity(curve, Grid.relative([0.1], [0.5]), 10).tolist() == [[20]]
 
 
 def test_every_epoch_counts_also_after_the_first_crossing() -> None:
-    assert sample_complexity([[0.0, 1.0, 0.0, 0.0, 1.0]], [0.5], [1.0], 1).tolist() == [[3]]
+    assert sample_complexity([[0.0, 1.0, 0.0, 0.0, 1.0]], Grid.relative([0.5], [1.0]), 1).tolist() == [[3]]
 
 
 def test_a_run_that_touches_the_threshold_has_reached_it() -> None:
     # 1 - 0.85 is 0.15000000000000002 in floating point
-    assert sample_complexity([[0.15]], [0.85], [1.0], 1).tolist() == [[0]]
-    assert sample_complexity([[np.nextafter(0.15, 0)]], [0.85], [1.0], 1).tolist() == [[1]]
+    assert sample_complexity([[0.15]], Grid.relative([0.85], [1.0]), 1).tolist() == [[0]]
+    assert sample_complexity([[np.nextafter(0.15, 0)]], Grid.relative([0.85], [1.0]), 1).tolist() == [[1]]
 
 
 def test_thresholds_are_read_in_the_precision_of_the_curves() -> None:
     assert float(np.float32(0.7)) < 0.7
-    assert sample_complexity(np.array([[0.7]], np.float32), [0.3], [1.0], 1).tolist() == [[0]]
+    assert sample_complexity(np.array([[0.7]], np.float32), Grid.relative([0.3], [1.0]), 1).tolist() == [[0]]
 
 
 @pytest.mark.parametrize("delta", [0.7, "0.7", Decimal("0.7"), np.float32(0.7), np.arange(0.1, 1, 0.1)[6]])
@@ -47,7 +45,7 @@ def test_seventy_of_a_hundred_runs_are_enough_for_delta_seven_tenths(delta: obje
     curves = np.zeros((100, 2))
     curves[:70, 0] = 1.0
     curves[:69, 1] = 1.0
-    assert sample_complexity(curves, [0.1], [delta], 1000).tolist() == [[1000]]
+    assert sample_complexity(curves, Grid.relative([0.1], [delta]), 1000).tolist() == [[1000]]
 
 
 @pytest.mark.parametrize("delta", [Fraction(k, 20) for k in range(1, 21)])
@@ -65,20 +63,23 @@ def test_noise_of_a_computed_grid_does_not_ask_for_one_run_more() -> None:
 
 def test_never_reached_is_the_horizon_and_unsettled() -> None:
     curves = np.zeros((4, 5))
-    assert sample_complexity(curves, [0.1, 0.2], [0.5], 7).tolist() == [[35], [35]]
-    assert unsettled(curves, [0.1, 0.2], [0.5]).tolist() == [[True], [True]]
+    assert sample_complexity(curves, Grid.relative([0.1, 0.2], [0.5]), 7).tolist() == [
+        [35],
+        [35],
+    ]
+    assert unsettled(curves, Grid.relative([0.1, 0.2], [0.5])).tolist() == [[True], [True]]
 
 
 def test_always_reached_is_zero_and_settled() -> None:
     curves = np.ones((4, 5))
-    assert sample_complexity(curves, [0.0], [1.0], 7).tolist() == [[0]]
-    assert unsettled(curves, [0.0], [1.0]).tolist() == [[False]]
+    assert sample_complexity(curves, Grid.relative([0.0], [1.0]), 7).tolist() == [[0]]
+    assert unsettled(curves, Grid.relative([0.0], [1.0])).tolist() == [[False]]
 
 
 def test_unsettled_looks_at_the_last_epoch_only() -> None:
     curves = [[0, 1, 0], [0, 1, 1]]
-    assert unsettled(curves, [0.5], [0.5, 0.6]).tolist() == [[False, True]]
-    assert unsettled_at(curves, [1], [0.5, 0.6]).tolist() == [[False, True]]
+    assert unsettled(curves, Grid.relative([0.5], [0.5, 0.6])).tolist() == [[False, True]]
+    assert unsettled(curves, Grid.absolute([1], [0.5, 0.6])).tolist() == [[False, True]]
 
 
 def test_at_cap_looks_at_the_upper_percentile() -> None:
@@ -93,7 +94,10 @@ def test_a_lower_bound_is_printed_as_one() -> None:
 
 def test_thresholds_may_be_any_number_and_curves_too() -> None:
     curves = [[-500.0, -110.0, -np.inf], [np.inf, -90.0, -110.0]]
-    assert sample_complexity_at(curves, [-110, 0], [0.5, 1], 10).tolist() == [[0, 20], [20, 30]]
+    assert sample_complexity(curves, Grid.absolute([-110, 0], [0.5, 1]), 10).tolist() == [
+        [0, 20],
+        [20, 30],
+    ]
 
 
 unit = st.floats(0, 1, width=32)
@@ -120,7 +124,9 @@ def test_s_hat_is_the_sum_of_the_definition(
         ]
         for e in epsilons
     ]
-    found = sample_complexity(curves, [e / 100 for e in epsilons], [d / 100 for d in deltas], steps)
+    found = sample_complexity(
+        curves, Grid.relative([e / 100 for e in epsilons], [d / 100 for d in deltas]), steps
+    )
     assert found.dtype == np.int64
     assert found.tolist() == expected
 
@@ -129,7 +135,9 @@ def test_s_hat_is_the_sum_of_the_definition(
 def test_s_hat_falls_with_epsilon_and_rises_with_delta(
     curves: np.ndarray, epsilons: list[int], deltas: list[int]
 ) -> None:
-    found = sample_complexity(curves, [e / 100 for e in epsilons], [d / 100 for d in deltas], 1)
+    found = sample_complexity(
+        curves, Grid.relative([e / 100 for e in epsilons], [d / 100 for d in deltas]), 1
+    )
     assert (np.diff(found, axis=0) <= 0).all()
     assert (np.diff(found, axis=1) >= 0).all()
 
@@ -138,6 +146,6 @@ def test_s_hat_falls_with_epsilon_and_rises_with_delta(
 def test_s_hat_does_not_depend_on_the_order_of_runs_or_epochs(
     curves: np.ndarray, epsilons: list[int], deltas: list[int]
 ) -> None:
-    grid = ([e / 100 for e in epsilons], [d / 100 for d in deltas], 1)
+    grid = (Grid.relative([e / 100 for e in epsilons], [d / 100 for d in deltas]), 1)
     assert (sample_complexity(curves, *grid) == sample_complexity(curves[::-1, ::-1], *grid)).all()
     assert (sample_complexity(curves, *grid) == sample_complexity(np.repeat(curves, 3, axis=0), *grid)).all()

@@ -18,7 +18,6 @@ from qrlsuite.statistics import (
     bootstrap_draws,
     bootstrap_interval,
     sample_complexity,
-    sample_complexity_at,
 )
 
 GOOD = np.full((4, 3), 0.5)
@@ -54,15 +53,16 @@ GOOD = np.full((4, 3), 0.5)
 def test_bad_arguments_are_named(
     function: Callable[..., Any], arguments: tuple[Any, ...], message: str
 ) -> None:
+    curves, epsilons, deltas, steps = arguments
     with pytest.raises(OptionError, match=message):
-        function(*arguments)
+        function(curves, Grid.relative(epsilons, deltas), steps)
 
 
 def test_the_general_case_refuses_only_what_is_not_a_number() -> None:
     with pytest.raises(OptionError, match="NaN"):
-        sample_complexity_at([[np.nan]], [1], [0.5], 1)
+        sample_complexity([[np.nan]], Grid.absolute([1], [0.5]), 1)
     with pytest.raises(OptionError, match=r"thresholds\[1\] = inf is not finite"):
-        sample_complexity_at([[5.0]], [1, np.inf], [0.5], 1)
+        sample_complexity([[5.0]], Grid.absolute([1, np.inf], [0.5]), 1)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_the_general_case_refuses_only_what_is_not_a_number() -> None:
 )
 def test_bad_bootstrap_options_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        bootstrap_interval(GOOD, [0.1], [0.5], 1, **options)
+        bootstrap_interval(GOOD, Grid.relative([0.1], [0.5]), 1, **options)
 
 
 def test_entries_rules_and_resampling_check_themselves() -> None:
