@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qrlsuite.cli.commands.calibrate import tables
 from qrlsuite.leaderboard import calibration
+from qrlsuite.leaderboard.findings import tables
 from qrlsuite.statistics import (
     DifferenceRule,
     Grid,

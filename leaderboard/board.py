@@ -7,15 +7,19 @@ a provisional section of their own length.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
+from qrlsuite.leaderboard import tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
     Board,
@@ -41,6 +45,13 @@ class Complexity:
     high: int
     at_cap: bool
     unsettled: bool
+
+    @property
+    def text(self) -> str:
+        """Steps with interval and marks: `>= 64k (52k to 200k, at cap)`."""
+        sign = ">= " if self.unsettled else ""
+        mark = ", at cap" if self.at_cap else ""
+        return f"{sign}{steps_text(self.steps)} ({steps_text(self.low)} to {steps_text(self.high)}{mark})"
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,11 @@ class Row:
         """What orders entries on the board: the tier, then those that reached no goal; 0 where undecided."""
         return float("inf") if self.not_reached else float(self.tier or 0)
 
+    @property
+    def reason(self) -> str:
+        """Why the entry has no tier; empty where it has one."""
+        return "" if self.tier is not None else untiered_reason(self)
+
 
 @dataclass(frozen=True)
 class Section:
@@ -120,7 +136,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """All sections, and what was refused and why."""
+    """All sections, and what was refused and why. In a notebook, and printed by rich, it is a table per section."""
 
     sections: tuple[Section, ...]
     refused: tuple[str, ...]
@@ -128,6 +144,54 @@ class Leaderboard:
     """Name of the significance rule that judged."""
     promise: str = ""
     """What that rule controls."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the board as plain values, for JSON."""
+        return as_dict(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for section in self.sections:
+            yield tables.section_table(section, options.max_width)
+        for line in self.refused:
+            yield Text(f"left out: {line}")
+
+    def _repr_html_(self) -> str:
+        return tables.board_html(self)
+
+
+@dataclass(frozen=True, eq=False)
+class EntryComparison(Comparison):
+    """The result of `compare_entries`. In a notebook, and printed by rich, it is a table of signs and a sentence.
+
+    Attributes
+    ----------
+    labels:
+        What the two entries are called.
+    remarks:
+        What may flatter one of them.
+    """
+
+    labels: tuple[str, str] = ("", "")
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """Who is compared with whom, and at how many seeds and steps."""
+        one, other = self.labels
+        rule = "" if self.rule == DEFAULT else f", rule '{self.rule}'"
+        return f"{one} against {other}, {self.n_runs} seeds each, {self.horizon} steps{rule}"
+
+    @property
+    def legend(self) -> str:
+        """What the signs in the table mean."""
+        return tables.legend(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield tables.comparison_table(self)
+        yield Text("\n".join([self.legend, f"{self.headline}:", self.sentence, *self.remarks]))
+
+    def _repr_html_(self) -> str:
+        return tables.comparison_html(self, self.headline, self.remarks)
 
 
 def learning_curves(entry: EntryCurves) -> LearningCurves:
@@ -301,7 +365,7 @@ def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
 
 def compare_entries(
     first: EntryCurves, second: EntryCurves, rule: SignificanceRule | None = None
-) -> Comparison:
+) -> EntryComparison:
     """Compare two entries of one task on its ranking grid.
 
     Parameters
@@ -327,7 +391,15 @@ def compare_entries(
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
-    return compare(learning_curves(first), learning_curves(second), ranking_of([first, second]).grid, rule)
+    grid = ranking_of([first, second]).grid
+    found = compare(learning_curves(first), learning_curves(second), grid, rule)
+    values = {field.name: getattr(found, field.name) for field in fields(found)}
+    remarks = [
+        f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
+        for entry in (first, second)
+        if entry.on_protocol_seeds
+    ]
+    return EntryComparison(**values, labels=(first.label, second.label), remarks=tuple(remarks))
 
 
 def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:
@@ -349,19 +421,6 @@ def untiered_reason(row: Row) -> str:
     if len(row.entry.seeds) < MIN_RUNS:
         return f"undecided: fewer than {MIN_RUNS} seeds"
     return "undecided: nothing to compare with"
-
-
-def steps_text(steps: int) -> str:
-    """Write steps in thousands where that is exact: 44000 as 44k."""
-    return f"{steps // 1000}k" if steps % 1000 == 0 else str(steps)
-
-
-def complexity_text(complexity: Complexity) -> str:
-    """Write a sample complexity with interval and marks: `>= 64k (52k to 200k, at cap)`."""
-    sign = ">= " if complexity.unsettled else ""
-    mark = ", at cap" if complexity.at_cap else ""
-    low, high = steps_text(complexity.low), steps_text(complexity.high)
-    return f"{sign}{steps_text(complexity.steps)} ({low} to {high}{mark})"
 
 
 def as_dict(board: Leaderboard) -> dict[str, Any]:

@@ -7,9 +7,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.board import learning_curves, ranking_of
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures.cells import choose_horizon
+from qrlsuite.results import lookup
 from qrlsuite.statistics import (
     Grid,
     LearningCurves,
@@ -116,6 +123,84 @@ class Job:
     def run(self, tick: Callable[[], object] | None = None) -> Finding:
         """Compute the line."""
         return self.measure(self.draws, tick)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What rules are calibrated on.
+
+    Attributes
+    ----------
+    curves:
+        The entries, cut to one horizon, by names that differ.
+    grid:
+        The task's ranking grid.
+    horizon:
+        Environment steps to which they are cut.
+    """
+
+    curves: tuple[LearningCurves, ...]
+    grid: Grid
+    horizon: int
+
+
+def choose(
+    runs: Path, names: Sequence[str] = (), task: str | None = None, published: bool = False
+) -> tuple[list[EntryCurves], list[str]]:
+    """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long.
+
+    Parameters
+    ----------
+    names:
+        The entries (see `qrlsuite.leaderboard.collect.find`); all of the task where empty.
+
+    Returns
+    -------
+    tuple
+        The entries, and one line for each that was left out and why.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such entry.
+    OptionError
+        If the entries belong to several tasks.
+    """
+    lookup.check_tasks(runs, task)
+    lines: list[str] = []
+    if names:
+        tasks = [task] if task else []
+        found = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
+    else:
+        found, refused = collect.collect(runs, task, shipped=published)
+        lines += refused
+    lines += [f"{entry.label}: a single seed has no spread" for entry in found if len(entry.seeds) < 2]
+    found = [entry for entry in found if len(entry.seeds) >= 2]
+    if not found:
+        wanted = f" of task {task}" if task else ""
+        raise UnknownNameError(f"{runs} holds no entry{wanted} with two seeds or more: qrlsuite run")
+    tasks = sorted({entry.task for entry in found})
+    if len({entry.task_hash for entry in found}) > 1:
+        raise OptionError(f"the entries belong to several tasks ({', '.join(tasks)}): choose one with --task")
+    longest = max(entry.curves.shape[1] for entry in found)
+    lines += [
+        f"{entry.label}: at epoch {entry.curves.shape[1]} of {longest}; repeat the `qrlsuite run` that made it"
+        for entry in found
+        if entry.curves.shape[1] < longest
+    ]
+    found = [entry for entry in found if entry.curves.shape[1] == longest]
+    return sorted(found, key=lambda entry: (entry.model, sum(entry.parameters), entry.label)), lines
+
+
+def prepare(entries: Sequence[EntryCurves]) -> Setup:
+    """Cut the entries of a task to one horizon, and name them without the algorithm where that tells them apart."""
+    horizon = choose_horizon(entries)
+    names = [entry.label.removeprefix(f"{entry.algorithm} ") for entry in entries]
+    if len(set(names)) < len(names):
+        names = [entry.name for entry in entries]
+    cut = (learning_curves(entry).cut(horizon) for entry in entries)
+    curves = tuple(replace(curve, name=name) for curve, name in zip(cut, names))
+    return Setup(curves, ranking_of(entries).grid, horizon)
 
 
 def plan(

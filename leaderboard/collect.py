@@ -60,7 +60,7 @@ def collect(
 def select(
     runs: Path,
     tasks: Collection[str] = (),
-    names: Iterable[str] = (),
+    names: Iterable[str | EntryCurves] = (),
     shipped: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
@@ -70,7 +70,7 @@ def select(
     Parameters
     ----------
     tasks, names:
-        The tasks and the entries (see `find`) to read; all where empty.
+        The tasks and the entries (see `find`) to read; all where empty. Entries that were read stand as they are.
     shipped:
         As for `collect`.
     horizon:
@@ -93,7 +93,9 @@ def select(
     named = {
         (copy.task_hash, copy.name): copy
         for name in names
-        for copy in _shown(_read_copies(runs, name, shipped, tasks))
+        for copy in (
+            [name] if isinstance(name, EntryCurves) else _shown(_read_copies(runs, name, shipped, tasks))
+        )
     }
     found, left_out = list(named.values()), list[str]()
     if not named:
@@ -281,6 +283,15 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         processors=origin.texts(provenance, "processor"),
         tuning=record["tuning"],
         executions=sum(run.executions for run in runs),
+        records={
+            run.seed: {
+                "epochs": len(run.scores),
+                "finished": run.finished,
+                "hours": run.seconds / 3600,
+                "executions": run.executions,
+            }
+            for run in runs
+        },
         runs=own if any(len(curve) != length for curve in own.values()) else {},
     )
 

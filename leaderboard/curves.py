@@ -5,11 +5,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow
 from numpy.typing import NDArray
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite import registry
 from qrlsuite.errors import QrlSuiteError, StoreError
@@ -19,7 +23,7 @@ from qrlsuite.experiment.task import load as load_task
 
 @dataclass(frozen=True)
 class EntryCurves:
-    """An entry with the learning curves of its complete runs.
+    """An entry with the learning curves of its complete runs. In a notebook, and printed by rich, it is a table.
 
     Attributes
     ----------
@@ -51,6 +55,9 @@ class EntryCurves:
         Whether the curves were read from a results folder or from a published entry.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
+    records:
+        By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
+        `executions` that it took.
     """
 
     name: str
@@ -77,6 +84,7 @@ class EntryCurves:
     source: Literal["runs", "published"] = "runs"
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     color: int | None = None
+    records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -92,6 +100,51 @@ class EntryCurves:
         """Return the first epochs of every run that has reached a number of them; None for none."""
         reached = self.reaching(epochs)
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
+
+    def to_table(self) -> pyarrow.Table:
+        """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.
+
+        Its columns are `task`, `entry` (the label), `seed`, `epoch` (from 1), `steps` (environment steps at the end
+        of the epoch) and `score` (mean validation score after it).
+        """
+        n_runs, epochs = self.curves.shape
+        epoch = np.tile(np.arange(1, epochs + 1), n_runs)
+        return pyarrow.table(
+            {
+                "task": pyarrow.repeat(self.task, n_runs * epochs),
+                "entry": pyarrow.repeat(self.label, n_runs * epochs),
+                "seed": np.repeat(np.array(self.seeds, dtype=np.int64), epochs),
+                "epoch": epoch,
+                "steps": epoch * self.steps_per_epoch,
+                "score": self.curves.ravel(),
+            }
+        )
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What a person asks of an entry first, in words."""
+        classical, quantum = self.parameters
+        n_runs, epochs = self.curves.shape
+        return {
+            "task": self.task,
+            "entry": f"{self.label} ({self.name})",
+            "parameters": f"{classical} + {quantum} quantum" if quantum else f"{classical}",
+            "seeds": f"{n_runs}" + (f", {len(self.left_out)} unfinished left out" if self.left_out else ""),
+            "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
+            "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
+            "core-hours": f"{self.hours:.2f}",
+            "read from": str(self.folder),
+        }
+
+    def __rich__(self) -> Table:
+        found = Table(show_header=False, box=None, pad_edge=False)
+        for name, text in self.facts.items():
+            found.add_row(Text(name), Text(text))
+        return found
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts.items())
+        return f"<table>{''.join(rows)}</table>"
 
     @property
     def legend(self) -> str:

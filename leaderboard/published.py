@@ -108,6 +108,15 @@ class Published:
             executions=int(self.executions.sum()),
             tuning=record["tuning"],
             source="published",
+            records={
+                seed: {
+                    "epochs": int(self.curves.shape[1]),
+                    "finished": True,
+                    "hours": float(hours),
+                    "executions": int(executions),
+                }
+                for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
+            },
         )
 
 

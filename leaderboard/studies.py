@@ -17,7 +17,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.collect import read_entry
 from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.studies.study import Member, PictureSection, Study
 
 Report = Callable[[str, int, int], None]
@@ -39,6 +39,8 @@ class Drawn:
         None where the picture cannot be drawn of what is there.
     problem:
         Then the reason.
+    path:
+        The picture's file, where it was written to one.
     """
 
     name: str
@@ -47,6 +49,18 @@ class Drawn:
     short: tuple[tuple[str, str, int], ...] = ()
     figure: Figure | None = None
     problem: str = ""
+    path: Path | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "picture": self.name,
+            "kind": self.kind,
+            "file": None if self.path is None else str(self.path),
+            "problem": self.problem or None,
+            "seeds": [{"task": task, "label": label, "seeds": count} for task, label, count in self.seeds],
+            "short": [{"task": task, "label": label, "epochs": count} for task, label, count in self.short],
+        }
 
 
 def check(study: Study) -> None:
@@ -141,6 +155,29 @@ def draw(
         else:
             drawn.append(_attempt(picture, entries, head, report))
     return drawn
+
+
+def write(study: Study, members: Sequence[Member], runs: Path, format_: str) -> list[Drawn]:
+    """Draw every picture of a study, and write those that can be drawn into the results folder.
+
+    Parameters
+    ----------
+    format_:
+        `png`, `pdf` or `svg`.
+
+    Raises
+    ------
+    StoreError
+        If an entry's folder is damaged, or a file cannot be written.
+    """
+    written = []
+    for drawn in draw(study, members, runs):
+        if drawn.figure is not None:
+            path = runs / f"study-{study.name}-{drawn.name}.{format_}"
+            write_atomically(path, pictures.encode(drawn.figure, format_))
+            drawn = dataclasses.replace(drawn, path=path)
+        written.append(drawn)
+    return written
 
 
 def _steps(entry: EntryCurves) -> int:

@@ -16,12 +16,27 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
+    from qrlsuite import api as api
+    from qrlsuite.api import board as board
+    from qrlsuite.api import compare as compare
+    from qrlsuite.api import evaluate as evaluate
+    from qrlsuite.api import load as load
+    from qrlsuite.api import plot as plot
+    from qrlsuite.api import run_study as run_study
+    from qrlsuite.api import train as train
+    from qrlsuite.api import tune as tune
     from qrlsuite.hookspecs import hookimpl as hookimpl
     from qrlsuite.registry import Registry
 
 __version__ = "0.1.0"
 
-__all__ = ["__version__", "hookimpl", "register_environments"]
+__all__ = [
+    "__version__", "api", "board", "compare", "evaluate", "hookimpl", "load", "plot", "register_environments",
+    "run_study", "train", "tune",
+]  # fmt: skip
+
+_FROM_API = frozenset({"board", "compare", "evaluate", "load", "plot", "run_study", "train", "tune"})
+"""Functions of `qrlsuite.api` that are attributes here too: no submodule may have one of these names."""
 
 # Python started in a checkout finds this folder before an installed package, and without the folders that an
 # installation maps below it (`qrlsuite.plugins` and others); there they lie beside it.
@@ -38,6 +53,11 @@ def __getattr__(name: str) -> object:
         from qrlsuite.hookspecs import hookimpl
 
         return hookimpl
+    if name == "api" or name in _FROM_API:
+        import importlib
+
+        api = importlib.import_module("qrlsuite.api")
+        return api if name == "api" else getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -300,6 +300,25 @@ def parse_setting(word: str) -> Setting:
     return Setting(side, name, value) if dot else Setting(None, side, value)
 
 
+def from_mapping(given: Mapping[str, Any] | None) -> list[Setting]:
+    """Return settings from a mapping: `{"qubits": 6, "algorithm.gamma": 0.9}`.
+
+    Raises
+    ------
+    OptionError
+        If a name is no text.
+    """
+    settings = []
+    for key, value in (given or {}).items():
+        if not isinstance(key, str) or not key.strip():
+            raise OptionError(
+                f"options {key!r}: write names, for example {{'qubits': 6, 'algorithm.gamma': 0.9}}"
+            )
+        side, dot, name = key.strip().partition(".")
+        settings.append(Setting(side if dot else None, name if dot else side, value, "option "))
+    return settings
+
+
 def parse_value(text: str) -> Any:
     """Read a value as TOML would (`6`, `0.5`, `.5`, `true`, `[1, 2]`, `"text"`), else as bare text."""
     for candidate in (text, f"0{text}" if text.startswith(".") else text):

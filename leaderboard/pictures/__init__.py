@@ -12,13 +12,14 @@ import io
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Literal
 
 from qrlsuite.errors import UnknownNameError, nearest
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.specs import resolve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)

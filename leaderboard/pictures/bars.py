@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 
 WIDEST = 12.0
 """Inches; on a page, what is written in a wider picture could not be read."""
@@ -109,7 +110,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     axes.set_ylabel("Ŝ (environment steps)")
     axes.set_ylim(0, horizon * 1.06)
     axes.set_xlim(float(centers.min()) - 0.6, float(centers.max()) + 0.6)
-    axes.yaxis.set_major_formatter(style.thousands)
+    axes.yaxis.set_major_formatter(steps_text)
     style.tidy(axes)
     axes.grid(axis="x", visible=False)
     title = f"{style.heading(entries)}: sample complexity Ŝ, whiskers 5th to 95th percentile"

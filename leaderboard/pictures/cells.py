@@ -9,6 +9,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import style
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 from qrlsuite.statistics.grid import BoolArray, FloatArray
 
@@ -126,4 +127,4 @@ def cut_note(entries: Sequence[EntryCurves], horizon: int) -> str:
     lengths = {entry.label: int(entry.curves.shape[1]) * entry.steps_per_epoch for entry in entries}
     short = min(lengths, key=lambda label: lengths[label])
     why = f", the length of {style.plain(short)}" if len(set(lengths.values())) > 1 else ""
-    return f"all cut to {style.thousands(horizon)} steps{why}"
+    return f"all cut to {steps_text(horizon)} steps{why}"

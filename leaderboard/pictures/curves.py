@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 
 MANY = 5
 """Of more entries the percentiles would hide each other, and the legend the curves."""
@@ -56,7 +57,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     relative = style.relative(entries)
     axes.set_xlabel("environment steps")
     axes.set_ylabel("validation score (received / optimal)" if relative else "validation score")
-    axes.xaxis.set_major_formatter(style.thousands)
+    axes.xaxis.set_major_formatter(steps_text)
     axes.set_xlim(left=0)
     if relative:
         axes.set_ylim(0, 1)

@@ -21,6 +21,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Grid
 from qrlsuite.statistics.estimator import complexity
 
@@ -200,12 +201,10 @@ def _learning(
         at = np.arange(1, shown.shape[1] + 1) * entry.steps_per_epoch
         mean, spread = shown.mean(axis=0), shown.std(axis=0)
         axes.fill_between(at, mean - spread, mean + spread, color=look.color, alpha=0.15, lw=0)
-        axes.plot(
-            at, mean, color=look.color, ls=look.line, lw=1.5, label=f"{name}: Ŝ = {style.thousands(steps)}"
-        )
+        axes.plot(at, mean, color=look.color, ls=look.line, lw=1.5, label=f"{name}: Ŝ = {steps_text(steps)}")
     axes.axhline(grid.thresholds[0], color="#505050", lw=0.9, ls=":")
     axes.set_title(title, fontsize=8.5, loc="left")
-    axes.xaxis.set_major_formatter(style.thousands)
+    axes.xaxis.set_major_formatter(steps_text)
     axes.set_xlim(0, horizon)
     axes.tick_params(labelsize=8)
     style.tidy(axes)
@@ -233,7 +232,7 @@ def _distribution(axes: Axes, drawn: _Draws, horizon: int, step: int, names: Seq
     axes.set_xlim(0, horizon + width)
     axes.set_ylim(bottom=0)
     axes.set_yticks([])
-    axes.xaxis.set_major_formatter(style.thousands)
+    axes.xaxis.set_major_formatter(steps_text)
     axes.tick_params(labelsize=8)
     style.tidy(axes)
     axes.spines["left"].set_visible(False)

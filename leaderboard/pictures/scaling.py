@@ -18,6 +18,7 @@ from qrlsuite import options
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ def _draw_panel(
     axes.set_xlabel(panel.by.removeprefix("environment."))
     axes.axhline(horizon, color="#505050", lw=0.9, ls=":")
     axes.set_ylim(0, horizon * 1.08)
-    axes.yaxis.set_major_formatter(style.thousands)
+    axes.yaxis.set_major_formatter(steps_text)
     style.tidy(axes)
     axes.set_title(f"{words}: {_seeds(panel)}", fontsize=9, loc="left")
     if cell == (0, 0):

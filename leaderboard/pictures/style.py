@@ -83,13 +83,6 @@ def relative(entries: Sequence[EntryCurves]) -> bool:
     return all(entry.task_file.score.source == "info" for entry in entries)
 
 
-def thousands(value: float, _: object = None) -> str:
-    """Write steps as a tick label: 40000 as 40k, 1000000 as 1M."""
-    if value == 0:
-        return "0"
-    return f"{value / 1e6:g}M" if abs(value) >= 1e6 else f"{value / 1e3:g}k"
-
-
 def tidy(axes: Axes) -> None:
     """Give axes a light grid and no frame above and to the right."""
     axes.grid(alpha=0.25)

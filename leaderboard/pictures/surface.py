@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Grid
 
 
@@ -54,7 +55,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     grid = cells.choose_grid(entries[0], chosen.epsilons, chosen.deltas)
     measured = [cells.measure(entry, grid, horizon) for entry in entries]
     drawing = _maps if chosen.style == "map" else _box
-    title = f"{style.heading(entries)}: sample complexity Ŝ, up to {style.thousands(horizon)} steps"
+    title = f"{style.heading(entries)}: sample complexity Ŝ, up to {steps_text(horizon)} steps"
     return drawing(entries, measured, grid, title, horizon, chosen)
 
 
@@ -104,7 +105,7 @@ def _maps(
     for row in range(rows):
         panels[row * columns].set_ylabel(cells.level_name(grid))
     bar = figure.colorbar(image, ax=panels[: len(entries)].tolist(), shrink=0.9, pad=0.02, aspect=30)
-    bar.ax.yaxis.set_major_formatter(style.thousands)
+    bar.ax.yaxis.set_major_formatter(steps_text)
     bar.outline.set_visible(False)
     bar.set_label("environment steps", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -150,7 +151,7 @@ def _box(
     axes.set_ylabel("δ")
     axes.set_zlabel("Ŝ (environment steps)", labelpad=8)
     axes.set_zlim(0, horizon)
-    axes.zaxis.set_major_formatter(style.thousands)
+    axes.zaxis.set_major_formatter(steps_text)
     axes.set_xticks(levels)
     axes.set_yticks(deltas)
     axes.tick_params(labelsize=8)

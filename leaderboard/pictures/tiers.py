@@ -16,6 +16,7 @@ from qrlsuite import options
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Board, outperformance
 
 LOOKS: dict[str, dict[str, Any]] = {
@@ -66,7 +67,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         "undecided": "undecided: fewer than 20 seeds",
     }
     handles = [Patch(**LOOKS[state], lw=0, label=text) for state, text in words.items() if state in states]
-    title = f"{style.heading(entries)}: significant outperformance, up to {style.thousands(horizon)} steps"
+    title = f"{style.heading(entries)}: significant outperformance, up to {steps_text(horizon)} steps"
     style.legend(figure, title, handles)
     style.footnotes(
         figure,

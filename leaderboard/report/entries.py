@@ -11,7 +11,8 @@ import numpy as np
 
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
-from qrlsuite.leaderboard.report.words import counted, ranges
+from qrlsuite.leaderboard.report.words import ranges
+from qrlsuite.results.text import counted
 
 SINGLE_RUNS = 100_000
 """Values of single runs that a page carries at most, all entries together: two bytes each."""

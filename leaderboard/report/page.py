@@ -13,8 +13,9 @@ from markupsafe import Markup
 import qrlsuite
 from qrlsuite.leaderboard import rules
 from qrlsuite.leaderboard.board import Leaderboard
-from qrlsuite.leaderboard.report import entries, sections, words
+from qrlsuite.leaderboard.report import entries, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
+from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS, SignificanceRule
 
 PAPER = "https://arxiv.org/abs/2501.15893"
@@ -70,7 +71,7 @@ def render(
             data=Markup(script_json(data)),
             scripts=[Markup(script) for script in scripts],
             clean=clean,
-            counted=words.counted,
+            counted=counted,
         )
     )
 

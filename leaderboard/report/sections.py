@@ -8,13 +8,14 @@ from typing import Any
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.absent import absent
-from qrlsuite.leaderboard.board import Row, Section, ranking_of, untiered_reason
+from qrlsuite.leaderboard.board import Row, Section, ranking_of
 from qrlsuite.leaderboard.report import ladder
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
-from qrlsuite.leaderboard.report.words import counted, listed, short
+from qrlsuite.leaderboard.report.words import listed
+from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome, SignificanceRule
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
@@ -104,7 +105,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
         number=number,
         section=section,
         judgement=judgement,
-        horizon=short(section.horizon),
+        horizon=steps_text(section.horizon),
         lead=_lead(rows),
         rows=rows,
         wanted=section.rows[0].entry.task_file.protocol.seeds,
@@ -141,14 +142,14 @@ def _row(place: int, row: Row, entry: EntryView, judgement: Judgement) -> RowVie
         place=place,
         entry=entry,
         row=row,
-        steps=("≥ " if reference.unsettled else "") + short(reference.steps),
-        interval=f"{short(reference.low)} to {short(reference.high)}",
+        steps=("≥ " if reference.unsettled else "") + steps_text(reference.steps),
+        interval=f"{steps_text(reference.low)} to {steps_text(reference.high)}",
         low=100 * reference.low / horizon,
         point=100 * reference.steps / horizon,
         high=100 * reference.high / horizon,
         wins=int(beats[place].sum()),
         losses=int(beats[:, place].sum()),
-        reason="" if row.tier is not None else untiered_reason(row),
+        reason=row.reason,
     )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.report.words import in_unit, short
+from qrlsuite.leaderboard.report.words import in_unit
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 
 LEVELS = 10
@@ -38,7 +39,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
         cells = []
         for j, delta in enumerate(grid.deltas):
             sign = "≥ " if open_end[i, j] else ""
-            low, high = (short(float(v)) for v in interval[i, j])
+            low, high = (steps_text(float(v)) for v in interval[i, j])
             mark = ", at cap" if capped[i, j] else ""
             share = float(point[i, j]) / horizon
             cells.append(
@@ -48,7 +49,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
                     capped=bool(capped[i, j]),
                     unsettled=bool(open_end[i, j]),
                     reference=value == wanted and float(delta) == ranking.reference.delta,
-                    title=f"{sign}{short(float(point[i, j]))} ({low} to {high}{mark})",
+                    title=f"{sign}{steps_text(float(point[i, j]))} ({low} to {high}{mark})",
                 )
             )
         lines.append(tuple(cells))

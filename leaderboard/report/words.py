@@ -5,25 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 
-def short(steps: float) -> str:
-    """Write environment steps with at most four digits: 62k, 58.2k, 1.25M."""
-    for size, letter in ((1_000_000, "M"), (1000, "k")):
-        if abs(steps) >= size:
-            return f"{steps / size:.4g}{letter}"
-    return f"{steps:.4g}"
-
-
 def in_unit(steps: float, unit: int) -> str:
     """Write steps in multiples of a unit, with at most three digits."""
     value = steps / unit
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def counted(count: int, thing: str) -> str:
-    """Write a number of things: `1 entry`, `3 entries`."""
-    if count == 1:
-        return f"1 {thing}"
-    return f"{count:,} {thing[:-1]}ies" if thing.endswith("y") else f"{count:,} {thing}s"
 
 
 def listed(words: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from typer import Abort, BadParameter
 
 from qrlsuite.cli.app import build
-from qrlsuite.cli.terminal import printable, printable_lines
+from qrlsuite.engine.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.registry import STRICT, PluginWarning
 

@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.main import get_command
 
-from qrlsuite.cli.terminal import printable
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import PluginError
 from qrlsuite.registry import Registry, words
 

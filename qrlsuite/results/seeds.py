@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TypeGuard
+
+import numpy as np
 
 from qrlsuite.errors import OptionError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
-
-if TYPE_CHECKING:
-    pass  # torch, which a supervisor can do without
 
 LARGEST_GROUP = 100
 MOST_SEEDS = 100_000
@@ -53,6 +52,31 @@ def parse_seeds(text: str) -> list[int]:
     if not seeds or len(set(seeds)) != len(seeds):
         raise OptionError(f"seeds '{text}': at least one seed, none twice, is needed")
     return sorted(seeds)
+
+
+def read_seeds(given: int | str | Iterable[int]) -> list[int]:
+    """Return the seeds that are meant by a number (100: seeds 0 to 99), text as in `parse_seeds`, or the seeds.
+
+    Raises
+    ------
+    OptionError
+        If it is none of these, names no seed, one twice, or a negative one.
+    """
+    if isinstance(given, str):
+        return parse_seeds(given)
+    if _is_seed(given):
+        return parse_seeds(str(given))
+    seeds = list(given) if isinstance(given, Iterable) else [given]
+    wrong = [seed for seed in seeds if not _is_seed(seed)]
+    if wrong:
+        raise OptionError(
+            f"seeds {wrong[0]!r}: give a number (100), seeds ([0, 3, 10]) or text ('0,3,10:12')"
+        )
+    return parse_seeds(",".join(f"{seed}:{seed + 1}" for seed in seeds))
+
+
+def _is_seed(value: object) -> TypeGuard[int]:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 0
 
 
 def format_seeds(seeds: Sequence[int]) -> str:

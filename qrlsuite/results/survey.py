@@ -90,6 +90,29 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
     )
 
 
+def outline(store: EntryStore) -> dict[str, Any]:
+    """Return what an entry is and what its seeds were made with, as plain values; each origin once.
+
+    Raises
+    ------
+    StoreError
+        If a record is damaged.
+    """
+    record = store.record()
+    seeds = store.seeds()
+    records = [store.seed(seed).record() or {} for seed in seeds]
+    made_with: list[Any] = []
+    for run in records:
+        made_with += [made for made in run.get("provenance", []) if made not in made_with]
+    shown = ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
+    return {
+        **{key: record[key] for key in shown},
+        "seeds": len(seeds),
+        "provenance": made_with,
+        "parameters": (records[0] if records else {}).get("parameters", {}),
+    }
+
+
 def _seeds(
     store: EntryStore, problems: list[str], queued: Collection[int] | None
 ) -> tuple[dict[int, str], list[int]]:

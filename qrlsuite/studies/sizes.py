@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
-from qrlsuite import population, specs
+from qrlsuite import specs
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.training.trainer import build_envs
 
 LARGEST_SIZE = 4096
 
 
 def parameters(entry: Entry) -> int:
     """Return the number of parameters of an entry's first network, classical and quantum together."""
+    # torch is slow to import, and needed only where models of equal size are looked for
+    import torch
+
+    from qrlsuite import population
+    from qrlsuite.training.trainer import build_envs
+
     envs = build_envs(entry, 1, lambda: None)
     inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
     outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]

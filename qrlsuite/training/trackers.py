@@ -7,6 +7,7 @@ are asked through the environment variable `QRLSUITE_TRACK`, which `qrlsuite run
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import logging
@@ -53,6 +54,21 @@ def ask(words: Sequence[str]) -> None:
     """Ask for trackers, in this process and in the workers that it starts; the errors are those of `parse`."""
     parse(words)
     os.environ[TRACK] = "\n".join(words)
+
+
+@contextlib.contextmanager
+def asking(words: Sequence[str]) -> Iterator[None]:
+    """Ask for trackers while something is trained; without words, for those that the environment names."""
+    before = os.environ.get(TRACK)
+    if words:
+        ask(words)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ[TRACK] = before
+        else:
+            os.environ.pop(TRACK, None)
 
 
 def asked() -> list[str]:

@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
-import optuna
-from optuna import distributions
 
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.tuning.space import Dimension, Point, Space
@@ -162,6 +160,7 @@ class Tpe:
     def __init__(self, space: Space, trials: int, seed: int) -> None:
         if importlib.util.find_spec("optuna") is None:
             raise QrlSuiteError("--sampler tpe needs the package 'optuna': pip install 'qrlsuite[tune]'")
+        import optuna  # an extra, which other samplers do without
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.space, self.total = space, trials
@@ -172,6 +171,7 @@ class Tpe:
         self._trial: Any = None
 
     def _distribution(self, dimension: Dimension) -> Any:
+        from optuna import distributions  # as above
 
         ends = dimension.range
         if ends is None:  # by position: values may be lists, which Optuna does not take

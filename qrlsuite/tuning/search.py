@@ -6,15 +6,20 @@ finished on the disk, and ends with the same preset (but for the measured hours)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite import options, registry
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
@@ -22,10 +27,14 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import digest
 from qrlsuite.options import Setting
 from qrlsuite.results import provenance
-from qrlsuite.results.seeds import format_seeds, parse_seeds
+from qrlsuite.results.seeds import format_seeds, read_seeds
 from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.tuning import samplers, space
 from qrlsuite.tuning.objective import Merit, Objective, cell_text, merit
+
+SHOWN = 10
+"""Rows of the table of best settings."""
 
 FOLDER = "tuning"
 """Trials lie in a results folder of their own, so that leaderboards do not rank them."""
@@ -34,20 +43,20 @@ Train = Callable[[Entry, Sequence[int], int], EntryStore]
 """Trains the missing ones of some seeds to an epoch and returns the entry's folder, finished or not."""
 
 
-def tuning_seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds that `--seeds` means: a number counts from 1,000,000.
+def tuning_seeds(given: int | str | Iterable[int]) -> tuple[int, ...]:
+    """Return the seeds that are meant, as `read_seeds` reads them, but that a number counts from 1,000,000.
 
     Raises
     ------
     OptionError
-        If the text is malformed, or a seed belongs to the protocol.
+        If they are malformed, or a seed belongs to the protocol.
     """
-    if text.isdecimal():
-        return tuple(TUNING_SEEDS + seed for seed in parse_seeds(text))
-    seeds = tuple(parse_seeds(text))
+    seeds = tuple(read_seeds(given))
+    if isinstance(given, int) or (isinstance(given, str) and given.isdecimal()):
+        return tuple(TUNING_SEEDS + seed for seed in seeds)
     if seeds[0] < TUNING_SEEDS:
         raise OptionError(
-            f"--seeds {text}: tuning uses seeds from {TUNING_SEEDS} up, or its settings would be judged by the runs "
+            f"--seeds {given}: tuning uses seeds from {TUNING_SEEDS} up, or its settings would be judged by the runs "
             f"they were chosen on; write --seeds {len(seeds)} for {TUNING_SEEDS} to {TUNING_SEEDS + len(seeds) - 1}"
         )
     return seeds
@@ -96,13 +105,22 @@ class Trial:
     core_seconds: float
 
 
-class Search:
-    """One search over the settings of a model and an algorithm.
+class Search(Shown):
+    """One search over the settings of a model and an algorithm; shows its best settings.
 
     Parameters
     ----------
-    runs:
-        The results folder.
+    results:
+        The results folder; trials lie in its folder `tuning`.
+
+    Attributes
+    ----------
+    trials:
+        The finished trials, in the order in which they were begun.
+    pending:
+        Entries of trials whose runs are left to another process or a queue.
+    written:
+        The preset file, once it is written.
 
     Raises
     ------
@@ -110,9 +128,10 @@ class Search:
         If a name, an option or a value of the request cannot be used.
     """
 
-    def __init__(self, request: Request, runs: Path) -> None:
+    def __init__(self, request: Request, results: Path) -> None:
         self.request = request
-        self.runs = runs / FOLDER
+        self.results = results
+        self.runs = results / FOLDER
         self.base = resolve(request.task, request.model, request.algorithm, request.settings)
         self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
         self.space = space.space(self.base, request.grid, request.varied, request.settings)
@@ -125,6 +144,7 @@ class Search:
         )
         self.trials: list[Trial] = []
         self.pending: list[Entry] = []
+        self.written: Path | None = None
         self.asked = 0
 
     @property
@@ -262,6 +282,50 @@ class Search:
             f"them:\n  qrlsuite run --task {self.request.task} --model {base.model.name} --preset {path.name}"
         )
         write_atomically(path, preset.dumps(found, comment).encode())
+        self.written = path
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show the best trials, a row each."""
+        ranking = self.base.task.file.ranking
+        seeds = len(self.request.seeds)
+        table = Table(
+            title=Text(
+                f"{self.base.label} on {self.base.task.name}: the best of {len(self.trials)} trials, "
+                f"{seeds} seeds x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours"
+            ),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text(
+                f"minimized: {cell_text(ranking, self.request.objective)}; ties by the other, then by the mean score "
+                "over all epochs. Chosen as the best of many, the first row looks too good: judge it on protocol seeds"
+            ),
+            caption_justify="left",
+            pad_edge=False,
+        )
+        for name in ("trial", "settings", "S_hat", "area", "mean score", "core-hours"):
+            table.add_column(Text(name), justify="left" if name == "settings" else "right", overflow="fold")
+        for trial in sorted(self.trials, key=lambda t: (t.merit.order, t.number))[:SHOWN]:
+            merit = trial.merit
+            row = [
+                str(trial.number),
+                space.text(trial.point),
+                f"{'>= ' * merit.unsettled}{steps_text(merit.cell)}",
+                steps_text(merit.area),
+                f"{merit.score:.4f}",
+                hours_text(trial.core_seconds / 3600),
+            ]
+            table.add_row(*(Text(cell) for cell in row))
+        yield table
+
+
+def merit_text(trial: Trial) -> str:
+    """Write a trial's worth: `S_hat >= 60k, area 51k, mean score 0.712`."""
+    merit = trial.merit
+    sign = ">= " if merit.unsettled else ""
+    return (
+        f"S_hat {sign}{steps_text(merit.cell)}, area {steps_text(merit.area)}, mean score {merit.score:.4f}"
+    )
 
 
 def as_dict(search: Search) -> dict[str, Any]:

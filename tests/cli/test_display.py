@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.cli.commands.leaderboard import COLUMNS
-from qrlsuite.cli.commands.run import summarize
-from qrlsuite.cli.display import CostEstimate, RunDisplay
+from qrlsuite.engine.display import CostEstimate, RunDisplay
+from qrlsuite.engine.execution import Plan, summarize
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.leaderboard.tables import COLUMNS
 from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import Group
@@ -42,10 +42,11 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
     train("runs", [3, 4])
     store = EntryStore(path)
     snapshot = {group.id: ProgressFile(store, group.id).read() for group in PAIR}
-    monkeypatch.setattr("qrlsuite.cli.display.PLAIN_SECONDS", 0.0)
-    RunDisplay(entry, store, range(5), 3, PAIR, 2, quiet=False).update(snapshot)
+    monkeypatch.setattr("qrlsuite.engine.display.PLAIN_SECONDS", 0.0)
+    plan = Plan(path.parents[1], entry, store, range(5), 3, groups=PAIR)
+    RunDisplay(plan, 2).update(snapshot)
     shown = re.search(r"median score (\S+)", capsys.readouterr().err)
-    expected = summarize(entry, store, list(range(5)), 3)["median_score"]
+    expected = summarize(plan)["median_score"]
     assert shown is not None
     assert shown[1] == f"{expected:.3f}"
     assert len({state["median_score"] for state in snapshot.values()}) == 2, "the groups must differ"
@@ -77,8 +78,8 @@ def test_an_epoch_is_not_shorter_than_it_has_taken_so_far() -> None:
 def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsys, monkeypatch) -> None:
     """Its first update takes 100 seconds: after 20 what that means is said, with what is faster."""
     clock = [1000.0]
-    monkeypatch.setattr("qrlsuite.cli.display.time.monotonic", lambda: clock[0])
-    display = RunDisplay(entry, EntryStore(tmp_path), range(3), 10, PAIR[:1], 1, quiet=False)
+    monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
+    display = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10, groups=PAIR[:1]), 1)
     state = {"phase": "training", "epoch": 0, "done": 16, "total": 200}
     for _ in range(25):
         display.update({PAIR[0].id: state})
@@ -87,7 +88,7 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
     assert "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it" in shown
     assert "faster: " in shown
     assert not display.endless
-    late = RunDisplay(entry, EntryStore(tmp_path), range(3), 10_000, PAIR[:1], 1, quiet=False)
+    late = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10_000, groups=PAIR[:1]), 1)
     for _ in range(25):
         late.update({PAIR[0].id: state})
         clock[0] += 1.0
@@ -96,8 +97,9 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
 
 @pytest.mark.parametrize("submits", [False, True])
 def test_what_is_submitted_cannot_be_stopped_by_ctrl_c(entry, tmp_path, capsys, submits) -> None:
-    display = RunDisplay(entry, EntryStore(tmp_path), range(7), 3, PAIR, 2, quiet=False)
-    display.begin({5, 6}, submits)
+    plan = Plan(tmp_path, entry, EntryStore(tmp_path), range(7), 3, frozenset({5, 6}), PAIR)
+    display = RunDisplay(plan, 2)
+    display.begin(submits)
     display.close()
     shown = " ".join(capsys.readouterr().err.split())
     assert ("Ctrl-C saves" in shown) is not submits

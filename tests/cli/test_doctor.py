@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.cli import installed
 from qrlsuite.cli.commands import doctor
-from qrlsuite.cli.diagnosis import Diagnosis
+from qrlsuite.installation import packages
+from qrlsuite.installation.diagnosis import Diagnosis
 from tests.core.test_hooks import install, suite
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def test_this_installation(tmp_path: Path) -> None:
     assert set(facts["packages"]) == {line.partition(">")[0] for line in declared}
     assert facts["packages"]["numpy"] == metadata.version("numpy")
     assert facts["extras"]["slurm"]["install"] == "pip install 'qrlsuite[slurm]'"
-    assert facts["suite"]["location"] == str(Path(doctor.__file__).parents[1])
+    assert facts["suite"]["location"] == str(Path(doctor.__file__).parents[2])
     assert facts["tried"]["torch"]["threads"] == 1
     assert Path(facts["tried"]["simulator"]["cache"][0]).is_dir()
     assert facts["machine"]["variables"]["OMP_NUM_THREADS"] == "1"
@@ -122,8 +122,8 @@ def test_requirements_of_extras_are_followed(tmp_path: Path, monkeypatch: pytest
         tmp_path, "plain", "gymnasium[box2d]; extra == 'games'", "never; python_version < '3'", "not valid!"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    assert [requirement.name for requirement in installed.requirements()] == ["plain"]
-    [first, *rest] = [requirement.name for requirement in installed.requirements(extra="games")]
+    assert [requirement.name for requirement in packages.requirements()] == ["plain"]
+    [first, *rest] = [requirement.name for requirement in packages.requirements(extra="games")]
     assert first == "gymnasium"
     assert any("box2d" in name for name in rest), "what gymnasium[box2d] brings"
 

@@ -17,15 +17,15 @@ from typer.testing import CliRunner, Result
 from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
-from qrlsuite.cli.studying import Item, cheapest_first, check_budget, fitting, survey
-from qrlsuite.cli.training import Place
 from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec
+from qrlsuite.studies.runner import Item, cheapest_first, check_budget, fitting, survey
 from qrlsuite.studies.study import parse
 from tests.conftest import HANGS, TINY, Hold, results
 
@@ -285,7 +285,7 @@ def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp
 
 def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[Item]:
     study = parse(Path(widths).read_text(), "widths.toml")
-    return survey(study.members(), tmp_path / "runs", Place(Here(), 2), speeds, range(4), 10)
+    return survey(study.members(), tmp_path / "runs", Execution(Here(), 2), speeds, range(4), 10)
 
 
 def speeds(mlp: float | None, vqc: float | None) -> Speeds:
@@ -338,12 +338,17 @@ def test_a_budget_is_kept_and_the_same_command_continues(widths: str, tmp_path: 
 
 
 def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -> None:
-    from qrlsuite.cli.studying import Session
+    from qrlsuite.studies.runner import Session
 
     ticks = iter(range(0, 10_000, 60))
     known = speeds(0.1, 0.2)
     session = Session(
-        tmp_path / "runs", Place(Here(), 1), known, budget=100, quiet=True, clock=lambda: float(next(ticks))
+        tmp_path / "runs",
+        Execution(Here(), 1),
+        known,
+        budget=100,
+        quiet=True,
+        clock=lambda: float(next(ticks)),
     )
     left = session.run(items(widths, tmp_path, known))
     assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))], (

@@ -16,8 +16,8 @@ import typer
 from typer.testing import CliRunner
 
 from qrlsuite import hookspecs, registry
-from qrlsuite.cli.commands.listing import hooks
 from qrlsuite.cli.extensions import add_commands
+from qrlsuite.experiment.catalog import hooks
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.conftest import install, installed

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite.cli.commands.calibrate import summary, tables
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration
+from qrlsuite.leaderboard.findings import summary, tables
 from qrlsuite.statistics import (
     DifferenceRule,
     Evidence,

@@ -139,9 +139,7 @@ def test_equal_labels_are_told_apart() -> None:
 
 
 def test_numbers_in_words() -> None:
-    assert [words.short(steps) for steps in (60, 62_000, 58_150, 1_000_000)] == ["60", "62k", "58.15k", "1M"]
     assert words.ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
-    assert (words.counted(1, "entry"), words.counted(1200, "run")) == ("1 entry", "1,200 runs")
 
 
 def test_the_page_names_no_other_place_but_the_paper() -> None:

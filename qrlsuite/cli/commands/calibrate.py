@@ -6,24 +6,19 @@ import json
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
-from qrlsuite.cli.display import duration
-from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard import calibration, collect, rules
-from qrlsuite.leaderboard.board import learning_curves, ranking_of
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import calibration, findings, rules
 from qrlsuite.leaderboard.calibration import Finding, Job
-from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.leaderboard.pictures.cells import choose_horizon
-from qrlsuite.results import lookup
+from qrlsuite.leaderboard.tables import table
+from qrlsuite.results.text import duration
 
 
 class PartName(StrEnum):
@@ -71,20 +66,14 @@ def calibrate(
 
     Example: qrlsuite calibrate --task beam6g --rule difference --draws 1000
     """
-    chosen = _entries(runs, published, entries or [], task)
-    horizon = choose_horizon(chosen)
+    chosen, left_out = calibration.choose(runs, entries or [], task, published)
+    for line in left_out:
+        typer.echo(f"left out: {line}", err=True)
     judges = [rules.load(name) for name in dict.fromkeys(rule or ["intervals", "difference"])]
-    names = [entry.label.removeprefix(f"{entry.algorithm} ") for entry in chosen]
-    if len(set(names)) < len(names):
-        names = [entry.name for entry in chosen]
-    curves = [
-        type(learned)(learned.values, learned.steps_per_epoch, name)
-        for learned, name in zip((learning_curves(entry).cut(horizon) for entry in chosen), names)
-    ]
-    grid = ranking_of(chosen).grid
+    setup = calibration.prepare(chosen)
     jobs = calibration.plan(
-        curves,
-        grid,
+        setup.curves,
+        setup.grid,
         judges,
         draws,
         parts=[each.value for each in part] if part else calibration.PARTS,
@@ -95,54 +84,23 @@ def calibrate(
     if json_output:
         content = {
             "task": chosen[0].task,
-            "horizon": horizon,
-            "cells": grid.size,
+            "horizon": setup.horizon,
+            "cells": setup.grid.size,
             "board": board,
             "rules": {judge.name: judge.promise for judge in judges},
-            "entries": {name: len(entry.seeds) for name, entry in zip(names, chosen)},
+            "entries": {curves.name: curves.n_runs for curves in setup.curves},
             "rates": [finding.as_dict() for finding in found],
         }
         typer.echo(json.dumps(content))
         return
-    for heading, lines in tables(found, grid.size, board):
+    for heading, lines in findings.tables(found, setup.grid.size, board):
         _show(heading, lines)
     for judge in judges:
         typer.echo(f"'{judge.name}' promises {judge.promise}")
-    if said := [words for judge in judges if (words := summary(found, judge.name, board))]:
+    if said := [words for judge in judges if (words := findings.summary(found, judge.name, board))]:
         typer.echo("\nOn these entries:")
         for words in said:
             typer.echo(f"- {words}")
-
-
-def _entries(runs: Path, published: bool, names: Sequence[str], task: str | None) -> list[EntryCurves]:
-    """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long."""
-    lookup.check_tasks(runs, task)
-    if names:
-        tasks = [task] if task else []
-        found = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
-    else:
-        found, refused = collect.collect(runs, task, shipped=published)
-        for line in refused:
-            typer.echo(f"left out: {line}", err=True)
-    single = [entry.label for entry in found if len(entry.seeds) < 2]
-    if single:
-        typer.echo(f"left out, a single seed has no spread: {', '.join(single)}", err=True)
-    found = [entry for entry in found if len(entry.seeds) >= 2]
-    if not found:
-        wanted = f" of task {task}" if task else ""
-        raise UnknownNameError(f"{runs} holds no entry{wanted} with two seeds or more: qrlsuite run")
-    tasks = sorted({entry.task for entry in found})
-    if len({entry.task_hash for entry in found}) > 1:
-        raise OptionError(f"the entries belong to several tasks ({', '.join(tasks)}): choose one with --task")
-    longest = max(entry.curves.shape[1] for entry in found)
-    for entry in found:
-        if entry.curves.shape[1] < longest:
-            reached = f"at epoch {entry.curves.shape[1]} of {longest}"
-            typer.echo(
-                f"left out, {reached}: {entry.label}; repeat the `qrlsuite run` that made it", err=True
-            )
-    found = [entry for entry in found if entry.curves.shape[1] == longest]
-    return sorted(found, key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
 
 
 def _pair(word: str) -> tuple[int, int]:
@@ -183,109 +141,14 @@ def _compute(jobs: Sequence[Job], quiet: bool) -> list[Finding]:
     return found
 
 
-HEAD = ["entry", "seeds", "rule", "cell, worst", "any cell", "a winner"]
-
-
-def tables(found: Sequence[Finding], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
-    """Return what was found as tables: a sentence, and rows of which the first is the head."""
-    parts = {name: [each for each in found if each.part == name] for name in PartName}
-    result = []
-    if halves := parts[PartName.halves]:
-        rows = [[each.entry, _seeds(each), each.rule, *_cells(each), f"{each.winner:.1%}"] for each in halves]
-        for name in dict.fromkeys(each.rule for each in halves):
-            rates = [each.winner for each in halves if each.rule == name]
-            if len(rates) > 1:
-                rows.append([f"over {len(rates)} entries", "", name, "", "", _range(rates)])
-        sentence = (
-            f"Real runs: random halves of one entry, {halves[0].draws} splits each. Every winner is false. Splits "
-            "of an entry share its runs: only the spread over entries says how sure a rate is."
-        )
-        result.append((sentence, [HEAD, *rows]))
-    if pairs := parts[PartName.pairs]:
-        rows = [[each.entry, _seeds(each), each.rule, *_cells(each), _winner(each)] for each in pairs]
-        sentence = (
-            f"Simulated: two entries that are equal, {pairs[0].draws} pairs each. Every winner is false. `cell`: "
-            f"different in a given one of the {cells} cells, on average and in the worst; `a winner`: one seems to "
-            "outperform the other."
-        )
-        result.append((sentence, [HEAD, *rows]))
-    if boards := parts[PartName.boards]:
-        rows = [[each.entry, str(each.n_runs[0]), each.rule, _winner(each)] for each in boards]
-        sentence = (
-            f"Simulated: boards of {board} equal entries ({board * (board - 1) // 2} pairs), {boards[0].draws} "
-            "boards each. How often any of them seems to outperform another:"
-        )
-        result.append((sentence, [["entry", "seeds", "rule", "boards with a winner"], *rows]))
-    if strong := parts[PartName.power]:
-        rows = [[each.entry, str(each.n_runs[0]), _slower(each), each.rule, _winner(each)] for each in strong]
-        sentence = (
-            f"Simulated: one entry takes longer to get as far, {strong[0].draws} pairs each. How often the other is "
-            "found to outperform it (power):"
-        )
-        result.append((sentence, [["entry", "seeds", "slower by", "rule", "found"], *rows]))
-    return result
-
-
-def summary(found: Sequence[Finding], rule: str, board: int) -> str:
-    """Return in one sentence what was found about a rule."""
-    own = [each for each in found if each.rule == rule]
-    equal = [each for each in own if each.part == "pairs" and each.n_runs[0] == each.n_runs[1]]
-    parts = []
-    if equal:
-        seeds = max(each.n_runs[0] for each in equal)
-        rates = [each.winner for each in equal if each.n_runs[0] == seeds]
-        parts.append(
-            f"declares a false winner between two equal entries of {seeds} seeds in {_range(rates)} of cases"
-        )
-    halves = [each.winner for each in own if each.part == "halves"]
-    if halves and not equal:
-        parts.append(f"declares a false winner between halves of one entry in {_range(halves)} of splits")
-    boards = [each.winner for each in own if each.part == "boards"]
-    if boards:
-        parts.append(f"finds one somewhere on {_range(boards)} of boards of {board} equals")
-    for factor in sorted({each.factor for each in own if each.factor is not None})[:2]:
-        rates = [each.winner for each in own if each.factor == factor]
-        parts.append(f"finds an entry that takes {factor - 1:.0%} longer to be worse in {_range(rates)}")
-    return f"'{rule}' " + "; ".join(parts) if parts else ""
-
-
-def _range(rates: Sequence[float]) -> str:
-    """Write the spread of rates over entries."""
-    low, high = f"{min(rates):.1%}", f"{max(rates):.1%}"
-    return low if low == high else f"{low} to {high}"
-
-
-def _seeds(finding: Finding) -> str:
-    return f"{finding.n_runs[0]},{finding.n_runs[1]}"
-
-
-def _slower(finding: Finding) -> str:
-    return f"{(finding.factor or 1) - 1:.0%}"
-
-
-def _winner(finding: Finding) -> str:
-    return f"{100 * finding.winner:.1f} ± {finding.error:.1%}"
-
-
-def _cells(finding: Finding) -> tuple[str, str]:
-    mean, worst, anywhere = (
-        f"{value or 0:{digits}%}"
-        for value, digits in ((finding.cell_mean, ".2"), (finding.cell_worst, ".1"), (finding.any_cell, ".1"))
-    )
-    return f"{mean.removesuffix('%')}, {worst}", anywhere
-
-
 def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:
-
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
-    for name in rows[0]:
-        justify: Literal["left", "right"] = "left" if name in ("entry", "rule") else "right"
-        table.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name != "entry")
+    """Print a table of findings; an entry is named in its first line only."""
+    shown = table(rows[0], left=("entry", "rule"), fixed=[name for name in rows[0] if name != "entry"])
+    shown.padding = (0, 1, 0, 0)
     before = None
     for row in rows[1:]:
-        shown = ["" if row[0] == before else row[0], *row[1:]]
+        shown.add_row(*(Text(cell) for cell in ("" if row[0] == before else row[0], *row[1:])))
         before = row[0]
-        table.add_row(*(Text(cell) for cell in shown))
     console = Console(highlight=False)
     console.print(Text(heading))
-    console.print(table)
+    console.print(shown)

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from qrlsuite import registry, testing
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.cli.terminal import printable
+from qrlsuite.engine.terminal import printable
 from qrlsuite.options import parse_setting
 from qrlsuite.testing import Finding, selection
 from qrlsuite.testing.findings import Finding as Found

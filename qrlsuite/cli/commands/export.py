@@ -9,11 +9,12 @@ from typing import Annotated
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.terminal import command, counted
+from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.export import export as write
 from qrlsuite.results import lookup
+from qrlsuite.results.text import counted
 
 
 def export(

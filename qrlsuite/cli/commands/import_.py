@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.terminal import command
+from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.task import load
 from qrlsuite.results.imports import import_files

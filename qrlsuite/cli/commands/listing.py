@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 from typing import Annotated
 
 import typer
 
-from qrlsuite import hookspecs, registry
+from qrlsuite import registry
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.cli.terminal import printable
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import UnknownNameError, nearest
+from qrlsuite.experiment.catalog import hooks
 from qrlsuite.registry import Registry
 
 SHOWN = 8
@@ -56,19 +56,6 @@ def list_things(
         typer.echo(json.dumps(rows))
         return
     _print(rows)
-
-
-def hooks() -> list[dict[str, str]]:
-    """Return every hook: its name, its signature, the first line of its manual and the manual."""
-    found = []
-    for name, function in vars(hookspecs).items():
-        if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec"):
-            manual = inspect.getdoc(function) or ""
-            arguments = ", ".join(inspect.signature(function).parameters)
-            summary = manual.partition("\n")[0]
-            row = {"name": name, "summary": summary, "signature": f"{name}({arguments})", "manual": manual}
-            found.append(row)
-    return found
 
 
 def _list_plugins(known: Registry, json_output: bool) -> None:

@@ -6,12 +6,10 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from qrlsuite import options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.display import RunDisplay
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -21,15 +19,12 @@ from qrlsuite.cli.training import (
     TimeOption,
     TrackOption,
     WorkersOption,
-    place,
-    plan,
-    train,
+    execution_of,
 )
-from qrlsuite.errors import OptionError
+from qrlsuite.engine import execution
+from qrlsuite.engine.display import RunDisplay
 from qrlsuite.experiment import entry as entries
-from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.seeds import parse_seeds
-from qrlsuite.results.store import EntryStore
 from qrlsuite.training import trackers
 
 QUICK_SEEDS = 8
@@ -98,22 +93,20 @@ def run(
     entry = entries.resolve(task, model, algorithm, words, preset)
     if track:
         trackers.ask(track)
-    protocol = entry.task.file.protocol
-    wanted = parse_seeds(seeds or str(QUICK_SEEDS if quick else protocol.seeds))
-    last = epochs or (QUICK_EPOCHS if quick else entry.task.epochs(entry.algorithm.name))
-    where = place(engine, workers, partition, time, engine_options, device)
-    if minutes is not None and not 0 < minutes < float("inf"):
-        raise OptionError(f"--minutes {minutes:g}: give a time, for example --minutes 2 or --minutes 0.5")
-    if minutes is not None and where.submits:
-        raise OptionError(f"--minutes: engine '{engine}' leaves its tasks in a queue; give --time instead")
-
-    work = plan(runs, entry, wanted, last, where)
-    display = RunDisplay(entry, work.store, wanted, last, work.groups, where.workers, quiet=json_output)
-    outcome = train(work, where, display, minutes, confirmed=yes)
+    wanted = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
+    last = epochs or (QUICK_EPOCHS if quick else None)
+    where = execution_of(engine, workers, partition, time, engine_options, device)
+    execution.check_minutes(minutes, where)
+    work = execution.plan(runs, entry, where, wanted, last)
+    display = RunDisplay(work, where.workers, quiet=json_output)
+    try:
+        outcome = execution.train(work, where, display, minutes, confirmed=yes)
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
     if outcome.submitted is not None:
         typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
         return
-    summary = summarize(entry, work.store, wanted, last)
+    summary = execution.summarize(work)
     if json_output:
         typer.echo(json.dumps(summary))
     else:
@@ -126,21 +119,3 @@ def _quick_settings(model: str, words: list[Any]) -> list[Any]:
     if "qubits" in names and not any(word.name == "qubits" for word in words):
         return [options.Setting("model", "qubits", QUICK_QUBITS), *words]
     return words
-
-
-def summarize(entry: Entry, store: EntryStore, seeds: list[int], epochs: int) -> dict[str, Any]:
-    """Return what a finished (or partly finished) run amounts to, as plain values."""
-    curves = {seed: store.seed(seed).read() for seed in seeds if store.seed(seed).record()}
-    complete = {seed: curve.curve[:epochs] for seed, curve in curves.items() if len(curve.scores) >= epochs}
-    summary: dict[str, Any] = {
-        "task": entry.task.name,
-        "entry": entry.name,
-        "label": entry.label,
-        "folder": str(store.path),
-        "seeds": len(complete),
-        "epochs": epochs,
-        "median_score": None,
-    }
-    if complete:
-        summary["median_score"] = float(np.median([curve[-1] for curve in complete.values()]))
-    return summary

@@ -11,14 +11,14 @@ from typing import Annotated
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.display import duration
-from qrlsuite.cli.terminal import printable
 from qrlsuite.engine.api import Queues
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import entries
 from qrlsuite.results.survey import STATUSES, EntrySurvey, delete, garbage, look, remove, survey
+from qrlsuite.results.text import duration, size_text
 
 
 def runs(
@@ -62,16 +62,6 @@ def runs(
     if yes:
         raise OptionError("--yes belongs to `qrlsuite runs gc` and `qrlsuite runs rm`")
     _list(runs, task, json_output)
-
-
-def size_text(size: int) -> str:
-    """Write a number of bytes as people say it."""
-    amount = float(size)
-    for unit in ("B", "kB", "MB", "GB"):
-        if amount < 1000:
-            return f"{amount:.0f} {unit}" if amount >= 10 or unit == "B" else f"{amount:.1f} {unit}"
-        amount /= 1000
-    return f"{amount:.1f} TB"
 
 
 def _list(folder: Path, task: str | None, json_output: bool) -> None:

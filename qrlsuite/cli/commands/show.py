@@ -9,17 +9,17 @@ from typing import Annotated, Any
 
 import typer
 
-from qrlsuite import circuit, options, registry, specs
+from qrlsuite import circuit, registry
 from qrlsuite.circuit import drawing
 from qrlsuite.cli.arguments import JsonOption, RunsOption
-from qrlsuite.cli.commands.listing import hooks
-from qrlsuite.cli.terminal import printable_lines
+from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
-from qrlsuite.experiment.task import load
+from qrlsuite.experiment.catalog import describe, hooks
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.options import parse_setting
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, entries, write_atomically
+from qrlsuite.results.survey import outline
 
 
 def show(
@@ -62,7 +62,7 @@ def show(
     if not found and kind is None:
         folder = _entry_folder(runs, wanted)
         if folder is not None:
-            content = _entry(folder)
+            content = outline(EntryStore(folder))
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not found:
@@ -71,7 +71,9 @@ def show(
     if len(found) > 1:
         singulars = " or ".join(f"`show {registry.SINGULAR[k]} {wanted}`" for k in found)
         raise UnknownNameError(f"'{wanted}' is several things; write {singulars}")
-    content = _content(found[0], wanted)
+    content = describe(found[0], wanted)
+    if found[0] == "significance_tests":
+        content["promises"] = rules.load(wanted).promise
     if found[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
         raise OptionError(
             f"{registry.SINGULAR[found[0]]} '{wanted}': --qubits, --layers, --set and --figure draw an ansatz; options "
@@ -121,68 +123,6 @@ def _entry_folder(runs: Path, name: str) -> Path | None:
         if any(lookup.mentions(entry, name) for entry in stored):
             raise
         return None
-
-
-def _entry(folder: Path) -> dict[str, Any]:
-
-    store = EntryStore(folder)
-    record = store.record()
-    seeds = store.seeds()
-    records = [store.seed(seed).record() or {} for seed in seeds]
-    made_with: list[Any] = []
-    for run in records:
-        made_with += [made for made in run.get("provenance", []) if made not in made_with]
-    return {
-        **{
-            key: record[key]
-            for key in ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
-        },
-        "seeds": len(seeds),
-        "provenance": made_with,
-        "parameters": (records[0] if records else {}).get("parameters", {}),
-    }
-
-
-def _content(kind: str, name: str) -> dict[str, Any]:
-    """Return what there is to say about a registered thing."""
-    registered = registry.load().get(kind, name)
-    spec = registered.spec
-    content: dict[str, Any] = {
-        "kind": registry.SINGULAR[kind],
-        "name": spec.name,
-        "summary": spec.summary,
-        "distribution": registered.distribution,
-    }
-    if isinstance(spec, specs.TaskSpec):
-        task = load(name)
-        content |= {
-            "hash": task.hash,
-            "path": spec.path,
-            **task.file.model_dump(mode="json", exclude={"name", "summary"}),
-        }
-        return content
-    if isinstance(spec, specs.SignificanceTestSpec):
-        content["promises"] = rules.load(name).promise
-    for field in dataclasses.fields(spec):
-        if field.name == "family":
-            content["family"] = getattr(spec, field.name)
-    reference = getattr(spec, "options", None)
-    if reference:
-        content["options"] = options.describe(specs.resolve(reference))
-        content["set_with"] = _set_with(kind, name)
-    return content
-
-
-def _set_with(kind: str, name: str) -> str:
-    """Return what to type to change an option of a thing."""
-    if kind != "ansatzes":
-        return "--set NAME=VALUE"
-    for model, registered in registry.load().entries["models"].items():
-        if isinstance(registered.spec, specs.ModelSpec):
-            names = options.field_names(specs.resolve(registered.spec.options))
-            if {"ansatz", "ansatz_options"} <= set(names):
-                return f"qrlsuite run --model {model} --set ansatz={name} --set NAME=VALUE"
-    return "no installed model takes an ansatz"
 
 
 def _draw(

@@ -9,14 +9,10 @@ from typing import Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.cli.display import duration
-from qrlsuite.cli.terminal import printable
-from qrlsuite.engine.api import Queues
-from qrlsuite.errors import QrlSuiteError
-from qrlsuite.results import lookup
+from qrlsuite.engine.status import survey
+from qrlsuite.engine.terminal import printable
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import entries
-from qrlsuite.results.survey import GroupStatus, groups, look
+from qrlsuite.results.text import duration
 
 
 def status(
@@ -31,28 +27,7 @@ def status(
 
     Example: qrlsuite status --task beam6g
     """
-    lookup.check_tasks(runs, task)
-    shown: list[dict[str, Any]] = []
-    queues = Queues()
-    for store in entries(runs, task):
-        entry, queued, silence = look(store), None, None
-        if entry.seeds.get("submitted"):
-            try:
-                queued = queues.waiting(store)
-                entry = look(store, queued)
-            except QrlSuiteError as error:
-                silence = str(error)
-        shown.append(
-            {
-                "task": entry.task,
-                "entry": entry.name,
-                "label": entry.label,
-                "seeds": dict(entry.seeds),
-                "problems": list(entry.problems),
-                "queue_problem": silence,
-                "groups": [_plain(group) for group in groups(store, queued)],
-            }
-        )
+    shown = [found.as_dict() for found in survey(runs, task)]
     if json_output:
         typer.echo(json.dumps(shown))
         return
@@ -62,18 +37,8 @@ def status(
         typer.echo(f"{runs} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
 
 
-def _plain(group: GroupStatus) -> dict[str, Any]:
-    return {
-        "seeds": list(group.seeds),
-        "state": group.state,
-        "where": group.where,
-        "seconds_left": group.seconds_left,
-        **{key: group.progress.get(key) for key in ("phase", "epoch", "epochs", "median_score", "error")},
-    }
-
-
 def _print(row: dict[str, Any]) -> None:
-
+    """Print an entry and its groups, a line each."""
     seeds = ", ".join(f"{count} {status}" for status, count in row["seeds"].items()) or "none"
     typer.echo(printable(f"{row['task']}  {row['label']}  ({row['entry']}): {seeds}"))
     for problem in row["problems"]:

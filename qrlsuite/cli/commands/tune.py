@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from qrlsuite import options
-from qrlsuite.cli import budget as budgets
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -21,14 +19,15 @@ from qrlsuite.cli.training import (
     PartitionOption,
     TimeOption,
     WorkersOption,
-    place,
-    plan,
+    execution_of,
+    seconds,
 )
-from qrlsuite.cli.trials import TuneDisplay, plain, report
-from qrlsuite.engine import api
+from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
-from qrlsuite.results.store import EntryStore
-from qrlsuite.tuning.search import FOLDER, Request, Search
+from qrlsuite.results.text import hours_text
+from qrlsuite.tuning import runner, search, space
+from qrlsuite.tuning.display import TuneDisplay
+from qrlsuite.tuning.search import Search
 
 LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
@@ -137,13 +136,11 @@ def tune(
 
     Example: qrlsuite tune --task beam6g --model mlp --grid paper --sampler one-at-a-time --seeds 20
     """
-    from qrlsuite.tuning import search, space
-
     if (model is None) == (equal_budget is None):
         raise OptionError("give either --model NAME or --equal-budget A B")
     if out is not None and (equal_budget is not None or out.suffix != ".toml"):
         raise OptionError(f"--out {out}: one file ending in .toml, for one model")
-    limit = None if budget is None else budgets.seconds(budget)
+    limit = None if budget is None else seconds(budget)
     words = tuple(options.parse_setting(word) for word in settings or [])
     requests = []
     for name in equal_budget or [str(model)]:
@@ -164,13 +161,15 @@ def tune(
                 objective=objective.value,
             )
         )
-    searches = _searches(requests, runs)
-    where = place(engine, workers, partition, time, engine_options, device)
-    display = TuneDisplay(searches, where, runs, quiet=json_output)
+    searches = runner.build(requests, runs)
+    execution = execution_of(engine, workers, partition, time, engine_options, device)
+    display = TuneDisplay(searches, execution.workers, quiet=json_output)
     display.begin()
     if dry_run:
         if json_output:
-            typer.echo(json.dumps({"searches": [plain(each) for each in searches], "complete": False}))
+            typer.echo(
+                json.dumps({"searches": [search.as_dict(each) for each in searches], "complete": False})
+            )
         return
     planned = sum(each.planned for each in searches)
     if planned > LARGE and not yes and limit is None:
@@ -179,84 +178,50 @@ def tune(
             "--sampler one-at-a-time or --sampler random --trials 50 tries fewer"
         )
     try:
-        complete = _run(searches, runs, where, display, limit)
+        complete = runner.run(searches, runs, execution, display, limit, out)
     except KeyboardInterrupt:
-        display.interrupted()
         raise typer.Exit(130) from None
-    finally:
-        display.close()
-    _finish(searches, out, runs, complete, display, json_output)
-
-
-def _searches(requests: Sequence[Request], runs: Path) -> list[Search]:
-    """Build the searches; of two, the larger grid is sampled down to the number of combinations of the smaller."""
-    built = [Search(request, runs) for request in requests]
-    fewest = min(search.planned for search in built)
-    for i, search in enumerate(built):
-        if search.planned == fewest:
-            continue
-        if search.request.sampler != "grid":
-            counts = " and ".join(str(each.planned) for each in built)
-            raise OptionError(
-                f"--equal-budget: sampler '{search.request.sampler}' gives {counts} trials; --sampler random --trials "
-                f"{fewest} gives both as many"
-            )
-        built[i] = Search(dataclasses.replace(search.request, sampler="random", trials=fewest), runs)
-    return built
-
-
-def _run(searches: Sequence[Search], runs: Path, where: Any, display: Any, limit: float | None) -> bool:
-    """Run trials, of several searches in turns, until all are over or the budget is; returns whether all are."""
-    import time
-
-    def train(entry: Any, seeds: Sequence[int], epochs: int) -> EntryStore:
-        work = plan(runs / FOLDER, entry, seeds, epochs, where)
-        EntryStore.create(runs / FOLDER, entry)
-        display.trial(entry, work)
-        if work.groups:
-            outcome = where.engine.run(
-                api.Work(work.store, work.groups, epochs, where.workers, where.device), display.update
-            )
-            api.raise_failures(outcome)
-            if outcome.submitted is not None:
-                display.console.print(outcome.submitted, markup=False)
-        return work.store
-
-    began = time.monotonic()
-    longest = 0.0
-    while not all(search.over for search in searches):
-        if limit is not None and time.monotonic() - began + longest > limit:
-            return False
-        started = time.monotonic()
-        for search in searches:
-            if not search.over:
-                display.told(search, search.step(train))
-        longest = max(longest, time.monotonic() - started)
-    return not any(search.pending for search in searches)
-
-
-def _finish(
-    searches: Sequence[Search],
-    out: Path | None,
-    runs: Path,
-    complete: bool,
-    display: Any,
-    json_output: bool,
-) -> None:
-    """Write the preset files where there is a best trial and none is waited for, and say what came out."""
-    written: dict[int, Path] = {}
-    for i, search in enumerate(searches):
-        if search.best is not None and not search.pending:
-            path = out or search.path
-            search.write(path)
-            written[i] = path
     if json_output:
         rows = [
-            {**plain(each), "preset": str(written[i]) if i in written else None}
-            for i, each in enumerate(searches)
+            {**search.as_dict(each), "preset": None if each.written is None else str(each.written)}
+            for each in searches
         ]
         typer.echo(json.dumps({"searches": rows, "complete": complete}))
         return
-    report(searches, written, runs, complete)
-    if not complete and not written and not any(search.pending for search in searches):
+    _report(searches, runs, complete)
+    if not complete and not any(each.written or each.pending for each in searches):
         raise OptionError("--budget does not hold one trial: give more time, or fewer --seeds or --epochs")
+
+
+def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
+    """Print the best settings of each search, its preset file, and what to type next."""
+    wide = table_console()
+    for each in searches:
+        if each.trials:
+            wide.print(each)
+        if each.written is not None:
+            wide.print(f"wrote {each.written}", markup=False, soft_wrap=True)
+    if len(searches) > 1:
+        counts = " and ".join(
+            f"{len(each.trials)} ({hours_text(each.core_seconds / 3600)} core-hours)" for each in searches
+        )
+        wide.print(
+            f"trials of {' and '.join(each.base.model.name for each in searches)}: {counts}", markup=False
+        )
+    waiting = sum(len(each.pending) for each in searches)
+    if waiting:
+        wide.print(
+            f"{waiting} trials wait for other processes or a queue: repeat this command when they have ended"
+        )
+    elif not complete:
+        left = sum(each.planned - each.asked for each in searches)
+        wide.print(f"the budget is spent, {left} trials are left: the same command continues")
+    for each in searches:
+        if each.written is None:
+            continue
+        base = each.base
+        words = ["run", "--task", each.request.task, "--model", base.model.name]
+        if base.algorithm.name != base.task.file.default_algorithm:
+            words += ["--algorithm", base.algorithm.name]
+        line = command(*words, "--preset", str(each.written), runs=runs)
+        wide.print(f"next: {line}", markup=False, soft_wrap=True)

@@ -1,21 +1,22 @@
-"""The progress display of `qrlsuite run`: what is being trained, how far it is, what is left, what it costs."""
+"""The progress of training as it is shown: what is trained, how far it is, what is left, what it will take."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from html import escape as escape_html
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn
 
 from qrlsuite import registry
-from qrlsuite.cli.terminal import command, counted
-from qrlsuite.experiment.entry import Entry
+from qrlsuite.engine.execution import Plan
+from qrlsuite.engine.terminal import command
 from qrlsuite.results.seeds import Group
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import counted, duration
 
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
@@ -32,22 +33,6 @@ SILENCE_SECONDS = 20.0
 DAY = 86400.0
 
 FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
-
-
-def hours_text(hours: float) -> str:
-    """Write core-hours to two digits, large ones as whole numbers."""
-    return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
-
-
-def duration(seconds: float) -> str:
-    """Write a duration as people say it."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    if seconds < 36 * 3600:
-        return f"{seconds / 3600:.1f} h"
-    return f"{seconds / 86400:.1f} days"
 
 
 class _Clock:
@@ -146,25 +131,94 @@ class CostEstimate:
         return None
 
 
+class Bar:
+    """One progress bar: on a terminal and in a notebook, nowhere else.
+
+    A notebook's bar is one output that is replaced, which needs no package beside the notebook's own.
+    """
+
+    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
+        self.console = console
+        self._columns = columns or (TaskProgressColumn(),)
+        self._live: Progress | None = None
+        self._cell: Any = None
+        self._bar: Any = None
+        self._total = 0.0
+
+    @property
+    def shown(self) -> bool:
+        """Whether there is a bar."""
+        return self._live is not None or self._cell is not None
+
+    def start(self, total: float, description: str) -> None:
+        """Show the bar, where it can be shown and is not yet."""
+        if self.shown or self.console.quiet or not self.console.is_terminal:
+            return
+        self._total = total
+        if self.console.is_jupyter:
+            from IPython.display import display  # in a notebook, it is there
+
+            self._cell = display(self._html(0.0, description, ""), raw=True, display_id=True)
+            return
+        self._live = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            *self._columns,
+            TextColumn("{task.fields[status]}", markup=False),
+            console=self.console,
+            transient=True,
+        )
+        self._live.start()
+        self._bar = self._live.add_task(description, total=total, status="")
+
+    def update(self, completed: float, description: str, status: str = "") -> None:
+        """Show how far it is."""
+        if self._live is not None:
+            self._live.update(self._bar, completed=completed, description=description, status=status)
+        elif self._cell is not None:
+            self._cell.update(self._html(completed, description, status), raw=True)
+
+    def stop(self) -> None:
+        """Take the bar away."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        if self._cell is not None:
+            self._cell.update({"text/html": "", "text/plain": ""}, raw=True)
+            self._cell = None
+
+    def _html(self, completed: float, description: str, status: str) -> dict[str, str]:
+        """Return the bar in the forms that a notebook chooses from."""
+        share = completed / self._total if self._total else 0.0
+        text = f"{description}  {share:.0%}  {status}"
+        bar = f"<progress value='{share:.4f}' max='1'></progress>"
+        return {"text/html": f"{bar} {escape_html(text)}", "text/plain": text}
+
+
 class RunDisplay:
-    """Shows one `qrlsuite run`: a live bar on a terminal, lines elsewhere, nothing when quiet."""
+    """Shows the training of one plan: a live bar on a terminal or in a notebook, lines elsewhere, nothing when quiet.
+
+    Parameters
+    ----------
+    workers:
+        Groups that are trained at a time.
+    again:
+        What continues the training once it has stopped: the command, or the call of a function.
+    """
 
     def __init__(
         self,
-        entry: Entry,
-        store: EntryStore,
-        seeds: Sequence[int],
-        epochs: int,
-        groups: Sequence[Group],
+        plan: Plan,
         workers: int,
-        quiet: bool,
+        quiet: bool = False,
+        again: Literal["command", "call"] = "command",
     ) -> None:
-        self.entry, self.store, self.seeds, self.epochs, self.groups = entry, store, seeds, epochs, groups
+        self.plan, self.entry, self.epochs, self.groups = plan, plan.entry, plan.epochs, plan.groups
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
-        self.estimate = CostEstimate(groups, epochs, workers)
-        self.workers = min(workers, max(1, len(groups)))
-        self.live: Progress | None = None
-        self.bar: Any = None
+        self.estimate = CostEstimate(plan.groups, plan.epochs, workers)
+        self.workers = min(workers, max(1, len(plan.groups)))
+        self.again = again
+        self.bar = Bar(self.console)
         self.deadline: float | None = None
         """The moment, by `time.monotonic`, at which training is stopped."""
         self.endless = False
@@ -174,19 +228,18 @@ class RunDisplay:
         self._last_line = time.monotonic()
         self._last: dict[str, dict[str, Any]] = {}
 
-    def begin(self, busy: Collection[int], submits: bool = False, holders: Sequence[str] = ()) -> None:
+    def begin(self, submits: bool = False, holders: Sequence[str] = ()) -> None:
         """Say what will be done, here or by tasks that are submitted and left.
 
         Parameters
         ----------
-        busy:
-            Seeds that others train, or that wait in a queue.
         holders:
-            Who trains them: `process 12 on HOST`.
+            Who trains the seeds that are busy: `process 12 on HOST`.
         """
-        task = self.entry.task
+        task, busy = self.entry.task, self.plan.busy
         self.console.print(
-            f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  ({escape(str(self.store.path))})"
+            f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  "
+            f"({escape(str(self.plan.store.path))})"
         )
         todo = sum(len(group.seeds) for group in self.groups)
         if busy:
@@ -196,34 +249,24 @@ class RunDisplay:
             nothing = "" if todo else ": nothing is left to do here"
             self.console.print(
                 f"{counted(len(busy), 'seed')} {waits if submits else are} being trained{who}{nothing}; repeat this "
-                "command when that has ended to see the whole",
+                f"{self.again} when that has ended to see the whole",
                 markup=False,
                 soft_wrap=True,
             )
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
-        there = len(self.seeds) - len(busy) - todo
+        there = len(self.plan.seeds) - len(busy) - todo
         places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
         parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
         parts += [f"{counted(there, 'seed')} already there"] * bool(there) + [f"{resumed} resume"] * bool(
             resumed
         )
-        end = "" if submits else " Ctrl-C saves; the same command continues."
+        end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
         if submits:
             return
-        if self.console.is_terminal:
-            self.live = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TaskProgressColumn(),
-                TextColumn("{task.fields[status]}"),
-                console=self.console,
-                transient=True,
-            )
-            self.live.start()
-            self.bar = self.live.add_task("starting", total=todo * self.epochs, status="")
+        self.bar.start(todo * self.epochs, "starting")
 
     def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
         """Show where every group stands."""
@@ -254,8 +297,8 @@ class RunDisplay:
         words += [f"median score {statistics.median(scores):.3f}"] if scores else []
         words += [f"{duration(left)} left"] if left is not None else ["measuring"]
         text = "  ".join(words)
-        if self.live is not None:
-            self.live.update(self.bar, completed=done, description="training", status=text)
+        if self.bar.shown:
+            self.bar.update(done, "training", text)
         elif now - self._last_line >= PLAIN_SECONDS:
             self._last_line = now
             self.console.print(text)
@@ -288,23 +331,24 @@ class RunDisplay:
 
     def close(self) -> None:
         """Take the live bar away."""
-        if self.live is not None:
-            self.live.stop()
-            self.live = None
+        self.bar.stop()
 
     def interrupted(self) -> None:
         """Say that everything is safe."""
         self.close()
-        self.console.print("stopped; every finished epoch is saved. The same command continues from there.")
+        self.console.print(
+            f"stopped; every finished epoch is saved. The same {self.again} continues from there."
+        )
 
     def out_of_time(self, minutes: float) -> None:
         """Say that training stopped as it was asked to, how far it is, and how to go on."""
         self.close()
         reached = [int(state.get("epoch") or 0) for state in self._last.values()] or [0]
         epochs = f"{min(reached)}" if min(reached) == max(reached) else f"{min(reached)} to {max(reached)}"
+        limit = "--minutes" if self.again == "command" else "`minutes`"
         self.console.print(
             f"stopped after {minutes:g} min, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "
-            "same command continues from there, and without --minutes to the end.",
+            f"same {self.again} continues from there, and without {limit} to the end.",
             soft_wrap=True,
         )
 
@@ -317,7 +361,6 @@ class RunDisplay:
         wanted = self.entry.task.file.protocol.seeds
         if summary["seeds"] < wanted:
             self.console.print(f"provisional: the task's protocol asks for {wanted} seeds")
-        runs = self.store.path.parent.parent
         name = self.entry.task.name
         for words in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
-            self.console.print(f"next: {command(*words, runs=runs)}", markup=False, soft_wrap=True)
+            self.console.print(f"next: {command(*words, runs=self.plan.runs)}", markup=False, soft_wrap=True)

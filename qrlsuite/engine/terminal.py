@@ -1,7 +1,8 @@
-"""Text of strangers in a terminal: names, summaries and errors of plugins, content of damaged files."""
+"""Text in a terminal: tables, commands to type next, and the text of strangers (plugins, damaged files)."""
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 import shutil
@@ -9,6 +10,16 @@ import sys
 from pathlib import Path
 
 from rich.console import Console
+
+
+class Shown:
+    """A result that prints itself with rich, in a terminal as in a notebook (`__rich_console__`)."""
+
+    def _repr_html_(self) -> str:
+        console = Console(record=True, file=io.StringIO(), width=130, highlight=False, force_jupyter=False)
+        console.print(self)
+        style = "white-space:pre;overflow-x:auto;line-height:normal;font-family:monospace"
+        return console.export_html(inline_styles=True, code_format=f"<pre style='{style}'>{{code}}</pre>")
 
 
 def table_console(least: int = 130) -> Console:
@@ -42,11 +53,6 @@ def _program() -> str:
         return f"{shlex.quote(sys.executable)} -m qrlsuite"
     here = Path.cwd()
     return shlex.quote(str(own.relative_to(here) if own.is_relative_to(here) else own))
-
-
-def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return a number of things: `1 seed`, `2 seeds`, `2 processes`."""
-    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def printable(text: object) -> str:

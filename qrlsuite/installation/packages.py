@@ -73,7 +73,7 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
     Returns
     -------
     tuple
-        What `qrlsuite.cli.probe` found, by step; and what failed, one line for each cause.
+        What `qrlsuite.installation.probe` found, by step; and what failed, one line for each cause.
     """
     names = [requirement.name.lower().replace("-", "_") for requirement in requirements()]
     modules = [name for name in names if importlib.util.find_spec(name) is not None]
@@ -81,7 +81,7 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
     doing = "start Python"
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "qrlsuite.cli.probe", *modules],
+            [sys.executable, "-P", "-m", "qrlsuite.installation.probe", *modules],
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,

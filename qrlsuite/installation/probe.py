@@ -1,7 +1,7 @@
 """What `qrlsuite doctor` tries in a process of its own, for a broken library may end the process: `probe MODULE...`.
 
 Writes a JSON object per line: `{"doing": ...}` before every step, then what it found. Keeps to the standard library
-until a step imports something.
+until a step imports something: imports stand inside the steps, so that what breaks is named.
 """
 
 from __future__ import annotations
@@ -13,12 +13,6 @@ import os
 import sys
 from collections.abc import Callable
 from typing import Any
-
-import numba
-import numpy as np
-from numba.core.dispatcher import Dispatcher
-
-from qrlsuite.circuit import Circuit, expectations
 
 
 def main(modules: list[str]) -> None:
@@ -64,6 +58,10 @@ def torch() -> dict[str, Any]:
 
 def simulator() -> dict[str, Any]:
     """Compute <Z> after a rotation by 0 and by pi, and return where compiled kernels are kept, by which numba."""
+    import numpy as np
+
+    from qrlsuite.circuit import Circuit, expectations
+
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0))
     found = expectations(circuit, np.array([[0.0], [np.pi]]), {}).tolist()
@@ -73,6 +71,7 @@ def simulator() -> dict[str, Any]:
 
 
 def _numba() -> dict[str, Any]:
+    import numba
 
     config: Any = numba.config  # its attributes are made at run time
     layers = []
@@ -89,6 +88,8 @@ def _numba() -> dict[str, Any]:
 
 def _caches() -> set[str]:
     """Return the folders in which the suite's compiled functions are kept."""
+    from numba.core.dispatcher import Dispatcher
+
     found = set()
     for name, module in list(sys.modules.items()):
         if name.startswith("qrlsuite."):

@@ -19,7 +19,7 @@ from packaging.specifiers import SpecifierSet
 
 import qrlsuite
 from qrlsuite import registry
-from qrlsuite.cli import installed
+from qrlsuite.installation import packages
 from qrlsuite.registry import words
 from qrlsuite.results.provenance import collect, processor
 from qrlsuite.results.store import entries
@@ -83,7 +83,7 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
 
 def _suite(found: Diagnosis) -> Facts:
 
-    location, stated = Path(qrlsuite.__file__).parent, installed.about()["version"]
+    location, stated = Path(qrlsuite.__file__).parent, packages.about()["version"]
     if not stated:
         found.broken.append(f"{location} is on the path, and not installed: pip install it")
     elif stated != qrlsuite.__version__:
@@ -95,7 +95,7 @@ def _suite(found: Diagnosis) -> Facts:
 
 def _python(found: Diagnosis) -> Facts:
 
-    needed = installed.about()["python"]
+    needed = packages.about()["python"]
     if not SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
         found.broken.append(f"Python {platform.python_version()} is not supported: qrlsuite needs {needed}")
     return {
@@ -135,25 +135,25 @@ def _quota() -> float | None:
 
 
 def _packages(found: Diagnosis) -> Facts:
-    needed = list(installed.requirements())
-    found.broken += filter(None, map(installed.lacking, needed))
-    return {requirement.name: installed.version(requirement) for requirement in needed}
+    needed = list(packages.requirements())
+    found.broken += filter(None, map(packages.lacking, needed))
+    return {requirement.name: packages.version(requirement) for requirement in needed}
 
 
 def _extras(found: Diagnosis) -> Facts:
     facts: Facts = {}
-    for extra in installed.about()["extras"]:
-        needed = list(installed.requirements(extra=extra))
+    for extra in packages.about()["extras"]:
+        needed = list(packages.requirements(extra=extra))
         facts[extra] = {
-            "versions": {requirement.name: installed.version(requirement) for requirement in needed},
-            "missing": [requirement.name for requirement in needed if installed.lacking(requirement)],
+            "versions": {requirement.name: packages.version(requirement) for requirement in needed},
+            "missing": [requirement.name for requirement in needed if packages.lacking(requirement)],
             "install": f"pip install 'qrlsuite[{extra}]'",
         }
     return facts
 
 
 def _tried(announce: Callable[[str], None], found: Diagnosis) -> Facts:
-    answers, failed = installed.attempt(announce)
+    answers, failed = packages.attempt(announce)
     found.broken += failed
     facts = {name: answers.get(name, {}) for name in ("torch", "simulator")}
     driver = Path("/proc/driver/nvidia/version").exists()

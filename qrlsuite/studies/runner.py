@@ -1,19 +1,28 @@
-"""What `qrlsuite study` plans: which entries lack what, in which order, and how much fits into a budget."""
+"""Running a study: which entries lack what, in which order they are trained, and how much fits into a budget."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from qrlsuite.cli.display import RunDisplay, duration
-from qrlsuite.cli.training import Place, Plan, plan, train
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from qrlsuite import registry
 from qrlsuite.engine.api import Outcome
+from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.execution import Execution, Plan, plan, train
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
+from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
-from qrlsuite.studies.study import Member
+from qrlsuite.results.text import duration, hours_text
+from qrlsuite.studies.study import Member, Study
 
 
 @dataclass(frozen=True)
@@ -65,10 +74,114 @@ class Item:
         }
 
 
+@dataclass(frozen=True)
+class Overview(Shown):
+    """A study's entries: what is there of each, and how long the rest will take with some workers."""
+
+    study: Study
+    items: Sequence[Item]
+    workers: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        costs = [item.seconds for item in self.items]
+        known = [cost for cost in costs if cost is not None]
+        return {
+            **self.study.file.model_dump(mode="json", exclude={"format_version", "entries", "pictures"}),
+            "entries": [item.as_dict() for item in self.items],
+            "workers": self.workers,
+            "core_hours_left": sum(known) / 3600,
+            "hours_left": sum(known) / 3600 / self.workers,
+            "complete_estimate": len(known) == len(costs),
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show the study's question, a row per entry, and what is left."""
+        file = self.study.file
+        yield Text(file.summary, style="bold")
+        if file.source:
+            yield Text(file.source)
+        if file.reports:
+            yield Text(f"Reported there: {file.reports}")
+        yield self._table() if self.items else Text("nothing to train")
+        lacking = [item for item in self.items if item.plan.groups]
+        if self.items and not lacking:
+            yield Text("everything is there")
+        elif self.items:
+            known = sum(item.seconds or 0.0 for item in lacking)
+            unknown = sum(item.seconds is None for item in lacking)
+            more = f", and {unknown} entries of unknown cost" if unknown else ""
+            yield Text(
+                f"left: about {duration(known / self.workers)} with {self.workers} "
+                f"worker{'s' * (self.workers != 1)} ({hours_text(known / 3600)} core-hours{more})"
+            )
+            for basis in dict.fromkeys(item.estimate.basis for item in lacking):
+                yield Text(f"  {basis}: {BASES[basis]}")
+        if file.core_hours is not None:
+            yield Text(f"the paper's software needed about {file.core_hours:,.0f} core-hours for all of it")
+        yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
+
+    def _table(self) -> Table:
+        table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+        for column in ("task", "entry", "seeds", "epochs", "core time left", "because"):
+            table.add_column(
+                column, justify="right" if column in ("seeds", "epochs") else "left", overflow="fold"
+            )
+        for item in self.items:
+            cost = item.seconds
+            busy = f" (+{len(item.plan.busy)} at work)" if item.plan.busy else ""
+            cells = (
+                item.plan.entry.task.name,
+                item.plan.entry.label,
+                f"{item.finished}/{len(item.plan.seeds)}{busy}",
+                str(item.plan.epochs),
+                "-" if cost == 0 else "?" if cost is None else duration(cost),
+                "" if cost == 0 else item.estimate.basis,
+            )
+            table.add_row(*map(Text, cells))
+        return table
+
+
+def select(
+    study: Study,
+    settings: Sequence[Setting] = (),
+    models: Mapping[str, str] | None = None,
+    only: Sequence[str] = (),
+) -> list[Member]:
+    """Return the entries of a study that are wanted.
+
+    Parameters
+    ----------
+    settings, models:
+        As for `Study.members`; every model that takes the place of another has to be registered.
+    only:
+        Words, of which an entry's group, label or task has one; or names of entries. Empty takes all.
+
+    Raises
+    ------
+    QrlSuiteError
+        For an unknown name or option, or where no entry is left.
+    """
+    for new in (models or {}).values():
+        registry.model(new)
+    members = study.members(settings, models)
+    if not only:
+        return members
+    kept = [member for member in members if any(_mentions(member, word) for word in only)]
+    if not kept:
+        raise OptionError(f"--only {' --only '.join(only)}: study '{study.name}' has no such entry")
+    return kept
+
+
+def _mentions(member: Member, word: str) -> bool:
+    entry = member.entry
+    return word == entry.name or any(word in text for text in (member.group, entry.label, entry.task.name))
+
+
 def survey(
     members: Sequence[Member],
     runs: Path,
-    where: Place,
+    execution: Execution,
     speeds: Speeds,
     seeds: Sequence[int] | None,
     epochs: int | None,
@@ -91,9 +204,7 @@ def survey(
     items = []
     unique = {(m.entry.task.name, m.entry.name): m.entry for m in members}
     for key, entry in unique.items():
-        wanted = list(seeds) if seeds is not None else list(range(entry.task.file.protocol.seeds))
-        last = epochs or entry.task.epochs(entry.algorithm.name)
-        work = plan(runs, entry, wanted, last, where)
+        work = plan(runs, entry, execution, seeds, epochs)
         items.append(Item(work, tuple(dict.fromkeys(groups[key])), speeds.estimate(entry)))
     return items
 
@@ -130,6 +241,23 @@ def fitting(item: Item, seconds: float, workers: int) -> list[int]:
     return sorted(chosen)
 
 
+def dry_run(items: Sequence[Item], budget: float | None, workers: int) -> list[dict[str, Any]]:
+    """Return what would be trained, in this order: `Item.as_dict` with the number of seeds, `would_train`.
+
+    Parameters
+    ----------
+    budget:
+        Seconds; None for all.
+    """
+    steps, left = [], budget
+    for item in cheapest_first(items):
+        chosen = item.plan.missing if left is None else fitting(item, left, workers)
+        steps.append({**item.as_dict(), "would_train": len(chosen)})
+        if left is not None and item.seconds is not None:
+            left -= item.seconds * len(chosen) / len(item.plan.missing) / workers
+    return steps
+
+
 def check_budget(items: Sequence[Item], budget: float, workers: int) -> None:
     """Refuse a budget into which not even one seed of the cheapest entry fits.
 
@@ -157,13 +285,14 @@ def check_budget(items: Sequence[Item], budget: float, workers: int) -> None:
 
 @dataclass
 class Session:
-    """One `study run`: entries trained one after another, until nothing is missing or the budget is used up."""
+    """One run of a study: entries trained one after another, until nothing is missing or the budget is used up."""
 
     runs: Path
-    where: Place
+    execution: Execution
     speeds: Speeds
     budget: float | None = None
     quiet: bool = False
+    again: Literal["command", "call"] = "command"
     submitted: list[str] = field(default_factory=list)
     trained: int = 0
     clock: Callable[[], float] = time.monotonic
@@ -174,8 +303,8 @@ class Session:
 
         Raises
         ------
-        typer.Exit
-            With code 130 after Ctrl-C, with everything saved.
+        KeyboardInterrupt
+            After Ctrl-C, with everything saved.
         QrlSuiteError
             If a group failed; finished epochs are kept.
         """
@@ -188,7 +317,7 @@ class Session:
                 chosen = item.plan.missing
                 if self.budget is not None:
                     left = self.budget - (self.clock() - began) - self._planned
-                    chosen = fitting(item, left, self.where.workers) if left > 0 else []
+                    chosen = fitting(item, left, self.execution.workers) if left > 0 else []
                 if not chosen:
                     left_over.append(item)
                     break
@@ -199,12 +328,10 @@ class Session:
         """Train some seeds of an item; returns what is left of it."""
         work = item.plan
         there = sorted(set(work.seeds) - set(work.missing) - set(work.busy))
-        part = plan(self.runs, work.entry, sorted([*there, *chosen]), work.epochs, self.where)
-        display = RunDisplay(
-            work.entry, part.store, part.seeds, part.epochs, part.groups, self.where.workers, quiet=self.quiet
-        )
+        part = plan(self.runs, work.entry, self.execution, sorted([*there, *chosen]), work.epochs)
+        display = RunDisplay(part, self.execution.workers, self.quiet, self.again)
         display.console.print(f"\n[bold]{title}[/bold]", end="  ")
-        outcome = train(part, self.where, display)
+        outcome = train(part, self.execution, display)
         return self._after(item, part, outcome)
 
     def _after(self, item: Item, part: Plan, outcome: Outcome) -> Item:
@@ -214,14 +341,14 @@ class Session:
             self.submitted.append(outcome.submitted)
             if item.estimate.seconds is not None:
                 todo = sum(len(group.seeds) * (work.epochs - group.epoch) for group in part.groups)
-                self._planned += todo * item.estimate.seconds / self.where.workers
+                self._planned += todo * item.estimate.seconds / self.execution.workers
             untouched = sorted(set(work.missing) - set(part.missing))
-            rest = plan(self.runs, work.entry, untouched, work.epochs, self.where)
+            rest = plan(self.runs, work.entry, self.execution, untouched, work.epochs)
         else:
             self.speeds.note(store)
             done = store.finished(part.missing, work.epochs)
             self.trained += len(done)
             stuck = set(part.missing) - done  # another process has them
             wanted = [seed for seed in work.seeds if seed not in stuck]
-            rest = plan(self.runs, work.entry, wanted, work.epochs, self.where)
+            rest = plan(self.runs, work.entry, self.execution, wanted, work.epochs)
         return Item(rest, item.groups, self.speeds.estimate(work.entry))

@@ -1,0 +1,202 @@
+"""Trained agents of some entries and reference policies on the same fresh episodes: a table and a histogram."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.progress import TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from qrlsuite.engine.display import Bar
+from qrlsuite.engine.terminal import Shown
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.pictures import histogram
+from qrlsuite.results import lookup
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import evaluation
+from qrlsuite.training.evaluation import Played
+
+WIDE = 100
+"""Columns of a terminal in which the whole table can be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(Shown):
+    """What policies earned on the same fresh episodes of one task.
+
+    Attributes
+    ----------
+    policies:
+        The entries' best trained agents in the order of the entries, then the reference policies.
+    episodes:
+        Complete episodes of each agent.
+    seed:
+        The evaluation seed, which fixes the episodes.
+    """
+
+    task: str
+    task_hash: str
+    policies: tuple[Played, ...]
+    episodes: int
+    seed: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values: mean, percentiles and extremes of every policy."""
+        return {
+            "task": self.task,
+            "task_hash": self.task_hash,
+            "evaluation_seed": self.seed,
+            "episodes": self.episodes,
+            "selection": "last validation score",
+            "policies": [each.summary() for each in self.policies],
+        }
+
+    def figure(self) -> Figure:
+        """Draw the histogram of the episodes' sums of rewards."""
+        note = ""
+        if any(each.seeds for each in self.policies):
+            note = (
+                "agents: the best runs by last validation score; episodes: fresh, the same for all policies"
+            )
+        values = {each.name: each.returns if each.seeds else each.returns[0] for each in self.policies}
+        return histogram.draw(values, quantity="sum of rewards over an episode", title=self.task, note=note)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show a row per policy; a narrow terminal shows means only."""
+        wide = options.max_width >= WIDE
+        relative = any(each.scores is not None for each in self.policies)
+        notes = self._notes()
+        if not wide:
+            notes.append(f"a terminal of {WIDE} columns shows medians and percentiles too")
+        table = Table(
+            title=Text(f"{self.task}: {self.episodes} fresh episodes of each policy, the same for all"),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text("\n".join(notes)),
+            caption_justify="left",
+            pad_edge=False,
+        )
+        names = ["policy", "agents", "return: mean", "median", "5%", "95%"]
+        names += ["score: mean", "median", "5%", "95%"] * relative
+        shown = [i for i, name in enumerate(names) if wide or i < 2 or name.endswith("mean")]
+        for name in (names[i] for i in shown):
+            table.add_column(
+                Text(name),
+                justify="left" if name == "policy" else "right",
+                overflow="fold",
+                no_wrap=name != "policy",
+            )
+        for each in self.policies:
+            row = [
+                each.name,
+                str(len(each.seeds) or "-"),
+                *_row(each, "return"),
+                *_row(each, "score") * relative,
+            ]
+            row += [""] * (len(names) - len(row))
+            table.add_row(*(Text(row[i]) for i in shown))
+        yield table
+
+    def _notes(self) -> list[str]:
+        """Say how the agents were chosen, and what the choice promised against what came."""
+        notes = [
+            "return: sum of rewards; score: relative, as the task defines it; percentiles over all episodes"
+        ]
+        for each in self.policies:
+            if not each.seeds:
+                continue
+            among = f"the {len(each.seeds)} of {each.runs} runs with the best last validation score"
+            promised = f"(mean {np.mean(each.validation):.3f}"
+            came = "" if each.scores is None else f"; on these fresh episodes {each.scores.mean():.3f}"
+            notes.append(f"{each.name}: {among} {promised}{came})")
+        return notes
+
+
+def _row(played: Played, what: str) -> list[str]:
+    content = played.summary()[what]
+    if content is None:
+        return []
+    digits = 3 if what == "score" else 2
+    return [f"{content[name]:.{digits}f}" for name in ("mean", "p50", "p5", "p95")]
+
+
+def evaluate(
+    runs: Path,
+    names: Sequence[str],
+    task: str | None = None,
+    best: int = 10,
+    episodes: int = 1000,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: bool = True,
+) -> Evaluation:
+    """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
+
+    Parameters
+    ----------
+    runs:
+        The results folder.
+    names:
+        The entries, of one task, as `qrlsuite.leaderboard.collect.find` finds them.
+    task:
+        Look among the entries of this task only.
+    best, episodes, seed, device:
+        As for `qrlsuite.training.evaluation.trained`.
+    progress:
+        Whether to show a bar.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have a name, or no task has the name given.
+    OptionError
+        If no entry is named, the entries belong to several tasks, or a number is not positive.
+    StoreError
+        If an entry has no trained agent.
+    """
+    lookup.check_tasks(runs, task)
+    if not names:
+        raise OptionError("name at least one entry to evaluate")
+    tasks = [task] if task else []
+    folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in names)
+    stores = [EntryStore(folder) for folder in folders]
+    _one_task(stores)
+    bar = Bar(Console(stderr=True, quiet=not progress, highlight=False), TimeRemainingColumn())
+
+    def report(name: str, done: int, total: int) -> None:
+        bar.start(total, name)
+        bar.update(done, name, f"{done}/{total} episodes")
+        if done == total:
+            bar.stop()
+
+    try:
+        played = [evaluation.trained(store, best, episodes, seed, device, report) for store in stores]
+        entry = stores[0].entry()
+        references = evaluation.references(entry, episodes, seed, report)
+    finally:
+        bar.stop()
+    labels = [each.name for each in played]
+    played = [
+        each if labels.count(each.name) == 1 else replace(each, name=f"{each.name} {store.path.name[-8:]}")
+        for each, store in zip(played, stores)
+    ]
+    return Evaluation(entry.task.name, entry.task.hash, (*played, *references), episodes, seed)
+
+
+def _one_task(stores: Sequence[EntryStore]) -> None:
+    tasks = {store.record()["task_hash"]: store.record()["task_name"] for store in stores}
+    if len(tasks) > 1:
+        raise OptionError(
+            f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes and sums "
+            "cannot be compared: evaluate them one by one"
+        )

@@ -1,0 +1,181 @@
+"""A picture from its name: which entries, or which task's environment, it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from matplotlib.figure import Figure
+
+from qrlsuite import options, registry, specs
+from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
+from qrlsuite.experiment import task as task_files
+from qrlsuite.leaderboard import collect, pictures
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.results import lookup
+from qrlsuite.specs import EnvironmentSpec, PictureSpec
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A picture, and what it shows.
+
+    Attributes
+    ----------
+    entries:
+        Empty for a picture of no entries.
+    tasks:
+        The tasks of the entries, or those whose environment is shown.
+    left_out:
+        One line for each entry that was left out and why.
+    """
+
+    figure: Figure
+    entries: tuple[EntryCurves, ...] = ()
+    tasks: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+
+def compose(
+    kind: str,
+    tasks: Sequence[str] = (),
+    entries: Sequence[str | EntryCurves] = (),
+    *,
+    horizon: int | None = None,
+    min_seeds: int = 1,
+    runs: Path,
+    published: bool = False,
+    settings: Mapping[str, Any],
+    environment: Mapping[str, Any],
+) -> Composed:
+    """Choose what a picture shows, and draw it.
+
+    Parameters
+    ----------
+    kind:
+        A name of `summaries`.
+    tasks, entries, horizon, min_seeds, runs, published:
+        As for `qrlsuite.leaderboard.collect.select`.
+    settings:
+        The picture's settings by name.
+    environment:
+        For a picture of an environment: options that replace the task's.
+
+    Raises
+    ------
+    UnknownNameError
+        If a picture, task or entry is unknown, or there are no entries.
+    OptionError
+        If a setting is unknown or has a bad value, or the picture cannot be made of these entries or tasks.
+    PluginError
+        If a plugin's picture returns no figure.
+    """
+    spec = find(kind, tasks)
+    if spec is not None:
+        return Composed(_of_environment(kind, spec, tasks, settings, environment), tasks=tuple(tasks))
+    if environment:
+        raise OptionError(
+            f"--set environment.{next(iter(environment))}: picture '{kind}' shows what was trained"
+        )
+    of = pictures.KINDS[kind].of
+    if of == "episodes":
+        raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
+    given = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
+    if of == "nothing":
+        if any(given.values()):
+            name = next(name for name, value in given.items() if value)
+            raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
+        return Composed(pictures.draw(kind, (), **settings))
+    cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
+    own = {"horizon": horizon} if cuts and horizon is not None else {}
+    lookup.check_tasks(runs, *tasks)
+    found, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
+    if not entries:
+        found.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
+        found = [replace(entry, color=place) for place, entry in enumerate(found)]
+        if cuts:
+            found, short = collect.equally_long(found)
+            left_out += short
+    held = sorted({entry.task for entry in found})
+    if not found:
+        wanted = f" of task {' or '.join(tasks)}" if tasks else ""
+        raise UnknownNameError(
+            f"{runs} holds no results{wanted} yet: qrlsuite run; --published draws those that come with the suite"
+        )
+    if len(held) > 1 and not tasks and not entries:
+        raise OptionError(f"{runs} holds several tasks; choose with --task {' or --task '.join(held)}")
+    figure = pictures.draw(kind, found, **{**own, **settings})
+    return Composed(figure, tuple(found), tuple(dict.fromkeys(e.task for e in found)), tuple(left_out))
+
+
+def settings_of(kind: str, tasks: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Return the settings of a picture: name, default, accepted values and description."""
+    spec = find(kind, tasks)
+    return options.describe(specs.resolve(pictures.KINDS[kind].options if spec is None else spec.options))
+
+
+def summaries() -> dict[str, str]:
+    """Return one line for every picture; those of environments say of which."""
+    lines = {name: picture.summary for name, picture in pictures.KINDS.items()}
+    for name, owners in _environment_pictures().items():
+        summary = next(iter(owners.values())).summary
+        lines.setdefault(name, f"{summary} (tasks of {', '.join(owners)})")
+    return lines
+
+
+def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
+    """Return the pictures that environments bring: by picture, then by environment."""
+    found: dict[str, dict[str, PictureSpec]] = {}
+    for registered in registry.load().entries["environments"].values():
+        spec = cast(EnvironmentSpec, registered.spec)
+        for picture in spec.pictures:
+            found.setdefault(picture.name, {})[spec.name] = picture
+    return found
+
+
+def find(kind: str, tasks: Sequence[str]) -> PictureSpec | None:
+    """Return the environment's picture of that name, None for one of the suite's own kinds.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no picture of that name.
+    OptionError
+        If the tasks' environment has no such picture, or several environments have one and no task is named.
+    """
+    if kind in pictures.KINDS:
+        return None
+    owners = _environment_pictures().get(kind)
+    if owners is None:
+        raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, summaries())}")
+    if not tasks:
+        if len(owners) == 1:
+            return next(iter(owners.values()))
+        raise OptionError(f"several environments have a picture '{kind}': choose one with --task TASK")
+    environment = task_files.load(tasks[0]).environment.name
+    if environment not in owners:
+        raise OptionError(
+            f"picture '{kind}' shows tasks of {', '.join(owners)}; '{tasks[0]}' is a task of {environment}"
+        )
+    return owners[environment]
+
+
+def _of_environment(
+    kind: str, spec: PictureSpec, tasks: Sequence[str], own: Mapping[str, Any], world: Mapping[str, Any]
+) -> Figure:
+    """Draw a picture that an environment brings, of one or several tasks."""
+    if not tasks:
+        raise OptionError(f"picture '{kind}' shows the environment of a task: add --task TASK")
+    loaded = [task_files.load(name).with_environment(dict(world)) for name in tasks]
+    if len({task.environment.name for task in loaded}) > 1:
+        raise OptionError(f"picture '{kind}': {' and '.join(tasks)} have different environments")
+    chosen = options.build(specs.resolve(spec.options), dict(own), f"picture '{kind}'")
+    figure = specs.resolve(spec.draw)({task.name: task.environment_options for task in loaded}, chosen)
+    if not isinstance(figure, Figure):
+        raise PluginError(
+            f"picture '{kind}' of environment '{loaded[0].environment.name}' returned {type(figure).__name__}, "
+            "not a matplotlib.figure.Figure"
+        )
+    return figure

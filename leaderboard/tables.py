@@ -1,0 +1,293 @@
+"""Boards and comparisons as text: tables for a terminal and a notebook, Markdown, CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from html import escape
+from typing import TYPE_CHECKING, Literal
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from qrlsuite.leaderboard.absent import absent
+from qrlsuite.results.text import steps_text
+from qrlsuite.statistics import Comparison
+
+if TYPE_CHECKING:  # boards show themselves by this module
+    from qrlsuite.leaderboard.board import Leaderboard, Row, Section
+
+COLUMNS = (
+    "tier",
+    "rests on",
+    "entry",
+    "parameters",
+    "seeds",
+    "S_hat (5%-95%)",
+    "score",
+    "cells +/-",
+    "outperforms",
+    "outperformed by",
+    "hours",
+)
+SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
+"""What a spreadsheet shows of the win that a tier rests on."""
+NUMERIC = {"rests on", "parameters", "seeds", "score", "cells +/-", "hours"}
+WIDE = 150
+"""Characters per line in which the whole table can be read."""
+LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells +/-", "hours")))
+"""What a narrower one leaves out: the first where it has so many columns, else the second too."""
+
+
+def cells(section: Section, row: Row) -> tuple[str, ...]:
+    """Return an entry's cells, one per column of `COLUMNS`."""
+    entry = row.entry
+    classical, quantum = entry.parameters
+    return (
+        tier_text(row),
+        row.rests_on.text if row.rests_on is not None else "-",
+        entry.label,
+        f"{classical} + {quantum} q" if quantum else str(classical),
+        f"{len(entry.seeds)}" + "*" * row.provisional,
+        row.reference.text,
+        f"{row.median_score:.3f}",
+        f"{row.wins}/{row.losses}",
+        _names(row.outperforms, [r for r in section.rows if r.depth > row.depth], "all lower tiers"),
+        _names(row.outperformed_by, [r for r in section.rows if 0 < r.depth < row.depth], "all higher tiers"),
+        f"{entry.hours:.2f}",
+    )
+
+
+def tier_text(row: Row) -> str:
+    """Return the tier, or in a word why there is none."""
+    if row.tier is not None:
+        return str(row.tier)
+    return "not reached" if row.not_reached else "undecided"
+
+
+def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
+    """List a few names; many that are all the entries on one side of the board are called so."""
+    if len(names) > 1 and sorted(names) == sorted(row.entry.label for row in others):
+        return everyone
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") or "-"
+
+
+def notes(section: Section) -> list[str]:
+    """Explain the marks that occur in a section."""
+    lines = sorted({row.reason for row in section.rows if row.reason})
+    if any(row.rests_on for row in section.rows):
+        lines.append(
+            "rests on: cells of the narrowest win in the chain of wins above an entry, of the cells in which not "
+            "both are at the cap"
+        )
+    if any(row.provisional for row in section.rows):
+        wanted = section.rows[0].entry.task_file.protocol.seeds
+        lines.append(f"* provisional: the protocol asks for {wanted} seeds")
+    if any(row.reference.unsettled for row in section.rows):
+        lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
+    if any(row.entry.parameters[1] for row in section.rows):
+        lines.append("q: quantum parameters")
+    missing = sorted({name for row in section.rows for name in absent(row.entry)})
+    if missing:
+        lines.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
+    seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
+    if seen:
+        lines.append(
+            f"settings chosen after seeing runs on protocol seeds, which may flatter: {', '.join(seen)}"
+        )
+    mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
+    if mixed:
+        lines.append(
+            "made with several versions, see `qrlsuite show ENTRY`: "
+            + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
+        )
+    lines.append(
+        "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
+    )
+    return [*lines, "score: median over seeds after the last epoch; hours: core-hours"]
+
+
+def title(section: Section) -> str:
+    """Return the heading of a section."""
+    note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
+    return f"{section.task}, {steps_text(section.horizon)} steps{note}, S_hat at {section.cell}"
+
+
+def _left_out(width: int) -> list[str]:
+    """Return the columns for which a table of some width has no room."""
+    left_out: list[str] = []
+    for enough, names in LEFT_OUT if width < WIDE else ():
+        left_out += names
+        if width >= enough:
+            break
+    return left_out
+
+
+def section_table(section: Section, width: int = WIDE) -> Table:
+    """Return a section as a table for a terminal of some width, without the columns for which there is no room."""
+    remarks, left_out = notes(section), _left_out(width)
+    shown = [name for name in COLUMNS if name not in left_out]
+    if left_out:
+        remarks.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
+    found = table(
+        shown,
+        title=title(section),
+        caption="\n".join(remarks),
+        left=[name for name in shown if name not in NUMERIC],
+        fixed=[name for name in shown if name in NUMERIC or name.startswith("S_hat")],
+    )
+    for row in section.rows:
+        texts = dict(zip(COLUMNS, cells(section, row)))
+        found.add_row(*(Text(texts[name]) for name in shown))
+    return found
+
+
+def table(
+    columns: Sequence[str],
+    *,
+    title: str | None = None,
+    caption: str | None = None,
+    left: Sequence[str] = (),
+    fixed: Sequence[str] = (),
+) -> Table:
+    """Return an empty table as all commands show them.
+
+    Parameters
+    ----------
+    columns:
+        Their names. Numbers stand at the right.
+    title, caption:
+        What stands above and below it.
+    left:
+        Columns of words, which stand at the left.
+    fixed:
+        Columns that are never broken into several lines.
+    """
+    found = Table(
+        title=None if title is None else Text(title),
+        title_justify="left",
+        header_style="bold",
+        box=box.SIMPLE_HEAD,
+        caption=None if caption is None else Text(caption),
+        caption_justify="left",
+        pad_edge=False,
+    )
+    for name in columns:
+        justify: Literal["left", "right"] = "left" if name in left else "right"
+        found.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
+    return found
+
+
+def markdown(board: Leaderboard) -> str:
+    """Return a board as Markdown: a heading, a table and notes per section."""
+    lines = []
+    for section in board.sections:
+        lines += [f"### {title(section)}", "", f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
+        for row in section.rows:
+            texts = (cell.replace("|", "\\|").replace("<", "&lt;") for cell in cells(section, row))
+            lines.append(f"| {' | '.join(texts)} |")
+        lines += ["", *(f"{note.replace('*', chr(92) + '*')}  " for note in notes(section)), ""]
+    return "\n".join(lines)
+
+
+def csv_text(board: Leaderboard) -> str:
+    """Write one line per entry and section; lists are separated by semicolons."""
+    rows = []
+    for section in board.as_dict()["sections"]:
+        for row in section["rows"]:
+            low, high = row.pop("interval")
+            count = row.pop("parameters")
+            tuning = row.pop("tuning") or {}
+            tuned, on_protocol_seeds = bool(tuning), bool(tuning.get("on_protocol_seeds"))
+            support = row.pop("rests_on") or {}
+            flat = {
+                **{name: section[name] for name in ("task", "horizon", "cell")},
+                **row,
+                "parameters_classical": count["classical"],
+                "parameters_quantum": count["quantum"],
+                **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
+                "interval_low": low,
+                "interval_high": high,
+                "tuned": tuned,
+                "tuned_on_protocol_seeds": on_protocol_seeds,
+                "rule": board.rule,
+            }
+            rows.append({k: "; ".join(v) if isinstance(v, list) else v for k, v in flat.items()})
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _harmless(value) for name, value in row.items()} for row in rows)
+    return buffer.getvalue()
+
+
+def _harmless(value: object) -> object:
+    """Keep spreadsheets from reading a name as a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+def board_html(board: Leaderboard) -> str:
+    """Return a board as HTML for a notebook: every section with its heading, table and notes."""
+    parts = []
+    for section in board.sections:
+        rows = [cells(section, row) for row in section.rows]
+        parts.append(html_table(COLUMNS, rows, title(section), notes(section)))
+    parts += [f"<p>left out: {escape(line)}</p>" for line in board.refused]
+    return "\n".join(parts) or "<p>no entries</p>"
+
+
+def html_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], heading: str = "", remarks: Sequence[str] = ()
+) -> str:
+    """Return a table as HTML; every text is escaped."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in columns)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    return (
+        (f"<p><b>{escape(heading)}</b></p>" if heading else "")
+        + f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        + "".join(f"<p><small>{escape(line)}</small></p>" for line in remarks)
+    )
+
+
+SYMBOLS = {
+    "win": ("+", "bold bright_blue", "significantly fewer samples"),
+    "loss": ("-", "bold dark_orange", "significantly more samples"),
+    "tie": (".", "dim", "no significant difference"),
+    "both-at-cap": ("^", "dim", "both at the cap"),
+    "undecided": ("?", "yellow", "undecided"),
+}
+"""What a cell of a comparison looks like; the sign says everything, the color only helps."""
+
+
+def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
+    """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
+    grid = comparison.grid
+    rows = [f"{float(level):g}" for level in grid.levels]
+    return f"{grid.level_name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Return a comparison as a table: a sign per cell of the grid."""
+    heading, rows, deltas = _levels(comparison)
+    found = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(heading), title_justify="left")
+    found.add_column("", justify="right")
+    for delta in deltas:
+        found.add_column(Text(delta), justify="center")
+    for name, verdicts in zip(rows, comparison.verdicts):
+        found.add_row(Text(name), *(Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts))
+    return found
+
+
+def legend(comparison: Comparison) -> str:
+    """Explain the signs that occur in a comparison's table."""
+    there = {str(verdict) for row in comparison.verdicts for verdict in row}
+    return ", ".join(f"{sign} {words}" for name, (sign, _, words) in SYMBOLS.items() if name in there)
+
+
+def comparison_html(comparison: Comparison, headline: str, further: Sequence[str] = ()) -> str:
+    """Return a comparison as HTML for a notebook: the result in words, and a sign per cell of the grid."""
+    heading, rows, deltas = _levels(comparison)
+    signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
+    remarks = [heading, legend(comparison), *further]
+    return html_table(["", *deltas], signs, f"{headline}: {comparison.sentence}", remarks)

@@ -1,0 +1,663 @@
+"""The suite from Python: what the commands do, as functions that return what they found.
+
+    from qrlsuite import api
+
+    small = api.train("beam6g", "mlp", options={"width": 16}, seeds=8, epochs=10)
+    large = api.load("mlp width=64", task="beam6g", published=True)
+    api.compare(large, small)
+    api.board("beam6g", published=True)
+    api.plot("curves", entries=[small, large])
+    api.evaluate("mlp width=16", best=4)
+
+What they return shows itself: as a table in a notebook, and printed by rich in a terminal. Their errors are those of
+`qrlsuite.errors`; where a message names an option of a command, such as `--task`, the argument has the same name.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from matplotlib.figure import Figure
+from rich.console import Console, ConsoleOptions, RenderResult
+
+from qrlsuite.engine import execution
+from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.execution import Execution
+from qrlsuite.engine.terminal import Shown
+from qrlsuite.errors import OptionError, nearest
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard import board as boards
+from qrlsuite.leaderboard import collect, rules, studies
+from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures.compose import compose
+from qrlsuite.leaderboard.studies import Drawn
+from qrlsuite.options import from_mapping
+from qrlsuite.results import lookup, speed
+from qrlsuite.results.seeds import read_seeds
+from qrlsuite.studies import runner as study_runner
+from qrlsuite.studies import study as study_files
+from qrlsuite.training import trackers
+from qrlsuite.tuning import runner as tuning_runner
+from qrlsuite.tuning import space
+from qrlsuite.tuning.display import TuneDisplay
+from qrlsuite.tuning.search import Request, Search, tuning_seeds
+
+if TYPE_CHECKING:
+    from qrlsuite.leaderboard.evaluation import Evaluation
+
+__all__ = ["board", "compare", "evaluate", "load", "plot", "run_study", "train", "tune"]
+
+Seeds = int | str | Iterable[int]
+"""100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
+
+
+def load(
+    entry: str, *, task: str | None = None, runs: str | PathLike[str] = "runs", published: bool = False
+) -> EntryCurves:
+    """Read an entry: the learning curves of its seeds, and how they were made.
+
+    Parameters
+    ----------
+    entry:
+        Its name or label, `TASK/` before it or not, or the beginning of one of them; or its folder.
+    task:
+        Look among the entries of this task only; None looks among all.
+    runs:
+        The results folder.
+    published:
+        Look among the published entries that come with the suite, too. Of an entry that is in both, the copy that
+        gets further, then that with more seeds, is read.
+
+    Returns
+    -------
+    EntryCurves
+        With `curves` of shape (N, T): the mean validation score of N seeds after each of T epochs, in the task's
+        units ([0, 1] where scores are fractions of the optimum); `steps_per_epoch` environment steps each;
+        `records` by seed; `to_table()` for pandas and polars.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry or several have the name, or no epoch of it is finished; the message says what to type.
+    StoreError
+        If there is no results folder, or a file is damaged.
+
+    Examples
+    --------
+    >>> load("mlp width=64", task="beam6g", runs="none-yet", published=True).curves.shape
+    (100, 100)
+    """
+    folder = Path(runs)
+    lookup.check_tasks(folder, task)
+    return collect.find(folder, entry, published, _several(task))
+
+
+def board(
+    tasks: str | Sequence[str] | None = None,
+    *,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str = rules.DEFAULT,
+    horizon: int | None = None,
+    entries: Sequence[str | EntryCurves] = (),
+    min_seeds: int = 1,
+) -> Leaderboard:
+    """Rank entries by significant outperformance, task by task.
+
+    Parameters
+    ----------
+    tasks:
+        A task or several; None means all.
+    runs, published:
+        As for `load`.
+    rule:
+        What counts as significant: a name of `qrlsuite list significance-tests`.
+    horizon:
+        Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
+    entries:
+        Rank these only: what `load` accepts, or what it returns.
+    min_seeds:
+        Leave out entries with fewer seeds.
+
+    Returns
+    -------
+    Leaderboard
+        `sections`, one per task and horizon, with a row per entry; `refused`, one line for each entry that was left
+        out and why; `as_dict()`. Without any entry it has no section.
+
+    Raises
+    ------
+    UnknownNameError
+        If a task, an entry or the rule is unknown, or no entry is left.
+    OptionError
+        If the horizon is no whole number of epochs, or a paired rule meets entries of different seeds.
+    StoreError
+        If there is no results folder, and `published` is false.
+    PluginError
+        If a plugin's rule fails.
+
+    Examples
+    --------
+    >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
+    >>> [(row.tier, row.entry.label) for row in found.sections[0].rows]
+    [(1, 'ddqn mlp width=64'), (2, 'ddqn mlp width=16')]
+    """
+    folder, wanted = Path(runs), _several(tasks)
+    lookup.check_tasks(folder, *wanted)
+    found, left_out = collect.select(folder, wanted, entries, published, horizon, min_seeds)
+    return boards.build(found, left_out, rules.load(rule), horizon)
+
+
+def compare(
+    first: str | EntryCurves,
+    second: str | EntryCurves,
+    *,
+    task: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str = rules.DEFAULT,
+) -> EntryComparison:
+    """Say whether the first of two entries outperforms the second, cell by cell of the task's ranking grid.
+
+    Both are compared at equal numbers of seeds and equal horizons.
+
+    Parameters
+    ----------
+    first, second:
+        What `load` accepts, or what it returns.
+    task, runs, published:
+        As for `load`.
+    rule:
+        As for `board`.
+
+    Returns
+    -------
+    EntryComparison
+        `verdicts`, E rows of D cells; `points` of shape (2, E, D) and `intervals` of shape (2, E, D, 2), in
+        environment steps; `outcome`, and the same as a `sentence`; `as_dict()`.
+
+    Raises
+    ------
+    UnknownNameError
+        If an entry, the task or the rule is unknown.
+    QrlSuiteError
+        If the entries belong to different tasks, their lengths have no common horizon, or a paired rule finds no
+        common seed.
+
+    Examples
+    --------
+    >>> found = compare("mlp width=64", "mlp width=16", task="beam6g", runs="none-yet", published=True)
+    >>> str(found.outcome)
+    'outperforms'
+    """
+    one, other = (
+        entry if isinstance(entry, EntryCurves) else load(entry, task=task, runs=runs, published=published)
+        for entry in (first, second)
+    )
+    return boards.compare_entries(one, other, rules.load(rule))
+
+
+def plot(
+    kind: str,
+    *,
+    tasks: str | Sequence[str] | None = None,
+    entries: Sequence[str | EntryCurves] = (),
+    horizon: int | None = None,
+    min_seeds: int = 1,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    environment: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Figure:
+    """Draw a picture of entries, of a task's environment, or of the estimator.
+
+    Entries that would cut the others to their own length are left out, unless `entries` names them. A warning names
+    each entry that was left out.
+
+    Parameters
+    ----------
+    kind:
+        What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
+    tasks, entries, horizon, min_seeds, runs, published:
+        As for `board`. Without `entries` all of the task are drawn, the smallest model first.
+    environment:
+        For a picture of an environment: options that replace the task's.
+    settings:
+        The picture's own settings: `qrlsuite plot KIND --settings` lists them.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To show, change, or save with `figure.savefig`.
+
+    Raises
+    ------
+    UnknownNameError
+        If the kind, a task or an entry is unknown, or there are no entries.
+    OptionError
+        If a setting is unknown or has a bad value, or the picture cannot be made of these entries or tasks.
+    StoreError
+        If there is no results folder, and `published` is false.
+
+    Examples
+    --------
+    >>> plot("tiers", tasks="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
+    """
+    drawn = compose(
+        kind,
+        _several(tasks),
+        entries,
+        horizon=horizon,
+        min_seeds=min_seeds,
+        runs=Path(runs),
+        published=published,
+        settings=settings,
+        environment=environment or {},
+    )
+    for line in drawn.left_out:
+        warnings.warn(f"left out: {line}", stacklevel=2)
+    return drawn.figure
+
+
+def train(
+    task: str,
+    model: str,
+    *,
+    algorithm: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    preset: str | None = None,
+    seeds: Seeds | None = None,
+    epochs: int | None = None,
+    engine: str | Execution = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    minutes: float | None = None,
+    track: str | Sequence[str] = (),
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> EntryCurves | None:
+    """Train the missing seeds of an entry: a model and an algorithm on a task.
+
+    Interrupt it at any time: every finished epoch is saved, and the same call continues, to the same bytes as if it
+    had not been interrupted. More seeds or epochs add to what is there; a call for what is there trains nothing.
+
+    Parameters
+    ----------
+    task, model:
+        Registered names (`qrlsuite list tasks`, `qrlsuite list models`), or a task file's path.
+    algorithm:
+        A learning algorithm; None takes the task's.
+    options:
+        Options by name: `{"qubits": 6, "algorithm.gamma": 0.9, "environment.degree": 4}`.
+    preset:
+        One of the task's presets of settings, or a preset file's path.
+    seeds:
+        A number (100: seeds 0 to 99), the seeds themselves, or text ('0:20'); None takes the task's protocol.
+    epochs:
+        The epoch to which each is trained; None takes the task's protocol.
+    engine:
+        Where the work is done: a name (`qrlsuite list engines`), or what `qrlsuite.engine.execution.create` built
+        of a name and options.
+    workers:
+        Processes, or tasks in a queue; None takes one per core, or what the engine takes.
+    device:
+        `cpu`, `cuda` or `cuda:1`.
+    minutes:
+        Stop after this time, with every finished epoch saved.
+    track:
+        Trackers that watch, `NAME` or `NAME=TARGET`.
+    runs:
+        The results folder.
+    progress:
+        Whether to show a bar on a terminal or in a notebook, and lines elsewhere.
+
+    Returns
+    -------
+    EntryCurves
+        The entry with its learning curves (N, T), of all its seeds that are there; None where no epoch has finished
+        yet, for it was handed to a queue, or `minutes` were too few.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, TaskError
+        For an unknown name, or an option or argument that cannot be used.
+    StoreError
+        If a file of the entry is damaged.
+    QrlSuiteError
+        If training failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> entry = train("beam6g", "mlp", options={"width": 16}, seeds=2, epochs=1)  # doctest: +SKIP
+    >>> entry.curves.shape  # doctest: +SKIP
+    (2, 1)
+    """
+    entry = resolve(task, model, algorithm, from_mapping(options), preset)
+    watching = [track] if isinstance(track, str) else list(track)
+    wanted = None if seeds is None else read_seeds(seeds)
+    _check_positive("epochs", epochs)
+    where = _execution(engine, workers, device)
+    execution.check_minutes(minutes, where)
+    work = execution.plan(Path(runs), entry, where, wanted, epochs)
+    with trackers.asking(watching):
+        execution.train(work, where, RunDisplay(work, where.workers, not progress, "call"), minutes)
+    return collect.read(work.store)
+
+
+def evaluate(
+    entries: str | Sequence[str],
+    *,
+    task: str | None = None,
+    best: int = 10,
+    episodes: int = 1000,
+    seed: int = 0,
+    device: str = "cpu",
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> Evaluation:
+    """Play fresh episodes with the best trained agents of some entries, and with reference policies.
+
+    The agents are chosen by their last validation score; the episodes are others, the same for every policy, so the
+    choice does not raise the result.
+
+    Parameters
+    ----------
+    entries:
+        One or several entries of one task, each by name, label, the beginning of one of them, or folder.
+    task:
+        Look among the entries of this task only.
+    best:
+        How many agents of each entry.
+    episodes:
+        Complete episodes of each agent.
+    seed:
+        Another one gives other episodes.
+    device:
+        `cpu`, `cuda` or `cuda:1`.
+    runs:
+        The results folder.
+    progress:
+        Whether to show a bar on a terminal or in a notebook.
+
+    Returns
+    -------
+    Evaluation
+        With `policies`: `returns` (sums of rewards) and relative `scores`, each of shape (agents, episodes); a
+        `figure()`; and `as_dict()`.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have a name.
+    OptionError
+        If the entries belong to different tasks, or a number cannot be used.
+    StoreError
+        If an entry has no trained agent.
+
+    Examples
+    --------
+    >>> evaluate(["mlp width=64", "vqc-native"], best=10).figure().savefig("histogram.pdf")  # doctest: +SKIP
+    """
+    from qrlsuite.leaderboard import evaluation  # torch, which all other functions do without
+
+    _check_positive("best", best)
+    _check_positive("episodes", episodes)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
+    names = [entries] if isinstance(entries, str) else list(entries)
+    return evaluation.evaluate(Path(runs), names, task, best, episodes, seed, device, progress)
+
+
+def tune(
+    task: str,
+    model: str,
+    *,
+    algorithm: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    vary: Mapping[str, Any] | None = None,
+    grid: str | None = None,
+    sampler: Literal["grid", "one-at-a-time", "random", "tpe"] = "grid",
+    trials: int | None = None,
+    sampler_seed: int = 0,
+    seeds: Seeds = 20,
+    epochs: int | None = None,
+    objective: Literal["cell", "area"] = "cell",
+    minutes: float | None = None,
+    out: str | PathLike[str] | None = None,
+    engine: str | Execution = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> Search:
+    """Search settings with a small sample complexity, on seeds that entries are never judged by.
+
+    Interrupt it at any time: the same call continues, and ends with the same preset as if it had never stopped.
+
+    Parameters
+    ----------
+    task, model, algorithm, engine, workers, device, runs:
+        As for `train`. Trials lie below `runs`/tuning.
+    options:
+        Values that all trials share; they are not varied.
+    vary:
+        What is varied: lists of values, or ranges: `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`.
+    grid:
+        What is varied by a grid's name (`paper`) or a grid file's path; `vary` replaces options of it.
+    sampler:
+        All combinations, one option at a time, at random, or Optuna's TPE.
+    trials, sampler_seed:
+        For `random` and `tpe`: how many settings, and which.
+    seeds:
+        Runs of each trial: a number counts from seed 1,000,000.
+    epochs:
+        Of each trial; None takes the task's protocol.
+    objective:
+        What is minimized: S_hat at the task's reference `cell`, or its mean over the ranking grid (`area`).
+    minutes:
+        Begin no trial that would not end within this time. Every call gets it anew.
+    out:
+        The preset file, ending in .toml; None takes one below `runs`.
+    progress:
+        Whether to show what is searched, and a bar on a terminal or in a notebook.
+
+    Returns
+    -------
+    Search
+        With `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None where no trial
+        has finished, or some are `pending` in another process or a queue.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, TaskError
+        For an unknown name, or an option or argument that cannot be used.
+    QrlSuiteError
+        If a trial failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> found = tune("beam6g", "mlp", vary={"lr": [1e-3, 5e-4]}, seeds=20)  # doctest: +SKIP
+    >>> entry = train("beam6g", "mlp", preset=str(found.written))  # doctest: +SKIP
+    """
+    preset = None if out is None else Path(out)
+    if preset is not None and preset.suffix != ".toml":
+        raise OptionError(f"out = {str(out)!r}: the preset file's name ends in .toml")
+    _check_positive("epochs", epochs)
+    _check_positive("trials", trials)
+    where = _execution(engine, workers, device)
+    if minutes is not None and not 0 < minutes < float("inf"):
+        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
+    varied = {
+        name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
+    }
+    request = Request(
+        task=task,
+        model=model,
+        algorithm=algorithm,
+        settings=tuple(from_mapping(options)),
+        grid=None if grid is None else space.load(grid),
+        varied=tuple(from_mapping(varied)),
+        sampler=sampler,
+        trials=trials,
+        sampler_seed=sampler_seed,
+        seeds=tuning_seeds(seeds),
+        epochs=epochs,
+        objective=objective,
+    )
+    searches = tuning_runner.build([request], Path(runs))
+    display = TuneDisplay(searches, where.workers, not progress, "call")
+    display.begin()
+    budget = None if minutes is None else 60 * minutes
+    tuning_runner.run(searches, Path(runs), where, display, budget, preset)
+    return searches[0]
+
+
+@dataclass(frozen=True)
+class StudyRun(Shown):
+    """What is there of a study after it was run.
+
+    Attributes
+    ----------
+    overview:
+        Every entry with what is there and what is missing.
+    pictures:
+        Every picture with its `figure` and file (`path`), or the `problem` why there is none yet.
+    trained:
+        Seeds that this run finished.
+    submitted:
+        One line for each entry that was handed to a queue.
+    """
+
+    overview: study_runner.Overview
+    pictures: tuple[Drawn, ...]
+    trained: int
+    submitted: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            **self.overview.as_dict(),
+            "trained": self.trained,
+            "submitted": list(self.submitted),
+            "pictures": [each.as_dict() for each in self.pictures],
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show the overview, and where the pictures are."""
+        yield self.overview
+        for picture in self.pictures:
+            yield (
+                f"wrote {picture.path}" if picture.path else f"no picture '{picture.name}': {picture.problem}"
+            )
+
+
+def run_study(
+    name: str,
+    *,
+    options: Mapping[str, Any] | None = None,
+    models: Mapping[str, str] | None = None,
+    only: str | Sequence[str] = (),
+    seeds: Seeds | None = None,
+    epochs: int | None = None,
+    minutes: float | None = None,
+    format: Literal["png", "pdf", "svg"] = "png",
+    engine: str | Execution = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> StudyRun:
+    """Train what is missing of a study, the cheapest entry first, and draw its pictures from what is there.
+
+    Entries are those that `train` trains, in the same folders: nothing is trained twice.
+
+    Parameters
+    ----------
+    name:
+        A study (`qrlsuite study list`), or a study file's path.
+    options:
+        Options for every entry that has them, in the place of the study's own.
+    models:
+        Models in the place of others: `{"vqc-pennylane": "vqc-native"}`.
+    only:
+        Only entries whose group, label or task has this word or one of these; or entries by name.
+    seeds, epochs:
+        As for `train`; None takes each task's protocol.
+    minutes:
+        Stop at a group's end when this time is used up. The same call continues.
+    format:
+        Of the pictures, which are written into the results folder.
+    engine, workers, device, runs, progress:
+        As for `train`.
+
+    Returns
+    -------
+    StudyRun
+        With `pictures`, each with a matplotlib `figure`; an `overview` of the entries; and `as_dict()`.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, TaskError
+        For an unknown name, an option or argument that cannot be used, or `minutes` that hold not even one seed.
+    QrlSuiteError
+        If training failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> run_study("fig6", seeds=20, minutes=30)  # doctest: +SKIP
+    """
+    if format not in ("png", "pdf", "svg"):
+        raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
+    _check_positive("epochs", epochs)
+    if minutes is not None and not 0 < minutes < float("inf"):
+        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
+    where = _execution(engine, workers, device)
+    wanted = None if seeds is None else read_seeds(seeds)
+    study = study_files.load(name)
+    studies.check(study)
+    words = [only] if isinstance(only, str) else only
+    members = study_runner.select(study, from_mapping(options), models, words)
+    folder = Path(runs)
+    speeds = speed.known(folder)
+    items = study_runner.survey(members, folder, where, speeds, wanted, epochs)
+    budget = None if minutes is None else 60 * minutes
+    if budget is not None:
+        study_runner.check_budget(items, budget, where.workers)
+    session = study_runner.Session(folder, where, speeds, budget, not progress, "call")
+    session.run(items)
+    drawn = studies.write(study, members, folder, format)
+    after = study_runner.survey(members, folder, where, speeds, wanted, epochs)
+    overview = study_runner.Overview(study, after, where.workers)
+    return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
+
+
+def _execution(engine: str | Execution, workers: int | None, device: str) -> Execution:
+    """Return where training is done."""
+    if isinstance(engine, Execution):
+        if workers is not None or device != "cpu":
+            raise OptionError("workers and device belong to an engine that is built already: give them there")
+        return engine
+    _check_positive("workers", workers)
+    return execution.create(engine, workers, device=device)
+
+
+def _check_positive(name: str, value: int | None) -> None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise OptionError(f"{name} = {value!r}: give a whole number, 1 or more")
+
+
+def _several(names: str | Sequence[str] | None) -> Sequence[str]:
+    """Return names as a sequence."""
+    return [names] if isinstance(names, str) else names or []

@@ -1,0 +1,271 @@
+"""Training what is missing of an entry: an engine, a plan, the engine at work, and how it ended.
+
+Everything that trains goes through here: `run`, `tune` and `study` on the command line, and `qrlsuite.api`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from qrlsuite import registry, specs
+from qrlsuite.engine import api
+from qrlsuite.engine.api import Engine, Outcome
+from qrlsuite.engine.terminal import printable
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.claims import living
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import Group, plan_groups
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import device as devices
+
+if TYPE_CHECKING:
+    from qrlsuite.engine.display import RunDisplay  # which imports this module
+
+
+@dataclass(frozen=True)
+class Execution:
+    """Where training is done: an engine, as many groups at a time as `workers`, and their device.
+
+    Attributes
+    ----------
+    submits:
+        Whether the engine hands the groups to a queue and returns.
+    name:
+        The engine's name, for messages.
+    """
+
+    engine: Engine
+    workers: int
+    device: str = "cpu"
+    submits: bool = False
+    name: str = "local"
+
+    def run(self, work: Plan, show: api.Show) -> Outcome:
+        """Let the engine train the groups of a plan."""
+        return self.engine.run(
+            api.Work(work.store, work.groups, work.epochs, self.workers, self.device), show
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be trained of an entry.
+
+    Attributes
+    ----------
+    runs:
+        The results folder.
+    store:
+        The entry's folder in it, which need not exist yet.
+    seeds:
+        All seeds that were asked for.
+    epochs:
+        The epoch to which each is to be trained.
+    busy:
+        Those that another process trains, or that wait in a queue.
+    groups:
+        The rest of those that are missing.
+    """
+
+    runs: Path
+    entry: Entry
+    store: EntryStore
+    seeds: Sequence[int]
+    epochs: int
+    busy: frozenset[int] = frozenset()
+    groups: Sequence[Group] = field(default_factory=list)
+
+    @property
+    def missing(self) -> list[int]:
+        """The seeds of the groups, sorted."""
+        return sorted(seed for group in self.groups for seed in group.seeds)
+
+
+def create(
+    engine: str = "local",
+    workers: int | None = None,
+    options: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+) -> Execution:
+    """Build an engine by name.
+
+    Parameters
+    ----------
+    workers:
+        Groups that are trained at a time; None lets the engine choose.
+    options:
+        The engine's options; None stands for an option that was not given.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, QrlSuiteError
+        If there is no such engine, it has no such option or value, a package is not installed, or there can be
+        no such device.
+    """
+    devices.check(device)  # whether it is there is seen where the work is done
+    built = api.create(engine, options or {})
+    spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
+    return Execution(built, built.workers(workers), device, spec.submits, engine)
+
+
+def plan(
+    runs: Path,
+    entry: Entry,
+    execution: Execution,
+    seeds: Sequence[int] | None = None,
+    epochs: int | None = None,
+) -> Plan:
+    """Find out what of an entry is missing in a results folder; writes nothing.
+
+    Parameters
+    ----------
+    seeds, epochs:
+        None takes those of the task's protocol.
+
+    Raises
+    ------
+    StoreError
+        If the entry's folder is damaged, or belongs to another entry.
+    """
+    wanted = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
+    last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
+    store = EntryStore.find(runs, entry)
+    busy = {seed for claim in living(store) for seed in claim.seeds} | execution.engine.queued(store)
+    busy &= set(wanted)
+    missing = plan_groups(store, sorted(set(wanted) - busy), last, execution.workers)
+    return Plan(runs, entry, store, wanted, last, frozenset(busy), missing)
+
+
+class _TimeIsUp(Exception):
+    """Ends an engine's work as Ctrl-C does."""
+
+
+def check_minutes(minutes: float | None, execution: Execution) -> None:
+    """Refuse a time limit that cannot be kept.
+
+    Raises
+    ------
+    OptionError
+        If it is no positive, finite number, or the engine hands its work to a queue.
+    """
+    if minutes is None:
+        return
+    if not 0 < minutes < float("inf"):
+        raise OptionError(f"--minutes {minutes:g}: give a time, for example --minutes 2 or --minutes 0.5")
+    if execution.submits:
+        raise OptionError(
+            f"--minutes: engine '{execution.name}' leaves its tasks in a queue; give --time instead"
+        )
+
+
+def train(
+    work: Plan,
+    execution: Execution,
+    display: RunDisplay,
+    minutes: float | None = None,
+    confirmed: bool = True,
+) -> Outcome:
+    """Train what is planned, showing progress; returns how it ended.
+
+    Parameters
+    ----------
+    minutes:
+        After which training stops, with every finished epoch saved. None for no limit.
+    confirmed:
+        Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, when every worker has saved and ended.
+    QrlSuiteError
+        If a group failed; finished epochs are kept.
+    """
+    began = time.monotonic()
+
+    def show(snapshot: api.Snapshot) -> None:
+        display.update(snapshot)
+        if display.endless and not confirmed and minutes is None and display.console.is_terminal:
+            raise QrlSuiteError("stopped, for this takes more than a day: --yes starts it all the same")
+        if minutes is not None and time.monotonic() - began >= 60 * minutes:
+            raise _TimeIsUp
+
+    display.deadline = None if minutes is None else began + 60 * minutes
+    if not execution.submits and work.groups:
+        _check_device(execution.device)
+    fresh = not work.store.path.exists()
+    EntryStore.create(work.runs, work.entry)
+    holders = sorted({f"process {claim.pid} on {claim.host}" for claim in living(work.store)})
+    display.begin(execution.submits, holders)
+    if not work.groups:
+        return Outcome()
+    try:
+        outcome = execution.run(work, show)
+    except _TimeIsUp:
+        display.out_of_time(minutes or 0.0)
+        return Outcome()
+    except KeyboardInterrupt:
+        display.interrupted()
+        raise
+    finally:
+        display.close()
+    for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
+        display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
+    if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
+        _remove(work.store.path)
+        raise QrlSuiteError("; ".join(sorted(set(outcome.failed.values()))))
+    api.raise_failures(outcome)
+    for message in outcome.taken.values():
+        display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
+    return outcome
+
+
+def summarize(work: Plan) -> dict[str, Any]:
+    """Return what a finished (or partly finished) plan amounts to by now, as plain values."""
+    store, epochs = work.store, work.epochs
+    curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
+    complete = [curve.curve[:epochs] for curve in curves.values() if len(curve.scores) >= epochs]
+    return {
+        "task": work.entry.task.name,
+        "entry": work.entry.name,
+        "label": work.entry.label,
+        "folder": str(store.path),
+        "seeds": len(complete),
+        "epochs": epochs,
+        "median_score": float(np.median([curve[-1] for curve in complete])) if complete else None,
+    }
+
+
+def _check_device(name: str) -> None:
+    """Look whether there is such a device; torch is imported for a GPU only.
+
+    Raises
+    ------
+    OptionError
+        If this machine or this build of torch has none.
+    """
+    if name != "cpu":
+        devices.find(name)
+
+
+def _remove(folder: Path) -> None:
+    """Remove the folder of an entry of which nothing could be built, and those above it that are then empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
+
+
+def _warnings(store: EntryStore, group: Group) -> list[str]:
+    """Return what a group's worker left for the user to know."""
+    left = ProgressFile(store, group.id).read().get("warnings")
+    return [str(message) for message in left] if isinstance(left, list) else []

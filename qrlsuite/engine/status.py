@@ -1,0 +1,77 @@
+"""How far everything in a results folder is: what our own files say, and the queues that seeds were handed to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qrlsuite.engine.api import Queues
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.results import lookup
+from qrlsuite.results.store import entries
+from qrlsuite.results.survey import EntrySurvey, GroupStatus, groups, look
+
+
+@dataclass(frozen=True)
+class EntryStatus:
+    """An entry, and its groups that have not finished.
+
+    Attributes
+    ----------
+    queue_problem:
+        Why a queue that was handed some of its seeds did not answer; None where each did.
+    """
+
+    entry: EntrySurvey
+    groups: tuple[GroupStatus, ...]
+    queue_problem: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "task": self.entry.task,
+            "entry": self.entry.name,
+            "label": self.entry.label,
+            "seeds": dict(self.entry.seeds),
+            "problems": list(self.entry.problems),
+            "queue_problem": self.queue_problem,
+            "groups": [
+                {
+                    "seeds": list(group.seeds),
+                    "state": group.state,
+                    "where": group.where,
+                    "seconds_left": group.seconds_left,
+                    **{
+                        key: group.progress.get(key)
+                        for key in ("phase", "epoch", "epochs", "median_score", "error")
+                    },
+                }
+                for group in self.groups
+            ],
+        }
+
+
+def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
+    """Look at every entry of a results folder, or of one task in it; disturbs no worker.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such task.
+    StoreError
+        If there is no such folder.
+    """
+    lookup.check_tasks(runs, task)
+    found = []
+    queues = Queues()
+    for store in entries(runs, task):
+        entry, queued, problem = look(store), None, None
+        if entry.seeds.get("submitted"):
+            try:
+                queued = queues.waiting(store)
+                entry = look(store, queued)
+            except QrlSuiteError as error:
+                problem = str(error)
+        found.append(EntryStatus(entry, tuple(groups(store, queued)), problem))
+    return found

@@ -1,0 +1,76 @@
+"""What is registered, and what a plugin can do, as plain values: for lists, manuals and scripts."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from typing import Any
+
+from qrlsuite import hookspecs, options, registry, specs
+from qrlsuite.experiment.task import load
+
+
+def hooks() -> list[dict[str, str]]:
+    """Return every hook: its name, its signature, the first line of its manual and the manual."""
+    found = []
+    for name, function in vars(hookspecs).items():
+        if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec"):
+            manual = inspect.getdoc(function) or ""
+            arguments = ", ".join(inspect.signature(function).parameters)
+            summary = manual.partition("\n")[0]
+            row = {"name": name, "summary": summary, "signature": f"{name}({arguments})", "manual": manual}
+            found.append(row)
+    return found
+
+
+def describe(kind: str, name: str) -> dict[str, Any]:
+    """Return what there is to say about a registered thing, as plain values.
+
+    Parameters
+    ----------
+    kind:
+        One of `qrlsuite.registry.KINDS`.
+    name:
+        Under which it is registered.
+
+    Raises
+    ------
+    UnknownNameError
+        If nothing of that kind has the name.
+    """
+    registered = registry.load().get(kind, name)
+    spec = registered.spec
+    content: dict[str, Any] = {
+        "kind": registry.SINGULAR[kind],
+        "name": spec.name,
+        "summary": spec.summary,
+        "distribution": registered.distribution,
+    }
+    if isinstance(spec, specs.TaskSpec):
+        task = load(name)
+        content |= {
+            "hash": task.hash,
+            "path": spec.path,
+            **task.file.model_dump(mode="json", exclude={"name", "summary"}),
+        }
+        return content
+    for field in dataclasses.fields(spec):
+        if field.name == "family":
+            content["family"] = getattr(spec, field.name)
+    reference = getattr(spec, "options", None)
+    if reference:
+        content["options"] = options.describe(specs.resolve(reference))
+        content["set_with"] = _set_with(kind, name)
+    return content
+
+
+def _set_with(kind: str, name: str) -> str:
+    """Return what to type to change an option of a thing."""
+    if kind != "ansatzes":
+        return "--set NAME=VALUE"
+    for model, registered in registry.load().entries["models"].items():
+        if isinstance(registered.spec, specs.ModelSpec):
+            names = options.field_names(specs.resolve(registered.spec.options))
+            if {"ansatz", "ansatz_options"} <= set(names):
+                return f"qrlsuite run --model {model} --set ansatz={name} --set NAME=VALUE"
+    return "no installed model takes an ansatz"

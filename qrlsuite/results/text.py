@@ -1,0 +1,55 @@
+"""Numbers as tables, pictures and messages write them: steps, times, sizes and counts."""
+
+from __future__ import annotations
+
+
+def steps_text(steps: float, position: object = None) -> str:
+    """Write environment steps with at most four digits: 500, 44k, 107.9k, 1.25M, 8.6 billion.
+
+    Parameters
+    ----------
+    steps:
+        A number of environment steps.
+    position:
+        Ignored: with it, the function is a matplotlib formatter of tick labels.
+
+    >>> steps_text(107_900)
+    '107.9k'
+    """
+    for size, unit in ((1e9, " billion"), (1e6, "M"), (1e3, "k")):
+        if abs(steps) >= size:
+            return f"{steps / size:.4g}{unit}"
+    return f"{steps:.4g}"
+
+
+def hours_text(hours: float) -> str:
+    """Write core-hours with two digits, large ones as whole numbers: 0.044, 1.2, 1,234."""
+    return f"{hours:,.0f}" if hours >= 10 else f"{hours:.2g}"
+
+
+def duration(seconds: float) -> str:
+    """Write a time span in the unit that fits it: 80 s, 30 min, 2.5 h, 3.0 days."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    if seconds < 36 * 3600:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 86400:.1f} days"
+
+
+def size_text(size: int) -> str:
+    """Write a number of bytes: 812 B, 9.3 kB, 42 MB."""
+    amount = float(size)
+    for unit in ("B", "kB", "MB", "GB"):
+        if amount < 1000:
+            return f"{amount:.0f} {unit}" if amount >= 10 or unit == "B" else f"{amount:.1f} {unit}"
+        amount /= 1000
+    return f"{amount:.1f} TB"
+
+
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Write a number of things: `1 seed`, `2 seeds`, `3 entries`, `2 processes`."""
+    if number == 1:
+        return f"1 {noun}"
+    return f"{number:,} {plural or (f'{noun[:-1]}ies' if noun.endswith('y') else f'{noun}s')}"

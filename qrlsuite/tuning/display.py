@@ -1,0 +1,145 @@
+"""The progress of a search as it is shown: its size and cost, a bar, a line per trial."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from rich.console import Console
+
+from qrlsuite.engine.display import Bar
+from qrlsuite.engine.execution import Plan
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import speed
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import counted, duration, hours_text, steps_text
+from qrlsuite.tuning.objective import cell_text
+from qrlsuite.tuning.samplers import NAMES
+from qrlsuite.tuning.search import Search, Trial, merit_text
+from qrlsuite.tuning.space import text
+
+
+class TuneDisplay:
+    """Shows searches: a live bar on a terminal or in a notebook, a line per trial, nothing when quiet.
+
+    Parameters
+    ----------
+    again:
+        What continues a search once it has stopped: the command, or the call of a function, which shows no line per
+        trial beside a bar.
+    """
+
+    def __init__(
+        self,
+        searches: Sequence[Search],
+        workers: int,
+        quiet: bool = False,
+        again: Literal["command", "call"] = "command",
+    ) -> None:
+        self.searches, self.workers, self.again = searches, workers, again
+        self.console = Console(stderr=True, quiet=quiet, highlight=False)
+        self.bar = Bar(self.console)
+        self._began = time.monotonic()
+        self._trained = 0
+        self._work: Plan | None = None
+
+    def begin(self) -> None:
+        """Say how large each search is, and what it will cost as far as that is known."""
+        total: float | None = 0.0
+        bases: dict[str, None] = {}
+        for search in self.searches:
+            request, base = search.request, search.base
+            seeds = len(request.seeds)
+            lines = [
+                f"{base.label} on {base.task.name}: {search.planned} trials ({NAMES[request.sampler]}), each "
+                f"{seeds} seeds ({format_seeds(request.seeds)}) x {search.epochs} epochs, "
+                f"{steps_text(search.steps)} steps in all",
+                *(f"  {dimension.name}: {_short(dimension.plain())}" for dimension in search.space),
+                f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
+            ]
+            self.console.print("\n".join(lines), markup=False)
+            hours, basis = self._hours(search)
+            bases.setdefault(basis)
+            total = None if total is None or hours is None else total + hours
+        cores = self.workers
+        if total is None:
+            self.console.print("what it costs will be known after the first trial")
+        else:
+            self.console.print(
+                f"about {hours_text(total)} core-hours, {duration(total * 3600 / cores)} with "
+                f"{counted(cores, 'process', 'processes')} ({'; '.join(bases)}); finished trials cost nothing again"
+            )
+
+    def _hours(self, search: Search) -> tuple[float | None, str]:
+        """Return the core-hours of a whole search, None where unknown, and what that rests on."""
+        found = speed.known(search.runs, search.results).estimate(search.base)
+        basis = speed.BASES[found.basis]
+        if found.seconds is None:
+            return None, basis
+        return found.seconds * search.planned * len(search.request.seeds) * search.epochs / 3600, basis
+
+    def trial(self, entry: Entry, work: Plan) -> None:
+        """Show that a trial begins."""
+        self._work = work
+        self._trained += bool(work.groups)
+        if work.busy:
+            self.console.print(
+                f"{entry.label}: {len(work.busy)} runs are left to another process or a queue", markup=False
+            )
+        self.bar.start(sum(search.planned for search in self.searches), "tuning")
+        self.update({})
+
+    def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
+        """Show where the trial at work stands."""
+        if not self.bar.shown or self._work is None:
+            return
+        asked = sum(search.asked for search in self.searches)
+        work = self._work
+        epochs = [int(snapshot.get(group.id, {}).get("epoch") or group.epoch) for group in work.groups]
+        part = sum(epochs) / (len(epochs) * work.epochs) if epochs else 0.0
+        words = [f"trial {asked}/{sum(search.planned for search in self.searches)}"]
+        words += [f"epoch {min(epochs)}/{work.epochs}"] if epochs else []
+        words += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
+        left = self._left()
+        if left is not None:
+            words.append(f"{duration(left)} left")
+        self.bar.update(asked - 1 + part, "tuning", "  ".join(words))
+
+    def _left(self) -> float | None:
+        """Return the seconds left by the pace of the trials that were trained now; None before one was."""
+        done = self._trained - 1
+        if done < 1:
+            return None
+        left = sum(search.planned - search.asked + 1 for search in self.searches)
+        return (time.monotonic() - self._began) / done * left
+
+    def told(self, search: Search, trial: Trial | None) -> None:
+        """Show a trial's result."""
+        if trial is None or (self.again == "call" and self.bar.shown):
+            return
+        best = "  best so far" if search.best is trial else ""
+        several = f"{search.base.model.name}  " if len(self.searches) > 1 else ""
+        self.console.print(
+            f"{several}trial {trial.number}/{search.planned}  {text(trial.point)}: {merit_text(trial)}{best}",
+            markup=False,
+            soft_wrap=True,
+        )
+
+    def close(self) -> None:
+        """Take the live bar away."""
+        self.bar.stop()
+
+    def interrupted(self) -> None:
+        """Say that everything is safe."""
+        self.close()
+        done = sum(len(search.trials) for search in self.searches)
+        self.console.print(
+            f"stopped after {done} trials; every finished epoch is saved. The same {self.again} continues from there.",
+            soft_wrap=True,
+        )
+
+
+def _short(values: Any) -> str:
+    text = str(values)
+    return text if len(text) <= 100 else f"{text[:97]}..."

@@ -1,0 +1,219 @@
+"""The functions that read, from Python: on the published entries, and on bad input."""
+
+from __future__ import annotations
+
+import doctest
+import io
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute
+import pytest
+from rich.console import Console
+
+from qrlsuite import api
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.curves import EntryCurves
+from tests.conftest import HANGS
+from tests.core.test_dependencies import ALL
+
+WHERE: dict[str, Any] = {"runs": "no-results-yet", "published": True}
+
+
+@pytest.fixture(scope="module")
+def small() -> EntryCurves:
+    return api.load("mlp width=16", task="beam6g", **WHERE)
+
+
+@pytest.fixture(scope="module")
+def large() -> EntryCurves:
+    return api.load("beam6g/mlp width=64", **WHERE)
+
+
+def printed(thing: object, width: int = 200) -> str:
+    """What rich prints of something."""
+    console = Console(file=io.StringIO(), width=width)
+    console.print(thing)
+    text = console.file
+    assert isinstance(text, io.StringIO)
+    return text.getvalue()
+
+
+def test_an_entry_is_read_with_its_curves_and_records(small: EntryCurves) -> None:
+    assert small.curves.shape == (100, 100)
+    assert small.curves.dtype == np.float64
+    assert list(small.records) == list(small.seeds) == list(range(100))
+    assert {record["epochs"] for record in small.records.values()} == {100}
+    assert sum(record["hours"] for record in small.records.values()) == pytest.approx(small.hours)
+
+
+def test_runs_have_the_records_that_published_entries_have(
+    train: Callable[..., Path], tmp_path: Path, small: EntryCurves
+) -> None:
+    folder = train(tmp_path / "runs", [0, 1])
+    found = api.load(str(folder), runs=tmp_path / "runs")
+    assert list(found.records) == [0, 1]
+    assert found.records[0].keys() == small.records[0].keys()
+    assert all(record["finished"] and record["hours"] > 0 for record in found.records.values())
+    assert found.curves.shape == (2, found.records[0]["epochs"])
+
+
+def test_a_table_has_a_row_per_seed_and_epoch(small: EntryCurves) -> None:
+    table = small.to_table()
+    assert table.column_names == ["task", "entry", "seed", "epoch", "steps", "score"]
+    assert table.num_rows == small.curves.size
+    seventh = table.filter(pyarrow.compute.equal(table["seed"], 7)).to_pydict()
+    assert seventh["epoch"] == list(range(1, 101))
+    assert seventh["steps"] == [2000 * epoch for epoch in range(1, 101)]
+    assert seventh["score"] == small.curves[7].tolist()
+    assert set(seventh["entry"]) == {"ddqn mlp width=16"}
+
+
+def test_a_table_is_a_data_frame(small: EntryCurves) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
+    frame = small.to_table().to_pandas()
+    assert isinstance(frame, pandas.DataFrame)
+    assert frame.pivot(index="seed", columns="epoch", values="score").to_numpy() == pytest.approx(
+        small.curves
+    )
+
+
+def test_a_board_ranks_what_it_is_given(small: EntryCurves, large: EntryCurves) -> None:
+    board = api.board("beam6g", entries=[large, "mlp width=16"], **WHERE)
+    (section,) = board.sections
+    assert [(row.tier, row.entry.label) for row in section.rows] == [
+        (1, "ddqn mlp width=64"),
+        (2, "ddqn mlp width=16"),
+    ]
+    assert board.as_dict()["rule"] == "intervals"
+    assert api.board(["beam6g"], entries=[small], horizon=20_000, **WHERE).sections[0].horizon == 20_000
+
+
+def test_what_is_left_out_of_a_board_is_named(large: EntryCurves) -> None:
+    with pytest.raises(UnknownNameError, match=r"no entry is left: .*100 seeds, fewer than 101"):
+        api.board(entries=[large], min_seeds=101, **WHERE)
+
+
+def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None:
+    board = api.board("beam6g", entries=[small, large], **WHERE)
+    comparison = api.compare(large, small)
+    for shown in (board._repr_html_(), printed(board)):
+        assert "ddqn mlp width=64" in shown
+        assert "60k (56k to 66k)" in shown
+        assert "score: median over seeds" in shown
+    for shown in (comparison._repr_html_(), printed(comparison)):
+        assert "ddqn mlp width=64 against ddqn mlp width=16, 100 seeds each, 200000 steps" in shown
+        assert comparison.sentence in shown
+        assert "+ significantly fewer samples" in shown
+    assert "ddqn-mlp-" in small._repr_html_()
+    assert "387" in printed(small)
+    heads = [
+        next(line for line in printed(board, width).splitlines() if "tier" in line) for width in (80, 200)
+    ]
+    assert ["outperforms" in head for head in heads] == [False, True], "80 columns have no room for it"
+
+
+def test_html_holds_nothing_but_text(large: EntryCurves) -> None:
+    hostile = replace(large, label="<script>alert(1)</script>", folder=Path("<img src=x>"))
+    for shown in (
+        hostile._repr_html_(),
+        api.board(entries=[hostile], **WHERE)._repr_html_(),
+        api.compare(hostile, large)._repr_html_(),
+    ):
+        assert "<script" not in shown
+        assert "<img" not in shown
+        assert "&lt;script&gt;" in shown
+
+
+def test_names_and_entries_are_compared_alike(small: EntryCurves, large: EntryCurves) -> None:
+    by_name = api.compare("mlp width=64", "mlp width=16", task="beam6g", **WHERE)
+    assert by_name.as_dict() == api.compare(large, small).as_dict()
+    assert str(by_name.outcome) == "outperforms"
+    assert by_name.points.shape == (2, *by_name.grid.shape)
+    strict = api.compare(large, small, rule="difference")
+    assert strict.headline.endswith("rule 'difference'")
+
+
+@pytest.mark.parametrize("kind", ["curves", "bars", "tiers"])
+def test_pictures_are_figures(kind: str, small: EntryCurves, large: EntryCurves) -> None:
+    figure = api.plot(kind, entries=[small, large], **WHERE)
+    texts = " ".join(text.get_text() for text in figure.findobj() if hasattr(text, "get_text"))
+    assert "mlp width=64" in texts
+
+
+def test_pictures_of_an_environment_take_its_options() -> None:
+    assert api.plot("field", tasks="beam6g", environment={"degree": 5}, resolution=20).axes
+
+
+def test_a_picture_names_what_it_leaves_out(
+    small: EntryCurves, large: EntryCurves, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short = small.cut(50)
+    assert short is not None
+    monkeypatch.setattr(collect, "collect", lambda *_, **__: ([large, short], []))
+    with pytest.warns(
+        UserWarning, match=r"left out: ddqn mlp width=16: ends at 100000 steps; --horizon 100000"
+    ):
+        api.plot("bars", tasks="beam6g", **WHERE)
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "message"),
+    [
+        (
+            lambda: api.load("mlp width=17", task="beam6g", **WHERE),
+            UnknownNameError,
+            "no entry 'mlp width=17'",
+        ),
+        (lambda: api.load("mlp", task="beam7g", **WHERE), UnknownNameError, "did you mean 'beam6g"),
+        (lambda: api.load("mlp", runs="no-results-yet"), StoreError, "no results folder no-results-yet"),
+        (lambda: api.board("beam6g", horizon=2001, **WHERE), OptionError, "an epoch .* has 2000 steps"),
+        (lambda: api.board("beam6g", rule="interval", **WHERE), UnknownNameError, "did you mean 'intervals'"),
+        (
+            lambda: api.compare("beam6g/mlp width=64", "cartpole/reinforce mlp", **WHERE),
+            QrlSuiteError,
+            "only entries of one task can be compared",
+        ),
+        (lambda: api.plot("curve", tasks="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
+        (lambda: api.plot("curves", **WHERE), OptionError, "holds several tasks"),
+        (
+            lambda: api.plot("bars", tasks="beam6g", epsilon=[0.1], **WHERE),
+            OptionError,
+            "did you mean 'epsilons'",
+        ),
+        (
+            lambda: api.plot("bars", tasks="beam6g", environment={"degree": 5}, **WHERE),
+            OptionError,
+            "shows what was trained",
+        ),
+    ],
+)
+def test_bad_input_says_what_to_type(
+    call: Callable[[], object], kind: type[QrlSuiteError], message: str
+) -> None:
+    with pytest.raises(kind, match=message):
+        call()
+
+
+def test_the_examples_are_right() -> None:
+    result = doctest.testmod(api)
+    assert result.attempted >= 5
+    assert result.failed == 0
+
+
+def test_the_package_has_the_functions_and_no_module_hides_them() -> None:
+    """Also once every module was imported: importing a submodule sets the package's attribute of its name."""
+    program = (
+        "import importlib, sys, qrlsuite; from qrlsuite import api\n"
+        "for name in sys.argv[1:]: importlib.import_module(name)\n"
+        "assert all(getattr(qrlsuite, name) is getattr(api, name) for name in api.__all__), api.__all__\n"
+        "assert all(callable(getattr(api, name)) for name in api.__all__)\n"
+    )
+    children = sorted({".".join(name.split(".")[:2]) for name in ALL} - {"qrlsuite", "qrlsuite.__main__"})
+    subprocess.run([sys.executable, "-P", "-c", program, *children], check=True, cwd="/", timeout=HANGS)
