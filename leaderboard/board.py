@@ -364,6 +364,13 @@ def complexity_text(complexity: Complexity) -> str:
     return f"{sign}{steps_text(complexity.steps)} ({low} to {high}{mark})"
 
 
+def tuning_text(tuning: Mapping[str, Any]) -> str:
+    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`."""
+    units = {"trials": "trials", "steps": "steps", "core_hours": "core-hours"}
+    known = [f"{tuning[name]:,} {unit}" for name, unit in units.items() if tuning.get(name) is not None]
+    return ", ".join(known) or "budget not known"
+
+
 def as_dict(board: Leaderboard) -> dict[str, Any]:
     """Return a leaderboard as plain values, for JSON."""
     return {

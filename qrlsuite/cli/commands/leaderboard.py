@@ -190,6 +190,12 @@ def _notes(section: Section) -> list[str]:
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
+    tuned = [row.entry for row in section.rows if row.entry.tuning]
+    if tuned:
+        notes.append(
+            "settings found by tuning: "
+            + ", ".join(f"{entry.label} ({boards.tuning_text(entry.tuning or {})})" for entry in tuned)
+        )
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:
         notes.append(
