@@ -397,7 +397,11 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "rests_on": None if row.rests_on is None else asdict(row.rests_on),
         "entry": entry.name,
         "label": entry.label,
-        "parameters": {"classical": entry.parameters[0], "quantum": entry.parameters[1]},
+        "parameters": {
+            "classical": entry.parameters[0],
+            "quantum": entry.parameters[1],
+            "networks": entry.networks,
+        },
         "seeds": len(entry.seeds),
         "unfinished_seeds": len(entry.left_out),
         "provisional": row.provisional,

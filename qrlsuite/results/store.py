@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
 
 FORMAT_VERSION = 1
@@ -356,6 +357,17 @@ class SeedStore:
                     raise StoreError(f"{self.path}: {count!r} is not a number of circuit executions")
                 total += count
         return total
+
+
+def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the trainable numbers of an entry's agents, from the `run.json` of its seeds.
+
+    They are `classical` and `quantum`, summed over `networks`: all that are trained. Records without `networks` are of
+    older versions, which counted the first network alone; they stand only where no newer one is there.
+    """
+    found = [dict(record.get("parameters", {})) for record in records]
+    whole = [counts for counts in found if "networks" in counts]
+    return next(iter([*whole, *found]), {})
 
 
 def _is_count(value: Any) -> bool:

@@ -187,6 +187,12 @@ def _notes(section: Section) -> list[str]:
         notes.append(">= : still below delta at the last epoch; the sample complexity is at least this")
     if any(row.entry.parameters[1] for row in section.rows):
         notes.append("q: quantum parameters")
+    alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
+    if alone:
+        notes.append(
+            "parameters of the first network alone (older records count no other, such as a critic): "
+            + ", ".join(alone)
+        )
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         notes.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
@@ -206,6 +212,12 @@ def _notes(section: Section) -> list[str]:
         notes.append(
             "made with several versions, see `qrlsuite show ENTRY`: "
             + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
+        )
+    devices = [row.entry for row in section.rows if len(row.entry.devices) > 1]
+    if devices:
+        notes.append(
+            "trained on several kinds of device, see `qrlsuite show ENTRY`: "
+            + ", ".join(f"{entry.label} ({', '.join(entry.devices)})" for entry in devices)
         )
     notes.append(
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
@@ -285,6 +297,7 @@ def _csv(board: Leaderboard) -> str:
                 **row,
                 "parameters_classical": count["classical"],
                 "parameters_quantum": count["quantum"],
+                "networks": count["networks"],
                 **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
                 "interval_low": low,
                 "interval_high": high,

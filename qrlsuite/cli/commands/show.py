@@ -19,7 +19,7 @@ from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.options import parse_setting
 from qrlsuite.results import lookup
-from qrlsuite.results.store import EntryStore, entries, write_atomically
+from qrlsuite.results.store import EntryStore, entries, parameters_of, write_atomically
 
 
 def show(
@@ -139,7 +139,7 @@ def _entry(folder: Path) -> dict[str, Any]:
         },
         "seeds": len(seeds),
         "provenance": made_with,
-        "parameters": (records[0] if records else {}).get("parameters", {}),
+        "parameters": parameters_of(records),
     }
 
 
