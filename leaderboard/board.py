@@ -423,6 +423,291 @@ def untiered_reason(row: Row) -> str:
     return "undecided: nothing to compare with"
 
 
+def as_dict(self) -> dict[str, Any]:
+        """Return the board as plain values, for JSON."""
+        return as_dict(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for section in self.sections:
+            yield tables.section_table(section, options.max_width)
+        for line in self.refused:
+            yield Text(f"left out: {line}")
+
+    def _repr_html_(self) -> str:
+        return tables.board_html(self)
+
+
+@dataclass(frozen=True, eq=False)
+class EntryComparison(Comparison):
+    """The result of `compare_entries`. In a notebook, and printed by rich, it is a table of signs and a sentence.
+
+    Attributes
+    ----------
+    labels:
+        What the two entries are called.
+    remarks:
+        What may flatter one of them.
+    """
+
+    labels: tuple[str, str] = ("", "")
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """Who is compared with whom, and at how many seeds and steps."""
+        one, other = self.labels
+        rule = "" if self.rule == DEFAULT else f", rule '{self.rule}'"
+        return f"{one} against {other}, {self.n_runs} seeds each, {self.horizon} steps{rule}"
+
+    @property
+    def legend(self) -> str:
+        """What the signs in the table mean."""
+        return tables.legend(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield tables.comparison_table(self)
+        yield Text("\n".join([self.legend, f"{self.headline}:", self.sentence, *self.remarks]))
+
+    def _repr_html_(self) -> str:
+        return tables.comparison_html(self, self.headline, self.remarks)
+
+
+def learning_curves(entry: EntryCurves) -> LearningCurves:
+    """Return an entry's curves as the statistics take them."""
+    return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
+
+
+def build(
+    entries: Sequence[EntryCurves],
+    refused: Sequence[str] = (),
+    rule: SignificanceRule | None = None,
+    horizon: int | None = None,
+) -> Leaderboard:
+    """Rank entries, task by task and horizon by horizon.
+
+    Entries of one task that were made under another definition of it are refused: the majority's stands.
+
+    Parameters
+    ----------
+    entries:
+        Of any tasks.
+    refused:
+        Lines about what could not be read, passed on.
+    rule:
+        What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means the paper's.
+    horizon:
+        Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
+
+    Raises
+    ------
+    PluginError
+        If a plugin's rule fails.
+    """
+    chosen = rule or IntervalRule()
+    sections: list[Section] = []
+    problems = list(refused)
+    for task in sorted({entry.task for entry in entries}):
+        members = [entry for entry in entries if entry.task == task]
+        hashes = [entry.task_hash for entry in members]
+        definition = max(sorted(set(hashes)), key=hashes.count)
+        good = [entry for entry in members if entry.task_hash == definition]
+        problems += [
+            f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"
+            for entry in members
+            if entry.task_hash != definition
+        ]
+        for steps, provisional, group in _by_horizon(good, horizon):
+            try:
+                sections.append(_section(task, steps, provisional, group, chosen))
+            except PluginError:
+                raise
+            except QrlSuiteError as error:
+                problems.append(f"task '{task}' at {steps} steps: {error}")
+    return Leaderboard(tuple(sections), tuple(problems), chosen.name, chosen.promise)
+
+
+def _by_horizon(
+    entries: Sequence[EntryCurves], wanted: int | None
+) -> list[tuple[int, bool, list[EntryCurves]]]:
+    """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
+    horizons = sorted(ranking_of(entries).horizons)
+    groups = []
+    for horizon in horizons if wanted is None else [wanted]:
+        reached = [entry.reaching(horizon // entry.steps_per_epoch) for entry in entries]
+        members = [entry for entry in reached if entry is not None]
+        if members:
+            groups.append((horizon, horizon < horizons[0], members))
+    if wanted is not None:
+        return groups
+    short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
+    lengths = sorted({_length(entry) for entry in short}, reverse=True)
+    return groups + [
+        (steps, True, [entry for entry in short if _length(entry) == steps]) for steps in lengths
+    ]
+
+
+def _length(entry: EntryCurves) -> int:
+    return int(entry.curves.shape[1]) * entry.steps_per_epoch
+
+
+def ranking_of(entries: Sequence[EntryCurves]) -> RankingSection:
+    """Return the cells and horizons that most entries of a task have; they are equal where it is registered."""
+    ranked = [entry.task_file.ranking for entry in entries]
+    return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
+
+
+def _section(
+    task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves], rule: SignificanceRule
+) -> Section:
+    ranking = ranking_of(entries)
+    if getattr(rule, "paired", False):
+        _require_equal_seeds(entries, rule.name)
+    board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
+    by_name = {entry.name: entry for entry in entries}
+    labels = {entry.name: entry.label for entry in entries}
+    wanted = entries[0].task_file.protocol.seeds
+    rows = []
+    places = board.ranking
+    capped = {place.name for place in places.not_reached}
+    for place in places.entries:
+        entry = by_name[place.name]
+        values = entry.curves[:, : horizon // entry.steps_per_epoch]
+        rows.append(
+            Row(
+                entry=entry,
+                tier=place.tier,
+                reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
+                median_score=float(np.median(values[:, -1])),
+                copeland=place.copeland,
+                wins=int(board.better_cells[board.names.index(place.name)].sum()),
+                losses=int(board.better_cells[:, board.names.index(place.name)].sum()),
+                outperforms=tuple(labels[name] for name in place.outperforms),
+                outperformed_by=tuple(labels[name] for name in place.outperformed_by),
+                provisional=len(entry.seeds) < wanted,
+                not_reached=place.name in capped,
+                rests_on=_support(board, place.rests_on, labels),
+            )
+        )
+    return Section(task, entries[0].task_file.summary, horizon, provisional, cell_text(ranking), tuple(rows))
+
+
+def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, str]) -> Support | None:
+    if pair is None:
+        return None
+    won, lost = (board.names.index(name) for name in pair)
+    return Support(
+        winner=labels[pair[0]],
+        loser=labels[pair[1]],
+        cells=int(board.better_cells[won, lost]),
+        at_cap=int(board.capped_cells[won, lost]),
+        total=board.n_cells,
+    )
+
+
+def cell_text(ranking: RankingSection) -> str:
+    """Return the reference cell in words."""
+    cell = ranking.reference
+    if cell.epsilon is not None:
+        return f"epsilon {cell.epsilon:g}, delta {cell.delta:g}"
+    return f"return {cell.threshold:g}, delta {cell.delta:g}"
+
+
+def complexity_at(
+    values: np.ndarray[Any, np.dtype[np.float64]], ranking: RankingSection, steps_per_epoch: int, horizon: int
+) -> Complexity:
+    """Return the sample complexity at a task's reference cell.
+
+    Parameters
+    ----------
+    values:
+        (N, T) learning curves, cut to the horizon.
+    """
+    cell = ranking.reference_grid
+    steps = sample_complexity(values, cell, steps_per_epoch)
+    interval = bootstrap_interval(values, cell, steps_per_epoch)
+    low, high = (round(float(v)) for v in interval[0, 0])
+    capped, open_end = at_cap(interval, horizon)[0, 0], unsettled(values, cell)[0, 0]
+    return Complexity(int(steps[0, 0]), low, high, bool(capped), bool(open_end))
+
+
+def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
+    """Raise OptionError unless all entries have the same seeds, as a paired rule presupposes."""
+    for entry in entries[1:]:
+        if entry.seeds != entries[0].seeds:
+            raise OptionError(
+                f"rule '{rule}' pairs runs of the same seed: '{entries[0].label}' ({len(entries[0].seeds)}) and "
+                f"'{entry.label}' ({len(entry.seeds)}) have different seeds; `qrlsuite compare` pairs those that "
+                "two entries share"
+            )
+
+
+def compare_entries(
+    first: EntryCurves, second: EntryCurves, rule: SignificanceRule | None = None
+) -> EntryComparison:
+    """Compare two entries of one task on its ranking grid.
+
+    Parameters
+    ----------
+    first, second:
+        The entries.
+    rule:
+        What counts as significant; None means the paper's. For a paired rule both are reduced to the seeds that
+        they share.
+
+    Raises
+    ------
+    QrlSuiteError
+        If they belong to different tasks, their lengths have no common horizon, or a paired rule finds no
+        common seed.
+    """
+    if first.task_hash != second.task_hash:
+        raise QrlSuiteError(
+            f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
+            f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
+        )
+    epochs = min(first.curves.shape[1], second.curves.shape[1])
+    first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
+    if getattr(rule, "paired", False):
+        first, second = _common_seeds(first, second)
+    grid = ranking_of([first, second]).grid
+    found = compare(learning_curves(first), learning_curves(second), grid, rule)
+    values = {field.name: getattr(found, field.name) for field in fields(found)}
+    remarks = [
+        f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
+        for entry in (first, second)
+        if entry.on_protocol_seeds
+    ]
+    return EntryComparison(**values, labels=(first.label, second.label), remarks=tuple(remarks))
+
+
+def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:
+    """Return both entries with the runs of the seeds that they share, in one order."""
+    shared = sorted(set(first.seeds) & set(second.seeds))
+    if not shared:
+        raise OptionError(f"'{first.label}' and '{second.label}' share no seed: their runs cannot be paired")
+    one, other = (
+        replace(entry, curves=entry.curves[[entry.seeds.index(seed) for seed in shared]], seeds=tuple(shared))
+        for entry in (first, second)
+    )
+    return one, other
+
+
+def untiered_reason(row: Row) -> str:
+    """Say why an entry has no tier."""
+    if row.not_reached:
+        return "not reached: at the cap in every cell, and not ranked among each other"
+    if len(row.entry.seeds) < MIN_RUNS:
+        return f"undecided: fewer than {MIN_RUNS} seeds"
+    return "undecided: nothing to compare with"
+
+
+def tuning_text(tuning: Mapping[str, Any]) -> str:
+    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`."""
+    units = {"trials": "trials", "steps": "steps", "core_hours": "core-hours"}
+    known = [f"{tuning[name]:,} {unit}" for name, unit in units.items() if tuning.get(name) is not None]
+    return ", ".join(known) or "budget not known"
+
+
 def as_dict(board: Leaderboard) -> dict[str, Any]:
     """Return a leaderboard as plain values, for JSON."""
     return {
@@ -449,7 +734,11 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "rests_on": None if row.rests_on is None else asdict(row.rests_on),
         "entry": entry.name,
         "label": entry.label,
-        "parameters": {"classical": entry.parameters[0], "quantum": entry.parameters[1]},
+        "parameters": {
+            "classical": entry.parameters[0],
+            "quantum": entry.parameters[1],
+            "networks": entry.networks,
+        },
         "seeds": len(entry.seeds),
         "unfinished_seeds": len(entry.left_out),
         "provisional": row.provisional,

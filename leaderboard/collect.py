@@ -15,7 +15,7 @@ from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin, published
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.results import lookup
-from qrlsuite.results.store import EntryStore, SeedRun, entries
+from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
 
 def collect(
@@ -248,7 +248,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
     length = _common_length(runs)
     kept = [run for run in runs if len(run.scores) >= length]
     provenance = [made for run in runs for made in run.record.get("provenance", [])]
-    parameters = runs[0].record.get("parameters", {})
+    parameters = parameters_of(run.record for run in runs)
     identity = record["identity"]
     task_file = current(
         TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
@@ -266,6 +266,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         algorithm=identity["algorithm"],
         model=identity["model"],
         parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
+        networks=parameters.get("networks"),
         curves=values,
         seeds=tuple(run.seed for run in kept),
         left_out=tuple(run.seed for run in runs if len(run.scores) < length),
@@ -281,6 +282,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         versions=origin.versions(provenance),
         commits=origin.texts(provenance, "commit"),
         processors=origin.texts(provenance, "processor"),
+        devices=origin.devices(provenance),
         tuning=record["tuning"],
         executions=sum(run.executions for run in runs),
         records={

@@ -27,6 +27,11 @@ class EntryCurves:
 
     Attributes
     ----------
+    parameters:
+        Trainable numbers of one agent: classical, and of circuits.
+    networks:
+        The networks that `parameters` are summed over, all that are trained. None in records of older versions, which
+        counted the first alone, see `first_network_alone`.
     curves:
         (N, T) float64: mean validation score per run and epoch. T is what half of the finished runs or more have.
     seeds:
@@ -45,12 +50,12 @@ class EntryCurves:
         The preset that supplied defaults.
     versions:
         Every version that occurs among the seeds, by distribution; Python's under "python".
-    commits, processors:
-        Every code revision and processor that occurs among the seeds.
+    commits, processors, devices:
+        Every code revision, processor and kind of device that occurs among the seeds.
     executions:
         Circuit executions of these runs in all.
     tuning:
-        How the settings were found, where a preset file says so.
+        How the settings were found, where their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
     source:
         Whether the curves were read from a results folder or from a published entry.
     color:
@@ -79,12 +84,14 @@ class EntryCurves:
     versions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     commits: tuple[str, ...] = ()
     processors: tuple[str, ...] = ()
+    devices: tuple[str, ...] = ()
     executions: int = 0
     tuning: Mapping[str, Any] | None = None
     source: Literal["runs", "published"] = "runs"
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     color: int | None = None
     records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+    networks: int | None = None
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -163,6 +170,16 @@ class EntryCurves:
     def mixed_versions(self) -> tuple[str, ...]:
         """The distributions of which more than one version made the runs."""
         return tuple(name for name, found in self.versions.items() if len(found) > 1)
+
+    @property
+    def first_network_alone(self) -> bool:
+        """Whether `parameters` leave out every network but the first, or may do so: an older version counted them.
+
+        DDQN trains one network, and so does REINFORCE unless its baseline is one.
+        """
+        given = self.identity.get("algorithm_options", {})
+        one = {"ddqn": True, "reinforce": given.get("baseline") != "value"}.get(self.algorithm, False)
+        return self.networks is None and not one
 
     @property
     def on_protocol_seeds(self) -> bool:

@@ -10,7 +10,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.fingerprint import fingerprint
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, parameters_of
 
 
 def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
@@ -52,7 +52,7 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
         [run.seconds / 3600 for run in runs],
         [run.executions for run in runs],
         [run.record["provenance"][-1] if run.record.get("provenance") else {} for run in runs],
-        entry.parameters,
+        {"classical": 0, "quantum": 0, **parameters_of(run.record for run in runs)},
         fingerprint(built, entry.seeds),
     )
     _replace(folder, content)

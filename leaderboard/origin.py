@@ -1,9 +1,11 @@
-"""Where an entry's runs come from: versions, code revisions and processors, over all seeds."""
+"""Where an entry's runs come from: versions, code revisions, processors and devices, over all seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+from qrlsuite.results import provenance as machine
 
 
 def versions(provenance: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
@@ -21,3 +23,8 @@ def versions(provenance: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ..
 def texts(provenance: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]:
     """Return every text that stands under a name, sorted, each once."""
     return tuple(sorted({value for origin in provenance if isinstance(value := origin.get(name), str)}))
+
+
+def devices(provenance: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return every kind of device that occurs (`cpu`, `cuda`), sorted; what names none was trained on the CPU."""
+    return tuple(sorted({machine.device_kind(origin) for origin in provenance}))

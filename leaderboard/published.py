@@ -90,6 +90,7 @@ class Published:
             algorithm=identity["algorithm"],
             model=identity["model"],
             parameters=(count["classical"], count["quantum"]),
+            networks=count.get("networks"),
             curves=self.curves,
             seeds=self.seeds,
             left_out=(),
@@ -105,6 +106,7 @@ class Published:
             versions=origin.versions(provenance),
             commits=origin.texts(provenance, "commit"),
             processors=origin.texts(provenance, "processor"),
+            devices=origin.devices(provenance),
             executions=int(self.executions.sum()),
             tuning=record["tuning"],
             source="published",
@@ -171,6 +173,8 @@ def _read(folder: Path) -> Published:
     for family in ("classical", "quantum"):
         count = published["parameters"][family]
         _require(type(count) is int and 0 <= count < 10**12, folder, f"{family} parameters: {count!r}")
+    networks = published["parameters"].get("networks", 1)
+    _require(type(networks) is int and 0 <= networks < 10**6, folder, f"networks: {networks!r}")
     seeds, curves = _curves(folder, task_file)
     facts = _table(folder / SEEDS, _SEED_COLUMNS)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
@@ -328,7 +332,7 @@ def files(
     hours: list[float],
     executions: list[int],
     provenance: list[Mapping[str, Any]],
-    parameters: tuple[int, int],
+    parameters: Mapping[str, int],
     beginning: Fingerprint,
 ) -> dict[str, bytes]:
     """Encode an entry's three files, by name; equal entries give equal bytes.
@@ -339,6 +343,8 @@ def files(
         `entry.json` of its runs.
     curves:
         (N, T).
+    parameters:
+        As `qrlsuite.results.store.parameters_of` returns them.
     hours, executions, provenance, beginning:
         Per seed, N of each.
     """
@@ -352,7 +358,7 @@ def files(
         "published": {
             "seeds": count,
             "epochs": length,
-            "parameters": {"classical": parameters[0], "quantum": parameters[1]},
+            "parameters": dict(parameters),
             "core_hours": round(math.fsum(hours), 6),
             "circuit_executions": sum(executions),
             "provenance": distinct,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich import box
 from rich.table import Table
@@ -89,9 +89,21 @@ def notes(section: Section) -> list[str]:
         lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
     if any(row.entry.parameters[1] for row in section.rows):
         lines.append("q: quantum parameters")
+    alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
+    if alone:
+        lines.append(
+            "parameters of the first network alone (older records count no other, such as a critic): "
+            + ", ".join(alone)
+        )
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         lines.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")
+    tuned = [row.entry for row in section.rows if row.entry.tuning]
+    if tuned:
+        lines.append(
+            "settings found by tuning: "
+            + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
+        )
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:
         lines.append(
@@ -103,10 +115,23 @@ def notes(section: Section) -> list[str]:
             "made with several versions, see `qrlsuite show ENTRY`: "
             + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
         )
+    devices = [row.entry for row in section.rows if len(row.entry.devices) > 1]
+    if devices:
+        lines.append(
+            "trained on several kinds of device, see `qrlsuite show ENTRY`: "
+            + ", ".join(f"{entry.label} ({', '.join(entry.devices)})" for entry in devices)
+        )
     lines.append(
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
     )
     return [*lines, "score: median over seeds after the last epoch; hours: core-hours"]
+
+
+def _tuning_text(tuning: Mapping[str, Any]) -> str:
+    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`."""
+    units = {"trials": "trials", "steps": "steps", "core_hours": "core-hours"}
+    known = [f"{tuning[name]:,} {unit}" for name, unit in units.items() if tuning.get(name) is not None]
+    return ", ".join(known) or "budget not known"
 
 
 def title(section: Section) -> str:
@@ -207,6 +232,7 @@ def csv_text(board: Leaderboard) -> str:
                 **row,
                 "parameters_classical": count["classical"],
                 "parameters_quantum": count["quantum"],
+                "networks": count["networks"],
                 **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
                 "interval_low": low,
                 "interval_high": high,

@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 BuildModel = Callable[[int], nn.Module]
-"""`build_model(out_dim)` returns a population of S freshly initialized agents; every call draws anew."""
+"""`build_model(out_dim)` returns a population of S freshly initialized agents; every call draws anew.
+
+An entry's parameters are counted over all the networks that are built by it. One that is not trained, such as a
+target network, is a `copy.deepcopy` of another, or frozen by `requires_grad_(False)`.
+"""
 
 
 class Algorithm(Protocol):

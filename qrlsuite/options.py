@@ -180,14 +180,19 @@ def file_problems(error: pydantic.ValidationError, model: type[pydantic.BaseMode
 
 
 def _keys(model: Any, path: Sequence[str]) -> list[str]:
-    """Return the known keys of a (nested) section of a file; `path` may lead through lists and optional sections."""
+    """Return the known keys of a (nested) section of a file; `path` may lead through lists, tables and options."""
     for part in path:
         if part.isdecimal():
             continue
-        info = getattr(model, "model_fields", {}).get(part)
-        model = info.annotation if info is not None else None
-        while arguments := [each for each in get_args(model) if each is not type(None)]:
-            model = arguments[-1] if get_origin(model) is dict else arguments[0]
+        if get_origin(model) is dict:
+            model = get_args(model)[1]
+        else:
+            info = getattr(model, "model_fields", {}).get(part)
+            model = info.annotation if info is not None else None
+        while get_origin(model) is not dict and (
+            arguments := [each for each in get_args(model) if each is not type(None)]
+        ):
+            model = arguments[0]
     return list(getattr(model, "model_fields", {}))
 
 

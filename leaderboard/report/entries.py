@@ -77,7 +77,7 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Name", clean(entry.name)),
         ("Algorithm", clean(entry.algorithm)),
         ("Model", clean(entry.model)),
-        ("Parameters", f"{classical:,} classical, {quantum:,} quantum"),
+        ("Parameters", f"{classical:,} classical, {quantum:,} quantum{_networks(entry)}"),
         ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
@@ -87,10 +87,18 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Versions", _told(entry.versions)),
         ("Code revision", _told(entry.commits)),
         ("Processor", _told(entry.processors)),
+        ("Device", _told(entry.devices)),
         ("Tuned", _tuned(entry.tuning)),
         ("Source", _told(entry.source)),
         ("Task definition", clean(entry.task_hash)),
     ]
+
+
+def _networks(entry: EntryCurves) -> str:
+    """Say over how many networks parameters are summed, where that is not one."""
+    if entry.first_network_alone:
+        return " (first network alone)"
+    return f" in {entry.networks} networks" if entry.networks is not None and entry.networks > 1 else ""
 
 
 def _tuned(record: Mapping[str, Any] | None) -> str:

@@ -51,6 +51,7 @@ class SectionView:
     rows: tuple[RowView, ...]
     wanted: int
     missing: str
+    first_alone: str
     flattered: str
     """Entries whose settings were chosen on the protocol's seeds."""
     ladder: ladder.Ladder
@@ -110,6 +111,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
         rows=rows,
         wanted=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
+        first_alone=", ".join(row.entry.label for row in rows if row.row.entry.first_network_alone),
         flattered=", ".join(row.entry.label for row in rows if row.row.entry.on_protocol_seeds),
         ladder=ladder.draw(judgement.beats(), [row.depth for row in section.rows]),
         matrix=tuple(

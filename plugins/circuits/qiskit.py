@@ -136,7 +136,6 @@ class QiskitBackend:
     """
 
     def __init__(self, circuit: Circuit, options: Options) -> None:
-        circuit.require_simulable("qiskit")
         self.options = options
         self.shots: int | None = options.shots
         self.gradient = _gradient(options)

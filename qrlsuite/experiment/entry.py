@@ -30,7 +30,7 @@ class Entry:
     preset:
         The preset that supplied defaults; not part of the identity, its values are.
     tuning:
-        How the settings were found, where a preset file says so; not part of the identity either.
+        How the settings were found, where their preset says so; not part of the identity either.
     """
 
     task: Task
@@ -109,7 +109,7 @@ class Entry:
             **tuned,
             "task_name": self.task.name,
             "task_hash": self.task.hash,
-            "task_file": self.task.file.model_dump(mode="json"),
+            "task_file": self.task.file.model_dump(mode="json", exclude={"tuning"}),
             "identity": self.identity,
         }
 
@@ -146,11 +146,13 @@ def resolve(
     _hand_to_ansatz(values, sides, model_defaults)
     task = task.with_environment(values["environment"])
     chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
+    tuning, own = task.tuning(chosen, algorithm.name, model.family), {"algorithm": defaults}
     if file is not None and preset is not None:
         presets.require(file, preset, algorithm.name, model.name)
         for side, given in (("algorithm", file.algorithm_options), ("model", file.model_options)):
             options.build(sides[side], given, f"preset file {preset}: {side} '{getattr(file, side)}'")
         chosen, defaults = Path(preset).name, {**defaults, **file.algorithm_options}
+        tuning, own = file.tuning, {"algorithm": file.algorithm_options, "model": file.model_options}
     model_options = options.build(
         sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
     )
@@ -165,7 +167,7 @@ def resolve(
         ),
         model_options=model_options,
         preset=chosen,
-        tuning=None if file is None or chosen is None else presets.record_of(file, chosen, values),
+        tuning=None if tuning is None or chosen is None else presets.record_of(tuning, chosen, own, values),
     )
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError, TaskError, nearest
@@ -28,28 +28,48 @@ class _Table(BaseModel):
 
 
 class TuningRecord(_Table):
-    """How settings were found, and what it took."""
+    """How settings were found, and what it took; None is what is not known."""
 
-    task: Annotated[str, Field(max_length=80)]
-    objective: Literal["cell", "area"]
+    task: Annotated[str | None, Field(max_length=80)] = None
+    objective: Literal["cell", "area"] | None = None
     value: Annotated[
-        float, Field(ge=0, description="S_hat of the settings found, in steps, on the tuning seeds")
-    ]
-    sampler: Annotated[str, Field(max_length=40)]
-    trials: Annotated[int, Field(ge=1, description="settings that were tried")]
-    planned: Annotated[int, Field(ge=1, description="settings that were to be tried")]
-    seeds: Annotated[str, Field(max_length=10_000, description="as --seeds reads them")]
-    epochs: Annotated[int, Field(ge=1)]
-    steps: Annotated[int, Field(ge=0, description="environment steps of all trials together")]
-    space: Annotated[dict[str, Any], Field(description="what every option was chosen from")]
+        float | None, Field(ge=0, description="S_hat of the settings found, in steps, on the tuning seeds")
+    ] = None
+    sampler: Annotated[str | None, Field(max_length=40)] = None
+    trials: Annotated[int | None, Field(ge=1, description="settings that were tried")] = None
+    planned: Annotated[int | None, Field(ge=1, description="settings that were to be tried")] = None
+    seeds: Annotated[str | None, Field(max_length=10_000, description="as --seeds reads them")] = None
+    epochs: Annotated[int | None, Field(ge=1, description="of every trial")] = None
+    steps: Annotated[int | None, Field(ge=0, description="environment steps of all trials together")] = None
+    space: Annotated[dict[str, Any] | None, Field(description="what every option was chosen from")] = None
     versions: dict[str, str] = {}
-    core_hours: Annotated[float, Field(ge=0, description="measured; differs from machine to machine")] = 0.0
+    core_hours: Annotated[
+        float | None, Field(ge=0, description="measured; differs from machine to machine")
+    ] = None
+    note: Annotated[str | None, Field(max_length=1000, description="what the other fields cannot say")] = None
+    on_protocol_seeds: Annotated[
+        bool,
+        Field(description="chosen on seeds that entries are judged by; always so where `seeds` has some"),
+    ] = False
 
-    @property
-    def on_protocol_seeds(self) -> bool:
-        """Whether the settings were chosen on seeds that entries are judged by."""
-        found = re.findall(r"\d+", self.seeds)
-        return any(int(number) < TUNING_SEEDS for number in found)
+    @model_validator(mode="before")
+    @classmethod
+    def _mark(cls, data: Any) -> Any:
+        """Mark a record whose seeds are protocol seeds, whatever it says itself."""
+        seeds = data.get("seeds") if isinstance(data, Mapping) else None
+        numbers = re.findall(r"\d+", seeds) if isinstance(seeds, str) else []
+        if any(int(number) < TUNING_SEEDS for number in numbers):
+            return {**data, "on_protocol_seeds": True}
+        return data
+
+
+class EntryTuning(TuningRecord):
+    """What an entry keeps of the tuning of its settings (`tuning` in `entry.json`)."""
+
+    preset: Annotated[str | None, Field(description="where the record comes from")] = None
+    changed: Annotated[
+        tuple[str, ...], Field(description="options that --set changed afterwards, as SIDE.NAME")
+    ] = ()
 
 
 class PresetFile(_Table):
@@ -112,31 +132,30 @@ def require(preset: PresetFile, source: str, algorithm: str, model: str) -> None
 
 
 def record_of(
-    preset: PresetFile, source: str, values: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any] | None:
-    """Return what an entry keeps of the tuning of its preset; None for a preset written by hand.
+    tuning: TuningRecord,
+    source: str,
+    own: Mapping[str, Mapping[str, Any]],
+    values: Mapping[str, Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Return what an entry keeps of the tuning of its preset, see `EntryTuning`.
 
     Parameters
     ----------
+    source:
+        The preset's name.
+    own:
+        What the preset gives, by side (`algorithm`, `model`); a side that it says nothing of is absent.
     values:
-        What `--set` gave, by side (`algorithm`, `model`): where that differs from the preset, the record says so.
+        What `--set` gave, by side: where that differs from the preset, the record says so.
     """
-    if preset.tuning is None:
-        return None
-    own = {"algorithm": preset.algorithm_options, "model": preset.model_options}
     changed = sorted(
         f"{side}.{name}"
         for side, content in own.items()
         for name, value in values.get(side, {}).items()
         if content.get(name) != value
     )
-    record = preset.tuning.model_dump(mode="json")
-    return {
-        **record,
-        "preset": source,
-        "changed": changed,
-        "on_protocol_seeds": preset.tuning.on_protocol_seeds,
-    }
+    record = EntryTuning(**tuning.model_dump(), preset=source, changed=tuple(changed))
+    return record.model_dump(mode="json")
 
 
 def dumps(preset: PresetFile, comment: str = "") -> str:

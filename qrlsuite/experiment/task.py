@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite.experiment.preset import TuningRecord
 from qrlsuite.statistics.grid import Grid
 
 FORMAT_VERSION = 1
@@ -157,9 +158,22 @@ class TaskFile(_Section):
             description="[presets.NAME.ALGORITHM.FAMILY]: algorithm options, FAMILY all, classical or quantum"
         ),
     ] = {}
+    tuning: Annotated[
+        dict[str, dict[str, dict[Family, TuningRecord]]],
+        Field(
+            description="[tuning.NAME.ALGORITHM.FAMILY]: how the settings of that preset were found; entries keep it"
+        ),
+    ] = {}
 
     @model_validator(mode="after")
     def _preset_exists(self) -> TaskFile:
+        for name, by_algorithm in self.tuning.items():
+            if name not in self.presets:
+                raise ValueError(f"tuning: no preset '{name}'{nearest(name, self.presets)}")
+            for algorithm in by_algorithm:
+                if algorithm not in self.presets[name]:
+                    known = nearest(algorithm, self.presets[name])
+                    raise ValueError(f"tuning.{name}: the preset says nothing of '{algorithm}'{known}")
         if self.default_preset is not None and self.default_preset not in self.presets:
             raise ValueError(
                 f"default_preset '{self.default_preset}'{nearest(self.default_preset, self.presets)}"
@@ -252,6 +266,11 @@ class Task:
             )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
         return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+
+    def tuning(self, preset: str | None, algorithm: str, family: str) -> TuningRecord | None:
+        """Return how a preset's settings for an algorithm and a model family were found; None where it is not said."""
+        tables: dict[Any, TuningRecord] = dict(self.file.tuning.get(preset or "", {}).get(algorithm, {}))
+        return tables.get(family, tables.get("all"))
 
     def check_presets(self, algorithm: str, cls: type[Any]) -> None:
         """Check every preset of an algorithm against its options class.

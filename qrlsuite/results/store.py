@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
 
 FORMAT_VERSION = 1
@@ -358,8 +359,25 @@ class SeedStore:
         return total
 
 
+def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the trainable numbers of an entry's agents, from the `run.json` of its seeds.
+
+    They are `classical` and `quantum`, summed over `networks`: all that are trained. Records without `networks` are of
+    older versions, which counted the first network alone; they stand only where no newer one is there.
+    """
+    found = [dict(record.get("parameters", {})) for record in records]
+    whole = [counts for counts in found if "networks" in counts]
+    return next(iter([*whole, *found]), {})
+
+
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _steps(tuning: Mapping[str, Any]) -> int:
+    """Return the environment steps that a record of tuning names; -1 where it does not know them."""
+    steps = tuning.get("steps")
+    return -1 if steps is None else int(steps)
 
 
 def _epoch(row: Mapping[str, Any], path: Path) -> int:
@@ -469,7 +487,7 @@ class EntryStore:
         """Return the entry's folder below a results folder, made if it is not there.
 
         Where the entry's settings are known to come from tuning, its record says so from now on; of two records
-        of tuning the one that took more steps stands.
+        of tuning the one that took more steps stands; one that does not know its steps gives way to one that does.
 
         Raises
         ------
@@ -482,8 +500,8 @@ class EntryStore:
             write_json(path, entry.record())
         elif entry.tuning is not None:
             record = store.record()
-            known = record.pop("tuning") or {}
-            if known.get("steps", -1) < entry.tuning["steps"]:
+            known = record.pop("tuning")
+            if known is None or _steps(known) < _steps(entry.tuning):
                 del record["format_version"]
                 write_json(path, {**record, "tuning": entry.tuning})
         return store
@@ -509,9 +527,9 @@ class EntryStore:
             for name, value in named.items():
                 if not isinstance(value, str):
                     raise ValueError(f"{name} is not text")
-            tuning = record.get("tuning")
-            if tuning is not None and not (isinstance(tuning, dict) and _is_count(tuning.get("steps"))):
-                raise ValueError("tuning is not a record of it")
+            if record.get("tuning") is not None:
+                tuning = EntryTuning.model_validate(record["tuning"])
+                record["tuning"] = tuning.model_dump(mode="json", exclude_unset=True)
             TaskFile.model_validate(record.get("task_file"))
         except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
             raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None

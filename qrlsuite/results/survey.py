@@ -15,7 +15,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, move_away
 from qrlsuite.results.progress import read_progress
-from qrlsuite.results.store import EntryStore, entries, read_json, read_lines
+from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
 """What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
@@ -109,7 +109,7 @@ def outline(store: EntryStore) -> dict[str, Any]:
         **{key: record[key] for key in shown},
         "seeds": len(seeds),
         "provenance": made_with,
-        "parameters": (records[0] if records else {}).get("parameters", {}),
+        "parameters": parameters_of(records),
     }
 
 

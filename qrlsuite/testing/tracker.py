@@ -31,7 +31,7 @@ RUN: dict[str, Any] = {
     "model": "mlp",
     "family": "classical",
     "model_options": {"width": 64},
-    "parameters": {"classical": 4611, "quantum": 0},
+    "parameters": {"classical": 4611, "quantum": 0, "networks": 1},
     "seed": 7,
     "interactions_per_epoch": 2000,
 }

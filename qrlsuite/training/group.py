@@ -138,7 +138,6 @@ class GroupRun:
             self.events.send("run_started", run={**record, "folder": str(folder.path)})
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
-        classical, quantum = self.trainer.models.parameters[0]
         return {
             "task": self.entry.task.name,
             "task_hash": self.entry.task.hash,
@@ -149,7 +148,7 @@ class GroupRun:
             "model": self.entry.model.name,
             "family": self.entry.model.family,
             "model_options": options.plain(self.entry.model_options),
-            "parameters": {"classical": classical, "quantum": quantum},
+            "parameters": self.trainer.models.trained(),
             "seed": seed,
             "interactions_per_epoch": self.entry.task.file.protocol.interactions,
         }

@@ -157,7 +157,7 @@ class ModelBuilder:
         self.streams = streams
         self.statistics = statistics
         self.built: list[nn.Module] = []
-        self.parameters: list[tuple[int, int]] = []
+        self.parameters: list[tuple[int, int]] = []  # classical and quantum numbers of each network built
 
     def __call__(self, out_dim: int) -> nn.Module:
         """Return a population of freshly initialized agents."""
@@ -183,6 +183,19 @@ class ModelBuilder:
             self.statistics.attach(together)
         self.built.append(together)
         return together
+
+    def trained(self) -> dict[str, int]:
+        """Return the trainable numbers of one agent, `classical` and `quantum`, summed over its trained `networks`.
+
+        A network that needs no gradients, as a target network that was built here and frozen, does not count.
+        """
+        counted = [
+            numbers
+            for numbers, module in zip(self.parameters, self.built)
+            if any(parameter.requires_grad for parameter in module.parameters())
+        ]
+        classical, quantum = (sum(numbers[family] for numbers in counted) for family in (0, 1))
+        return {"classical": classical, "quantum": quantum, "networks": len(counted)}
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""

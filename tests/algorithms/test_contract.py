@@ -11,10 +11,20 @@ import pytest
 from numpy.typing import NDArray
 
 from qrlsuite import registry
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.options import parse_setting
+from qrlsuite.training.trainer import Trainer
 from tests.algorithms.worlds import Contexts, Group
 from tests.conftest import results
 
 E = 3
+COUNTED = {
+    "ddqn": ((), 1, (387, 0), (17, 12)),  # its target network is a copy
+    "ppo": ((), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
+    "reinforce": ((), 1, (387, 0), (17, 12)),
+    "reinforce with a value network": (("baseline=value",), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
+}
+"""Networks, and classical and quantum parameters: 3 inputs, 3 outputs or 1, width 16 and depth 2; 2 qubits, 1 layer."""
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
     "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
@@ -23,6 +33,20 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
 CASES = [(name, case) for name in registry.load().names("algorithms") for case in VARIANTS.get(name, [{}])]
 IDS = [f"{name}-{'-'.join(str(v) for v in case.values())}" for name, case in CASES]
 every_algorithm = pytest.mark.parametrize(("name", "case"), CASES, ids=IDS)
+
+
+@pytest.mark.parametrize("case", COUNTED)
+def test_parameters_are_those_of_all_trained_networks(case: str, tiny_task: str) -> None:
+    words, networks, *expected = COUNTED[case]
+    for model, sizes, numbers in zip(
+        ("mlp", "vqc-native"), (("width=16",), ("qubits=2", "layers=1")), expected
+    ):
+        settings = [parse_setting(word) for word in (*sizes, *words)]
+        trainer = Trainer(resolve(tiny_task, model, case.split()[0], settings), [0, 1])
+        told = {"classical": numbers[0], "quantum": numbers[1], "networks": networks}
+        assert trainer.models.trained() == told
+        trainer.models(3).requires_grad_(False)
+        assert trainer.models.trained() == told, "a frozen network is not trained"
 
 
 def group(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) -> Group:

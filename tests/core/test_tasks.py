@@ -95,6 +95,20 @@ def test_a_mistake_in_a_preset_is_named_with_its_file(tmp_path: Path) -> None:
     assert str(caught.value).count("gama") == 1
 
 
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("nine.ddqn.all", "tuning: no preset 'nine'; did you mean 'mine'"),
+        ("mine.ddpn.all", "tuning.mine: the preset says nothing of 'ddpn'; did you mean 'ddqn'"),
+        ("mine.ddqn.quantm", "tuning.mine.ddqn.quantm"),
+        ("mine.ddqn.all]\ntrails = 3\n[score", "unknown key 'trails' in .*; did you mean 'trials'"),
+    ],
+)
+def test_a_mistake_in_what_tuning_took_is_named(table: str, message: str) -> None:
+    with pytest.raises(TaskError, match=message):
+        task.parse(f"{TINY}[presets.mine.ddqn.all]\nlr = 0.1\n[tuning.{table}]\n", "t.toml")
+
+
 def test_a_bad_setting_is_not_blamed_on_the_file() -> None:
     with pytest.raises(OptionError, match=r"^environment 'beam6g': degree = 1: at least 2"):
         task.parse(TINY, "t.toml").with_environment({"degree": 1})

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,13 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, UnknownNameError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError, UnknownNameError
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
+from qrlsuite.leaderboard.published import SHIPPED
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space
+from tests.conftest import TINY
 
 SETTINGS = (parse_setting("width=4"), parse_setting("depth=1"))
 RANKING = RankingSection.model_validate(
@@ -134,6 +139,67 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     }  # fmt: skip
     assert preset.TuningRecord.model_validate({**record, "seeds": "0:20"}).on_protocol_seeds
     assert not preset.TuningRecord.model_validate({**record, "seeds": "1000000:1000020"}).on_protocol_seeds
+
+
+def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
+    path = tmp_path / "t.toml"
+    path.write_text(
+        TINY
+        + "[presets.mine.ddqn.all]\nlr = 0.1\ngamma = 0.5\n"
+        + '[tuning.mine.ddqn.quantum]\ntrials = 3\nseeds = "0:20"\n'
+    )
+    words = [parse_setting(word) for word in ("qubits=2", "layers=1", "gamma=.9")]
+    entry = resolve(str(path), "vqc-native", settings=words, preset="mine")
+    assert entry.tuning is not None
+    assert entry.tuning["trials"] == 3
+    assert entry.tuning["preset"] == "mine"
+    assert entry.tuning["changed"] == ["algorithm.gamma"], "qubits are none of the preset's"
+    assert entry.tuning["on_protocol_seeds"]
+    assert (entry.tuning["steps"], entry.tuning["value"]) == (None, None), "not known, and not made up"
+    assert entry.task.hash == resolve(str(path), "mlp").task.hash
+    assert resolve(str(path), "mlp", preset="mine").tuning is None, "nothing is said of networks"
+    assert resolve(str(path), "vqc-native", settings=words).tuning is None, "it is not the default"
+    assert "tuning" not in entry.record()["task_file"], "older versions read the record"
+
+    store = EntryStore.create(tmp_path / "runs", dataclasses.replace(entry, tuning=None))
+    assert store.record()["tuning"] is None
+    EntryStore.create(tmp_path / "runs", entry)
+    assert store.record()["tuning"] == entry.tuning
+    counted = dataclasses.replace(entry, tuning={**entry.tuning, "steps": 100})
+    EntryStore.create(tmp_path / "runs", counted)
+    EntryStore.create(tmp_path / "runs", entry)
+    assert store.record()["tuning"]["steps"] == 100, "a record that knows its steps stays"
+
+
+@pytest.mark.parametrize(
+    "path", sorted((SHIPPED / "cartpole").glob("*/entry.json")), ids=lambda p: p.parent.name
+)
+def test_published_entries_carry_the_tuning_of_the_preset_they_use(path: Path) -> None:
+    record = EntryStore(path.parent).record()
+    model = record["identity"]["model"]
+    sizes = {"mlp": ("width=16", "depth=1"), "vqc-native": ("qubits=4", "layers=1")}[model]
+    entry = resolve("cartpole", model, settings=[parse_setting(word) for word in sizes])
+    assert (entry.name, entry.preset) == (path.parent.name, record["preset"])
+    assert record["tuning"] == entry.tuning
+    assert (record["tuning"]["trials"], record["tuning"]["seeds"]) == (7, "1000000:1000010")
+    assert not record["tuning"]["on_protocol_seeds"]
+
+
+def test_a_record_of_tuning_in_an_entry_is_checked_and_marked(tmp_path: Path) -> None:
+    shutil.copy(SHIPPED / "beam6g" / "ddqn-mlp-333341ef" / "entry.json", tmp_path)
+    store, record = EntryStore(tmp_path), json.loads((tmp_path / "entry.json").read_text())
+    assert store.record()["tuning"] == record["tuning"], "nulls are what is not known"
+
+    def rewritten(**changes: Any) -> EntryStore:
+        tuning = {**record["tuning"], **changes}
+        (tmp_path / "entry.json").write_text(json.dumps({**record, "tuning": tuning}))
+        return store
+
+    marked = rewritten(on_protocol_seeds=False).record()["tuning"]
+    assert marked["on_protocol_seeds"], "its seeds say so, whatever it says itself"
+    for changes in ({"trials": "many"}, {"trails": 3}, {"steps": -1}):
+        with pytest.raises(StoreError, match="is not an entry's record"):
+            rewritten(**changes).record()
 
 
 def test_worth_by_hand() -> None:

@@ -6,14 +6,20 @@ import csv
 import io
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qrlsuite.cli.commands import leaderboard as command
-from qrlsuite.leaderboard import board, report
+from qrlsuite.engine.worker import train_group
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard import board, collect, origin, published, report
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.export import export
 from qrlsuite.leaderboard.pictures import tiers
+from qrlsuite.options import parse_setting
+from qrlsuite.results.store import EntryStore
 from tests.leaderboard import boards
 
 
@@ -97,3 +103,69 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     rows = list(csv.DictReader(io.StringIO(command._csv(made))))
     assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
     assert "protocol seeds, which" not in command._markdown(boards.of(entries))
+
+
+def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path: Path) -> None:
+    """A record of an older version counts PPO's policy alone; one new record of the entry says it all."""
+    stores = {}
+    for algorithm in ("ppo", "ddqn"):
+        entry = resolve(tiny_task, "mlp", algorithm, [parse_setting("width=16")])
+        stores[algorithm] = EntryStore.create(tmp_path / "runs", entry)
+        train_group(stores[algorithm].path, [0, 1], 3)
+
+    def forget(*seeds: int) -> None:
+        for store in stores.values():
+            for seed in seeds:
+                path = store.seed(seed).path / "run.json"
+                record = json.loads(path.read_text())
+                record["parameters"] = {"classical": 387, "quantum": 0}
+                path.write_text(json.dumps(record))
+
+    def told() -> tuple[dict[str, int], str, str]:
+        made = board.build(collect.collect(tmp_path / "runs")[0])
+        rows = board.as_dict(made)["sections"][0]["rows"]
+        counts = {row["label"].split()[0]: row["parameters"]["classical"] for row in rows}
+        return counts, command._markdown(made), report.render(made)
+
+    both = {"ppo": 387 + 353, "ddqn": 387}
+    counts, text, page = told()
+    assert counts == both
+    assert "first network alone" not in text + page
+    assert "740 classical, 0 quantum in 2 networks" in page
+    forget(0)
+    assert told()[0] == both
+    forget(1)
+    counts, text, page = told()
+    assert counts == {"ppo": 387, "ddqn": 387}
+    note = "arameters of the first network alone (older records count no other, such as a critic): ppo mlp width=16"
+    assert text.count(note) == page.count(note) == 1
+    assert f"{note}, ddqn" not in text + page
+
+    ppo = collect.read_entry(stores["ppo"])
+    assert ppo is not None
+    export(ppo, tmp_path / "old")
+    (old,) = collect.collect(tmp_path / "old")[0]
+    assert (old.parameters, old.networks) == ((387, 0), None)
+
+
+def test_published_entries_train_one_network() -> None:
+    found, refused = collect.collect(published.SHIPPED)
+    assert refused == []
+    assert [entry.label for entry in found if entry.first_network_alone] == []
+
+
+def test_devices_that_mix_within_an_entry_are_named() -> None:
+    one, two = boards.graded(2)
+    made = boards.of([replace(one, devices=("cpu", "cuda")), replace(two, devices=("cpu",))])
+    note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
+    assert note in command._markdown(made).split("  \n")
+    assert origin.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
+    assert "several kinds of device" not in command._markdown(boards.of([one, two]))
+
+
+def test_what_tuning_took_is_said() -> None:
+    one, two, three = boards.graded(3)
+    tuning = {"trials": 7, "steps": 10_500_000, "core_hours": 0.12}
+    made = boards.of([replace(one, tuning=tuning), replace(two, tuning={"trials": None}), three])
+    text = f"{one.label} (7 trials, 10,500,000 steps, 0.12 core-hours), {two.label} (budget not known)"
+    assert f"settings found by tuning: {text}" in command._markdown(made).split("  \n")

@@ -69,6 +69,8 @@ def test_what_is_published_is_what_was_run(folder: Path, tmp_path: Path) -> None
         "task_hash",
         "task_file",
         "parameters",
+        "networks",
+        "devices",
         "seeds",
         "identity",
         "executions",
@@ -184,6 +186,7 @@ RECORDS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "name": (lambda r: r.update(name="ddqn-mlp-00000000"), "named"),
     "place": (lambda r: r.update(task_name="../elsewhere"), "place|task"),
     "parameters": (lambda r: r["published"]["parameters"].update(classical=-1), "classical parameters"),
+    "networks": (lambda r: r["published"]["parameters"].update(networks="two"), "networks: 'two'"),
     "provenance": (lambda r: r["published"].update(provenance=[]), "provenance"),
     "nothing published": (lambda r: r.pop("published"), "published"),
 }
