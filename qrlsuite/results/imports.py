@@ -93,7 +93,7 @@ def import_files(
     try:
         seeds = store.seeds()
         digests = {str((store.seed(seed).record() or {}).get("imported", {}).get("sha256")) for seed in seeds}
-        new = []
+        new: list[int] = []
         for path, content, scores, parameters in contents:
             if content.sha256 not in digests:
                 digests.add(content.sha256)

@@ -76,7 +76,7 @@ def read_seeds(given: int | str | Iterable[int]) -> list[int]:
 
 
 def _is_seed(value: object) -> TypeGuard[int]:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
 
 
 def format_seeds(seeds: Sequence[int]) -> str:
