@@ -1,6 +1,13 @@
 """Circuit layers side by side: milliseconds for forward and backward of a batch of 64, one thread, one run.
 
     python benchmarks/circuits.py --qubits 4 6 8 10 --plot circuits.png
+    python benchmarks/circuits.py --bound
+
+With `--bound`: the native simulator alone, every built-in ansatz, 10 seeds together, as a share of the processor's
+bound: of what a loop of fused multiply-adds on the same vectors reaches, measured in turn with it. Work is counted
+as in a plain list of gates: 28 operations per amplitude pair that a block of rotations touches (80 backward), 2 per
+amplitude and Hadamard (4 backward), nothing for CNOT and CZ. Shares are medians: of the kernels forward, backward and
+both, and of the whole call from torch.
 
 Work: the paper's hybrid circuit (`iqp`, `rot`, 4 layers), gradients by inputs, scalings and weights. Peers are
 PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), lightning.qubit with
@@ -21,11 +28,13 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
+import numpy as np
 import torch
 
 from qrlsuite.circuit import Circuit, ansatz, create_backend
 
-BATCH = 64
+BATCH, SEEDS = 64, 10
+NINE = [(name, gate) for name in ("iqp", "cx", "cz") for gate in ("rot", "xyz", "u3")]
 Call = Callable[[], object]
 
 
@@ -101,6 +110,113 @@ def median_ms(call: Call, seconds: float, scale: float = 1.0) -> float:
     return 1e3 * scale * statistics.median(times)
 
 
+def fma_loop() -> tuple[Call, float]:
+    """Return a loop of independent fused multiply-adds on the simulator's vectors, and its operations."""
+    import numba
+
+    from qrlsuite.plugins.circuits.native import kernels
+    from qrlsuite.plugins.circuits.native.vectors import fma, load, store
+
+    @numba.njit(nogil=True, fastmath={"contract"}, error_model="numpy")
+    def loop(rows: np.ndarray, count: int) -> None:
+        x, y = load(rows, 0), load(rows, 1)
+        a = b = c = d = e = f = g = h = i = j = k = m = load(rows, 2)
+        for _ in range(count):
+            a, b, c, d = fma(a, x, y), fma(b, x, y), fma(c, x, y), fma(d, x, y)
+            e, f, g, h = fma(e, x, y), fma(f, x, y), fma(g, x, y), fma(h, x, y)
+            i, j, k, m = fma(i, x, y), fma(j, x, y), fma(k, x, y), fma(m, x, y)
+        store(rows, 3, a + b + c + d + e + f + g + h + i + j + k + m)
+
+    count, lanes = 300_000, kernels.lanes(np.float32)
+    rows = kernels.aligned((4, lanes), np.float32)
+    rows[:] = 0.5
+    return lambda: loop(rows, count), 2.0 * 12 * count * lanes
+
+
+def operations(circuit: Circuit) -> tuple[float, float]:
+    """Return the operations of one sample, forward and backward, in the plain list of gates."""
+    from qrlsuite.plugins.circuits.native.program import HADAMARD, NONE, ROTATE, compile_circuit
+
+    forward = backward = 0.0
+    for kind, first, second, third, _ in compile_circuit(circuit).steps.tolist():
+        if kind == ROTATE:
+            pairs = (1 << circuit.qubits) / (2 if first == NONE else 4)
+            forward, backward = forward + 28 * pairs, backward + 80 * pairs
+        elif kind == HADAMARD:
+            amplitudes = sum(bit != NONE for bit in (first, second, third)) << circuit.qubits
+            forward, backward = forward + 2 * amplitudes, backward + 4 * amplitudes
+    return forward, backward
+
+
+def seconds_of(call: Call) -> float:
+    """Return the processor time of one call."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def shares(circuit: Circuit, seconds: float, bound: Call, bound_operations: float) -> list[float]:
+    """Return the shares of the bound: kernels forward, backward, both, whole call; and the whole call's ms per seed."""
+    from qrlsuite.plugins.circuits.native import NativeBackend
+
+    backend = NativeBackend(circuit)
+    kernels = backend.simulator().kernels
+    inside = {"forward": 0.0, "backward": 0.0}
+    original = {name: getattr(kernels, name) for name in inside}
+
+    def timed(name: str) -> Callable[..., None]:
+        def call(*arguments: object) -> None:
+            inside[name] = seconds_of(lambda: original[name](*arguments))
+
+        return call
+
+    source = torch.Generator().manual_seed(0)
+    x = torch.rand(SEEDS, BATCH, circuit.inputs, generator=source)
+    parameters = {
+        name: (6.28 * torch.rand(SEEDS, *p.shape, generator=source)).requires_grad_()
+        for name, p in circuit.parameters.items()
+    }
+    cotangent = torch.rand(SEEDS, BATCH, len(circuit.observables), generator=source)
+
+    def whole() -> None:
+        torch.autograd.grad(backend(x, parameters), list(parameters.values()), cotangent)
+
+    forward, backward = (count * SEEDS * BATCH for count in operations(circuit))
+    for name in inside:
+        setattr(kernels, name, timed(name))
+    try:
+        whole()
+        rows: list[tuple[float, ...]] = []
+        began = time.process_time()
+        while len(rows) < 5 or time.process_time() - began < seconds:
+            peak = bound_operations / seconds_of(bound)
+            total = seconds_of(whole)
+            f, b = inside["forward"], inside["backward"]
+            both = forward + backward
+            rows.append(
+                (forward / f / peak, backward / b / peak, both / (f + b) / peak, both / total / peak, total)
+            )
+    finally:
+        for name, function in original.items():
+            setattr(kernels, name, function)
+    *medians, total = np.median(rows, axis=0).tolist()
+    return [*medians, 1e3 * total / SEEDS]
+
+
+def print_shares(qubits: list[int], layers: int, seconds: float) -> None:
+    """Print how close to the bound every built-in ansatz comes."""
+    bound, count = fma_loop()
+    bound()
+    print(
+        f"{'':>10}{'qubits':>8}{'forward':>10}{'backward':>10}{'both':>8}{'torch call':>12}{'ms a seed':>11}"
+    )
+    for name, gate in NINE:
+        for n in qubits:
+            row = shares(ansatz(name, qubits=n, layers=layers, gate=gate), seconds, bound, count)
+            cells = "{:>10.0%}{:>10.0%}{:>8.0%}{:>12.0%}{:>11.3g}".format(*row)
+            print(f"{f'{name} {gate}':>10}{n:>8}{cells}", flush=True)
+
+
 def main() -> None:
     """Measure, print the table, and draw it where asked."""
     parser = argparse.ArgumentParser(
@@ -113,8 +229,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="per measurement")
     parser.add_argument("--quick", action="store_true", help="native and PennyLane only")
     parser.add_argument("--plot", help="draw milliseconds against qubits to this file")
+    parser.add_argument("--bound", action="store_true", help="shares of the processor's bound, native alone")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if given.bound:
+        print_shares(given.qubits, given.layers, given.seconds)
+        return
     table: dict[str, dict[int, float]] = {}
     for n in given.qubits:
         circuit = ansatz(given.ansatz, qubits=n, layers=given.layers, gate=given.gate)

@@ -5,12 +5,17 @@
 An update is what training repeats: two forward passes for the target, one forward and backward pass, one step of
 Adam. Milliseconds of processor time per update and seed, medians, one thread, one run; ratios are to PennyLane at the
 same number of seeds. Qiskit (4 qubits, or fewer) computes a batch of 2, extrapolated: its cost is one of samples.
+For the native backend one round of training (choose actions, step the environment, update) is also divided: what
+part is the circuit's kernels, the environment, and the rest, which is torch.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import time
+from collections.abc import Callable
+from typing import Any
 
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -28,8 +33,8 @@ from qrlsuite.training.trainer import ModelBuilder, build_envs
 BATCH = 64
 
 
-def update(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> Call:
-    """Return a call that makes one update of a population on the standard task."""
+def training(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> tuple[Any, torch.Tensor]:
+    """Return a population's DDQN on the standard task, its replay buffer filled, and a batch's positions in it."""
     words = [*settings, f"algorithm.batch={batch}"]
     entry = resolve("beam6g", model, settings=[parse_setting(word) for word in words])
     streams = [Streams(entry.task.hash, seed) for seed in parse_seeds(f"0:{seeds}")]
@@ -42,8 +47,52 @@ def update(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> C
     ddqn.start()
     for _ in range(7):  # fills the replay buffer without learning, which takes Qiskit minutes
         ddqn._interact(torch.zeros((seeds, 10), dtype=torch.int64))
-    picked = torch.randint(70, (seeds, batch), generator=torch.Generator().manual_seed(0))
+    return ddqn, torch.randint(70, (seeds, batch), generator=torch.Generator().manual_seed(0))
+
+
+def update(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> Call:
+    """Return a call that makes one update of a population."""
+    ddqn, picked = training(model, settings, seeds, batch)
     return lambda: ddqn._learn(picked)
+
+
+def parts(qubits: int, seeds: int, seconds: float) -> dict[str, float]:
+    """Return what part of a round of training is circuit, environment and torch."""
+    from qrlsuite.plugins.circuits.native import kernels
+
+    ddqn, picked = training("vqc-native", [f"qubits={qubits}"], seeds)
+    spent = dict.fromkeys(("circuit", "environment"), 0.0)
+
+    def timed(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            start = time.process_time()
+            result = function(*arguments, **named)
+            spent[what] += time.process_time() - start
+            return result
+
+        return call
+
+    def one_round() -> float:
+        start = time.process_time()
+        ddqn._interact(ddqn._greedy(ddqn.observations))
+        ddqn._learn(picked)
+        return time.process_time() - start
+
+    original = {name: getattr(kernels, name) for name in ("forward", "backward")}
+    for name, function in original.items():
+        setattr(kernels, name, timed("circuit", function))
+    ddqn.envs.step = timed("environment", ddqn.envs.step)
+    try:
+        one_round()
+        spent.update(circuit=0.0, environment=0.0)
+        total = 0.0
+        while total < seconds:
+            total += one_round()
+    finally:
+        for name, function in original.items():
+            setattr(kernels, name, function)
+    shares = {name: part / total for name, part in spent.items()}
+    return {**shares, "torch": 1.0 - sum(shares.values())}
 
 
 def main() -> None:
@@ -71,6 +120,11 @@ def main() -> None:
                     f"{model} qubits={n}, {seeds} seeds: {ms:.3f} ms per seed (ratio {base[seeds] / ms:.3g})",
                     flush=True,
                 )
+        for seeds in (1, 10):
+            shares = ", ".join(
+                f"{name} {share:.0%}" for name, share in parts(n, seeds, given.seconds).items()
+            )
+            print(f"a round of training, vqc-native qubits={n}, {seeds} seeds: {shares}", flush=True)
 
 
 if __name__ == "__main__":

@@ -75,6 +75,7 @@ class PennyLaneBackend:
     """
 
     def __init__(self, circuit: Circuit, options: Options) -> None:
+        circuit.require_simulable("pennylane")
         self.circuit = circuit
         self.options = options
         self.shots: int | None = options.shots

@@ -136,6 +136,7 @@ class QiskitBackend:
     """
 
     def __init__(self, circuit: Circuit, options: Options) -> None:
+        circuit.require_simulable("qiskit")
         self.options = options
         self.shots: int | None = options.shots
         self.gradient = _gradient(options)

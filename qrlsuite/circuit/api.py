@@ -11,6 +11,9 @@ Registry, torch and simulators are imported when a function is called, not befor
 
 from __future__ import annotations
 
+import copy
+import threading
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -73,7 +76,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     name:
         Name of the ansatz: `qrlsuite list ansatzes`.
     qubits, layers:
-        Size of the circuit: 1 to 20 qubits, 1 layer or more.
+        Size of the circuit: 1 to 20 qubits, more where gates connect at most 20 of them; 1 layer or more.
     options:
         Options of the ansatz, such as `gate="rot"`.
 
@@ -87,13 +90,14 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     from qrlsuite import options as option_values
     from qrlsuite import registry, specs
 
-    if isinstance(qubits, bool) or not isinstance(qubits, int) or not 1 <= qubits <= MAX_QUBITS:
+    if isinstance(qubits, bool) or not isinstance(qubits, int) or qubits < 1:
         raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
     if isinstance(layers, bool) or not isinstance(layers, int) or layers < 1:
         raise OptionError(f"layers = {layers!r}: a circuit has 1 layer or more")
     spec = registry.ansatz(name)
     chosen = option_values.build(specs.resolve(spec.options), options, f"ansatz '{name}'")
     circuit: Circuit = specs.resolve(spec.build)(qubits, layers, chosen)
+    circuit.require_simulable()
     return circuit
 
 
@@ -116,6 +120,39 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
     return backend
 
 
+class _Prepared(threading.local):
+    """The backends of the last circuits that `expectations` ran, the latest last; every thread has its own."""
+
+    def __init__(self) -> None:
+        self.backends: OrderedDict[Any, CircuitBackend] = OrderedDict()
+
+
+_prepared = _Prepared()
+PREPARED = 8
+"""How many backends a thread keeps."""
+
+
+def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> CircuitBackend:
+    """Return a backend for a circuit: one made before if backend, options and the circuit's content are the same."""
+    from qrlsuite import options as option_values
+    from qrlsuite import registry, specs
+
+    spec = registry.circuit_backend(name)
+    chosen = option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
+    content = (circuit.qubits, circuit.inputs, *circuit.parameters.values(), *circuit, circuit.observables)
+    key = (spec, repr(chosen), content)
+    kept = _prepared.backends
+    if key in kept:
+        kept.move_to_end(key)
+        return kept[key]
+    # A copy: a backend may read its circuit at every call, and the caller may append to it.
+    backend: CircuitBackend = specs.resolve(spec.factory)(copy.deepcopy(circuit), chosen)
+    kept[key] = backend
+    if len(kept) > PREPARED:
+        kept.popitem(last=False)
+    return backend
+
+
 def expectations(
     circuit: Circuit,
     inputs: ArrayLike | torch.Tensor,
@@ -126,6 +163,8 @@ def expectations(
     **backend_options: Any,
 ) -> torch.Tensor:
     """Compute a circuit's expectation values for a batch of inputs.
+
+    The last few circuits are kept prepared, so that only the first call with a circuit compiles it.
 
     Parameters
     ----------
@@ -181,7 +220,7 @@ def expectations(
                 f"parameter '{name}' has shape {tuple(value.shape)}, declared is {parameter.shape}"
             )
         state[name] = value[None]
-    run = create_backend(backend, circuit, **backend_options)
+    run = _prepare(backend, circuit, backend_options)
     return run(x[None], state, None if seed is None else [seed])[0]
 
 

@@ -36,6 +36,7 @@ import numpy as np
 from qrlsuite.errors import CircuitError, OptionError, nearest
 
 MAX_QUBITS = 20
+"""How many qubits gates may connect, directly or through others: their state has 2^20 amplitudes."""
 
 
 class GateSignature(NamedTuple):
@@ -170,11 +171,11 @@ class Circuit:
     Raises
     ------
     OptionError
-        If the number of qubits is not 1..20 or the number of inputs is not positive.
+        If the number of qubits or inputs is not positive.
     """
 
     def __init__(self, qubits: int, inputs: int | None = None) -> None:
-        if not isinstance(qubits, int) or not 1 <= qubits <= MAX_QUBITS:
+        if not isinstance(qubits, int) or qubits < 1:
             raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
         self.qubits = qubits
         self.inputs = qubits if inputs is None else inputs
@@ -270,6 +271,46 @@ class Circuit:
             parameter = self.parameters.get(element.parameter)
             if parameter is None or not 0 <= element.index < parameter.size:
                 raise CircuitError(f"the angle uses {element}, which this circuit does not declare")
+
+    def components(self) -> list[list[int]]:
+        """Return the qubits in groups that gates connect, directly or through others: each group in rising order.
+
+        Without an entangling gate every qubit is a group of its own.
+        """
+        group = {q: {q} for q in range(self.qubits)}
+        for operation in self._operations:
+            first, *others = operation.qubits
+            for other in others:
+                if group[other] is not group[first]:
+                    group[first] |= group[other]
+                    for q in group[other]:
+                        group[q] = group[first]
+        return [sorted(qubits) for q, qubits in group.items() if q == min(qubits)]
+
+    def require_simulable(self, backend: str | None = None) -> None:
+        """Refuse a circuit whose state would be too large.
+
+        Parameters
+        ----------
+        backend:
+            Name of a backend that keeps one state of all qubits; None stands for a state per component.
+
+        Raises
+        ------
+        OptionError
+            If gates connect more than `MAX_QUBITS` qubits, or the backend would keep a state of more.
+        """
+        largest = max(map(len, self.components()))
+        if largest > MAX_QUBITS:
+            raise OptionError(
+                f"qubits = {self.qubits}: a circuit has 1 to {MAX_QUBITS} qubits, or more of which gates connect at "
+                f"most {MAX_QUBITS}; here they connect {largest}"
+            )
+        if backend is not None and self.qubits > MAX_QUBITS:
+            raise OptionError(
+                f"{self.qubits} qubits: backend '{backend}' keeps one state of all, of at most {MAX_QUBITS}; "
+                "'native' computes qubits apart that no gate connects"
+            )
 
     def __iter__(self) -> Iterator[Operation]:
         return iter(self._operations)

@@ -1,13 +1,15 @@
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 
 from qrlsuite import registry
-from qrlsuite.circuit import ansatz, expectations
+from qrlsuite.circuit import Circuit, ansatz, api, expectations
 from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.plugins.circuits.native import cpu, program
 
 
 @pytest.fixture
@@ -101,3 +103,55 @@ def test_an_unknown_backend_names_the_nearest(circuit, parameters):
         UnknownNameError, match=r"unknown circuit backend 'penylane'; did you mean 'pennylane'\?"
     ):
         expectations(circuit, ONES, parameters, backend="penylane")
+
+
+@pytest.mark.parametrize("backend", ["native", "pennylane"])
+def test_a_circuit_that_grew_is_computed_anew_and_the_old_content_as_before(backend):
+    """RX(0.3), then RX(0.3) RX(0.3): cos 0.3, cos 0.6, whichever circuit was computed and kept before."""
+
+    def one():
+        circuit = Circuit(1)
+        circuit.append("RX", 0, circuit.input(0))
+        return circuit
+
+    grown = one()
+    before = expectations(grown, [[0.3]], {}, backend=backend)
+    grown.append("RX", 0, grown.input(0))
+    after = expectations(grown, [[0.3]], {}, backend=backend)
+    fresh = expectations(one(), [[0.3]], {}, backend=backend)
+    assert [float(v) for v in (before, after, fresh)] == pytest.approx(
+        [np.cos(0.3), np.cos(0.6), np.cos(0.3)]
+    )
+
+
+def test_what_is_measured_and_the_options_are_part_of_a_circuits_content():
+    circuit = Circuit(2)
+    circuit.append("X", 1)
+    assert expectations(circuit, [[0.0, 0.0]], {}).tolist() == [[1.0, -1.0]]
+    circuit.measure([1])
+    assert expectations(circuit, [[0.0, 0.0]], {}).tolist() == [[-1.0]]
+    circuit.append("H", 0)
+    circuit.measure([0])
+    sampled = [float(expectations(circuit, [[0.0, 0.0]], {}, "pennylane", seed=3, shots=n)) for n in (1, 100)]
+    assert abs(sampled[0]) == 1.0
+    assert abs(sampled[1]) < 1.0
+
+
+def test_a_circuit_is_prepared_once_and_few_are_kept(monkeypatch):
+    made = []
+    compiled = program.compile_circuit
+    monkeypatch.setattr(cpu, "compile_circuit", lambda circuit: made.append(1) or compiled(circuit))
+    for number in (*range(20), 19):
+        circuit = Circuit(1)
+        circuit.append("RX", 0, 0.01 * number + 100)
+        expectations(circuit, [[0.0]], {}, backend="native")
+    assert len(made) == 20
+    assert len(api._prepared.backends) == api.PREPARED
+
+
+def test_threads_do_not_share_a_prepared_circuit(circuit, parameters):
+    x = np.linspace(-1, 1, 400).reshape(200, 2)
+    expected = expectations(circuit, x, parameters)
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda _: expectations(circuit, x, parameters), range(40)))
+    assert all(torch.equal(result, expected) for result in results)

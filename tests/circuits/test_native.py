@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
+import os
+import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -258,8 +261,8 @@ def test_programs_are_as_short_as_they_should_be(name: str) -> None:
 def test_state_memory_at_14_qubits() -> None:
     backend = NativeBackend(ansatz("iqp", qubits=14, layers=4))
     work = backend.simulator().workspace(torch.float32)
-    kept = 4 * work.state.nbytes  # 64 samples are 4 chunks
-    buffers = [*work.scratch, work.pair, work.overlap, work.sums, work.slopes, work.state]
+    kept = 4 * work.record.nbytes  # 64 samples are 4 chunks of 16 lanes
+    buffers = [*work.scratch, work.pair, work.overlap, work.sums, work.slopes, work.record]
     assert kept + sum(b.nbytes for b in buffers) < 64 << 20
 
 
@@ -274,6 +277,49 @@ def test_one_and_twenty_qubits() -> None:
     values = expectations(twenty, [[0.3]], {}, backend="native", dtype="float32")[0]
     expected = [math.cos(0.3), *[1.0] * 18, math.cos(0.3)]
     np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_qubits_that_no_gate_connects_have_states_of_their_own(path: str) -> None:
+    """64 qubits as easily as 6: RX(a) and RY(b) on |0> give cos a cos b on every qubit."""
+    circuit = Circuit(64)
+    weights = circuit.parameter("weights", (64,))
+    for q in range(64):
+        circuit.append("RX", q, circuit.input(q))
+        circuit.append("RY", q, weights[q])
+    assert compile_circuit(circuit).amplitudes == 128
+    x, parameters = random_values(circuit, 2, 20, torch.float64)
+    w = parameters["weights"].requires_grad_()
+    values = run(NativeBackend(circuit), path, x, {"weights": w})
+    torch.testing.assert_close(values.detach(), x.cos() * w.detach().cos()[:, None], rtol=0, atol=1e-12)
+    values.sum().backward()
+    expected = -x.cos().sum(1) * w.detach().sin()
+    torch.testing.assert_close(w.grad, expected, rtol=0, atol=1e-12)
+
+
+def test_components_of_a_circuit() -> None:
+    circuit = Circuit(6)
+    circuit.append("CNOT", (4, 1))
+    circuit.append("RX", 0, circuit.input(0))
+    circuit.append("RX", 3, circuit.input(3), control=5)
+    circuit.append("CZ", (1, 2))
+    assert circuit.components() == [[0], [1, 2, 4], [3, 5]]
+    assert compile_circuit(circuit).amplitudes == 2 + 8 + 4
+
+
+@pytest.mark.parametrize("backend", ["native", "pennylane", "qiskit"])
+def test_more_connected_qubits_than_a_state_can_hold_are_refused(backend: str) -> None:
+    circuit = Circuit(30)
+    for q in range(21):
+        circuit.append("CNOT", (q, q + 1))
+    with pytest.raises(OptionError, match="gates connect at most 20; here they connect 22"):
+        expectations(circuit, [[0.0] * 30], {}, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["pennylane", "qiskit"])
+def test_backends_with_one_state_for_all_qubits_take_twenty(backend: str) -> None:
+    with pytest.raises(OptionError, match=r"21 qubits: backend '.*' keeps one state of all, of at most 20"):
+        expectations(Circuit(21), [[0.0] * 21], {}, backend=backend)
 
 
 @pytest.mark.parametrize(
@@ -310,7 +356,58 @@ def test_copies_share_the_compiled_program() -> None:
     assert copy.deepcopy(backend) is backend
 
 
-def test_the_compile_cache_depends_on_every_source_file(tmp_path: Path) -> None:
+PROCESSORS = {"haswell": 32, "x86-64": 16}
+"""Processors that numba is asked to compile for, and the bytes of their vector registers; the last has no FMA."""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="runs code for processors of this architecture")
+@pytest.mark.parametrize(("processor", "register"), PROCESSORS.items())
+def test_other_processors(processor: str, register: int, tmp_path: Path) -> None:
+    """The released code's numbers, seeds in company and any circuit, compiled for a processor with less."""
+    if processor == "haswell" and "fma" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("this processor has no AVX2 and FMA")
+    program = (
+        "import sys, pytest; from numba import types; from qrlsuite.plugins.circuits.native.vectors import LANES; "
+        "assert LANES == {types.float32: int(sys.argv[1]) // 4, types.float64: int(sys.argv[1]) // 8}, LANES; "
+        "sys.exit(pytest.main(['-q', '-x', '-p', 'no:cacheprovider', sys.argv[2], '-k', sys.argv[3]]))"
+    )
+    chosen = "numbers and kernels or company or finite_differences or linear_algebra or connects"
+    target = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "QRLSUITE_CACHE": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(register), __file__, chosen],
+        env={**os.environ, **target},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_code_for_arm_has_vectors_and_fused_multiplications() -> None:
+    """Not run here, but compiled: a block's sweep, with this machine's lanes, for an ARM processor."""
+    import llvmlite.binding as llvm
+    import numba
+
+    from qrlsuite.plugins.circuits.native.sweeps import rotate
+
+    def sweep(state: object, gates: object) -> None:
+        rotate(state, 3, 0, 1, gates, 0, 0)
+
+    signature = (numba.types.Array(numba.float32, 2, "C"),) * 2
+    options = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False, "no_cpython_wrapper": True}
+    compiled = numba.njit(**options)(sweep)  # alone: numba's own code around it is for this machine
+    compiled.compile(signature)
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    machine = llvm.Target.from_triple("aarch64-unknown-linux-gnu").create_target_machine(opt=3)
+    code = re.sub(r'target (triple|datalayout) = ".*"\n', "", compiled.inspect_llvm(signature))
+    module = llvm.parse_assembly(code)
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    assembly = machine.emit_assembly(module)
+    assert re.search(r"fmla\s+v\d+\.4s", assembly)
+
+
+def test_the_compile_cache_depends_on_every_source_file_and_the_processor(tmp_path: Path) -> None:
     """A changed source is never served from a stale cache, and two processes may fill it at once."""
     from qrlsuite.plugins.circuits.native import cache
 
@@ -323,15 +420,16 @@ def test_the_compile_cache_depends_on_every_source_file(tmp_path: Path) -> None:
         "m = importlib.util.module_from_spec(s); s.loader.exec_module(m); print(m.FOLDER)"
     )
 
-    def folder() -> str:
+    def folder(**variables: str) -> str:
         command = [sys.executable, "-c", program, str(package / "cache.py")]
-        return subprocess.run(
-            command, capture_output=True, text=True, check=True, env={"QRLSUITE_CACHE": str(tmp_path)}
-        ).stdout
+        env = {"QRLSUITE_CACHE": str(tmp_path), **variables}
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout
 
     first = folder()
     assert folder() == first
     assert first.startswith(str(tmp_path))
+    generic = folder(NUMBA_CPU_NAME="generic")
+    assert len({first, generic, folder(NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="+neon")}) == 3
     (package / "vectors.py").write_text((package / "vectors.py").read_text() + "\n")
     assert folder() != first
 
@@ -348,8 +446,6 @@ print(v.tolist())
 
 
 def test_two_processes_may_compile_at_once_and_later_ones_start_from_the_cache(tmp_path: Path) -> None:
-    import os
-
     env = {**os.environ, "QRLSUITE_CACHE": str(tmp_path)}
     both = [
         subprocess.Popen(

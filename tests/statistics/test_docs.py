@@ -10,7 +10,20 @@ import pytest
 
 import qrlsuite.statistics
 from qrlsuite import registry
-from qrlsuite.statistics import Outcome, Verdict
+from qrlsuite.leaderboard.published import SHIPPED, read
+from qrlsuite.statistics import (
+    Decided,
+    DecisionPlan,
+    LearningCurves,
+    Outcome,
+    PairDecision,
+    Spending,
+    Verdict,
+    nominal_levels,
+    outperformance,
+    times_board,
+)
+from tests.statistics.conftest import SURFACE
 
 PAGE = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
 
@@ -34,6 +47,16 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
         "board_false_winners",
         "power",
         "Evidence",
+        "times_below",
+        "mean_time",
+        "times_board",
+        "DecisionPlan",
+        "decide",
+        "runs_needed",
+        "runs_to_detect",
+        "across_tasks",
+        "horizon_shares",
+        "rliable_arrays",
     ],
 )
 def test_functions_on_the_page_exist(name: str) -> None:
@@ -44,6 +67,30 @@ def test_functions_on_the_page_exist(name: str) -> None:
 def test_rules_verdicts_and_outcomes_are_on_the_page() -> None:
     for name in (*registry.load().names("significance_tests"), *Verdict, *Outcome):
         assert name in PAGE
+
+
+def test_decisions_on_the_page_are_those_of_the_code() -> None:
+    plan = DecisionPlan(("A", "B"))
+    assert " ".join(f"{level:.4f}"[1:] for level in nominal_levels(plan.looks, 0.05, Spending.POCOCK)) in PAGE
+    assert "Looks at 20, 40, 60, 80 and 100 runs" in PAGE
+    assert plan.looks == (20, 40, 60, 80, 100)
+    for decided in Decided:
+        pair = PairDecision("A", "B", decided, 100, interval=(0, 0.12))
+        assert f"`{pair.verdict}`" in PAGE.replace("above x percent", "above 12 percent")
+
+
+def test_the_published_board_on_the_page_is_that_of_the_code() -> None:
+    entries = [read(folder).entry_curves() for folder in sorted((SHIPPED / "beam6g").iterdir())]
+    curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries]
+    board = times_board(curves, SURFACE)
+    tiers = {entry.name: entry.tier for entry in outperformance(curves, SURFACE).ranking.entries}
+    for index in board.order:
+        mean, (best, worst) = board.means[index], board.ranks[index]
+        low, high = mean.interval
+        ranks = f"{best} to {worst}"
+        name = board.names[index]
+        assert f"| {name} | {tiers[name]} | {mean.mean:.0f} | {low:.0f} to {high:.0f} |" in PAGE
+        assert f"{100 * mean.at_cap.mean():.2f}% | {ranks} |" in PAGE
 
 
 def test_public_names_exist_and_are_documented() -> None:

@@ -25,6 +25,7 @@ from qrlsuite.statistics import (
     decide,
     nominal_levels,
     slower,
+    times_below,
 )
 from qrlsuite.statistics.permutation import CHUNK
 from tests.statistics.conftest import SURFACE, entry
@@ -82,8 +83,8 @@ def test_a_clear_pair_is_decided_at_the_first_look() -> None:
     assert decision.finished
     assert (pair.decided, pair.n_runs, pair.verdict) == (Decided.FIRST, 20, "a needs fewer")
     assert pair.difference == pytest.approx(3.2), "21 epochs are 320 percent more than 5"
-    assert pair.p == (pytest.approx(1 / (CHUNK + 1)),)
-    assert pair.levels == (pytest.approx(0.01477, abs=1e-5),)
+    assert list(pair.p) == pytest.approx([1 / (CHUNK + 1)])
+    assert list(pair.levels) == pytest.approx([0.01477], abs=1e-5)
     assert decide(plan("b", "a"), runs, CELL).pairs[0].verdict == "a needs fewer"
     assert decide(plan("b", "a"), runs, CELL).pairs[0].decided is Decided.SECOND
 
@@ -174,6 +175,18 @@ def test_labels_are_nested_across_looks() -> None:
     )
     other.extend(CHUNK)
     assert (other.reached != early.reached).all(), "as the second block they are relabeled otherwise"
+
+
+def test_a_decision_relabels_within_the_blocks_of_its_looks() -> None:
+    model, generator = SmoothedRuns(entry(0)), np.random.default_rng(8)
+    runs = {name: model.draw(40, generator) for name in "ab"}
+    [pair] = decide(plan(alpha=1e-4), runs, SURFACE).pairs
+    times = [times_below(runs[name].values, SURFACE, 2000) for name in "ab"]
+    for look, expected in enumerate(pair.p):
+        n_runs = LOOKS[look]
+        test = MaxT([(times[0][:n_runs], times[1][:n_runs])], ((20, 20),) * (look + 1))
+        test.extend(int(test.n_relabelings[0]) + 200_000)
+        assert test.p[0] == expected
 
 
 def test_sentences_of_all_kinds() -> None:

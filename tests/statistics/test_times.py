@@ -41,7 +41,7 @@ def test_mean_time_by_hand() -> None:
     curves = np.array([[0.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
     found = mean_time(LearningCurves(curves, 100), CELL)
     assert found.mean == 200
-    assert found.interval == (0, 400), "kept within the horizon"
+    assert list(found.interval) == [0, 400], "kept within the horizon"
     assert found.at_cap.tolist() == [0, 0]
     assert found.half == 150, "two epochs: 100 and 200"
     many = mean_time(LearningCurves(np.repeat(curves, 50, axis=0), 100), CELL)

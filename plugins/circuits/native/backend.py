@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 from qrlsuite.circuit import Circuit
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import dense
-from qrlsuite.plugins.circuits.native.program import compile_circuit
+from qrlsuite.plugins.circuits.native.program import Program, compile_circuit
 
 if TYPE_CHECKING:
     from qrlsuite.plugins.circuits.native.cpu import Simulator
@@ -33,7 +35,7 @@ class NativeBackend:
     Parameters
     ----------
     circuit:
-        What to run; its whole content is compiled here, later changes have no effect.
+        What to run; its whole content is copied here, later changes have no effect.
     options:
         None are needed.
     """
@@ -41,8 +43,9 @@ class NativeBackend:
     shots: int | None = None
 
     def __init__(self, circuit: Circuit, options: Options | None = None) -> None:
+        circuit.require_simulable()
+        self.circuit = copy.deepcopy(circuit)
         self.shapes = {name: p.shape for name, p in circuit.parameters.items()}
-        self.program = compile_circuit(circuit)
         self._simulator: Simulator | None = None
 
     def __call__(
@@ -78,18 +81,23 @@ class NativeBackend:
             raise OptionError("the circuit's inputs or parameters are not finite (NaN or infinite)")
         return result
 
+    @cached_property
+    def program(self) -> Program:
+        """What devices other than the CPU run: steps on the whole state, made when first needed."""
+        return compile_circuit(self.circuit)
+
     def simulator(self) -> Simulator:
         """Return the CPU simulator, made when first needed."""
         if self._simulator is None:
             from qrlsuite.plugins.circuits.native.cpu import Simulator
 
-            self._simulator = Simulator(self.program)
+            self._simulator = Simulator(self.circuit)
         return self._simulator
 
     def _check(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> None:
-        if inputs.dim() != 3 or inputs.shape[2] != self.program.inputs or 0 in inputs.shape[:2]:
+        if inputs.dim() != 3 or inputs.shape[2] != self.circuit.inputs or 0 in inputs.shape[:2]:
             raise OptionError(
-                f"inputs have shape {tuple(inputs.shape)}: this circuit needs (seeds, batch, {self.program.inputs})"
+                f"inputs have shape {tuple(inputs.shape)}: this circuit needs (seeds, batch, {self.circuit.inputs})"
             )
         if inputs.dtype not in (torch.float32, torch.float64):
             raise OptionError(

@@ -1,8 +1,9 @@
 """Numba's compile cache, in a folder whose name covers everything that the kernels are made of.
 
 Numba judges a cached kernel by the file of the called function alone; here the folder's name hashes the source of
-every module of this package, the versions of numba and LLVM, and the processor, so that a stale kernel is never
-served. Files are written atomically by numba, so that processes that compile at once do no harm.
+every module of this package, the versions of numba and LLVM, and the processor that numba compiles for (its own
+variables NUMBA_CPU_NAME and NUMBA_CPU_FEATURES included), so that a stale kernel is never served. Files are written
+atomically by numba, so that processes that compile at once do no harm.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
-import llvmlite.binding
 import numba
 from numba.core import config as _config
+from numba.core.registry import cpu_target
 
 config: Any = _config  # its attributes are made at run time
 
@@ -29,9 +30,9 @@ def folder() -> Path:
     content = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         content.update(path.name.encode() + b"\0" + path.read_bytes())
-    features = sorted(name for name, there in llvmlite.binding.get_host_cpu_features().items() if there)
-    machine = [numba.__version__, llvmlite.__version__, platform.python_version(), *features]
-    content.update("/".join([*machine, llvmlite.binding.get_host_cpu_name()]).encode())
+    target = cpu_target.target_context.codegen().magic_tuple()
+    machine = [numba.__version__, llvmlite.__version__, platform.python_version(), *target]
+    content.update("/".join(map(str, machine)).encode())
     name = f"qrlsuite/native-{content.hexdigest()[:16]}"
     standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     for base in (os.environ.get("QRLSUITE_CACHE"), standard, tempfile.gettempdir()):

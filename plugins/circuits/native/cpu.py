@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from qrlsuite.circuit import Circuit
 from qrlsuite.plugins.circuits.native.cache import announce
-from qrlsuite.plugins.circuits.native.program import Program
+from qrlsuite.plugins.circuits.native.program import compile_circuit
 
 KEEP_BYTES = 256 << 20
-"""Final states up to this size are kept for the backward pass; larger ones are computed again."""
+"""Final states and gates up to this size are kept for the backward pass; larger ones are computed again."""
 
-LANES = {torch.float32: 16, torch.float64: 8}
+SPARE_BYTES = 64 << 20
+"""Memory up to this size is kept from one pass to the next, one array per circuit and precision."""
+
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
@@ -24,23 +27,45 @@ class _Workspace:
     """Buffers of one precision, reused from call to call."""
 
     scratch: Any
+    record: np.ndarray[Any, Any]
     pair: np.ndarray[Any, Any]
     overlap: np.ndarray[Any, Any]
     sums: np.ndarray[Any, Any]
     slopes: np.ndarray[Any, Any]
-    state: np.ndarray[Any, Any]
+
+
+class _Records:
+    """Final states and gates of one forward pass, (chunks, rows, V), until its backward pass is over.
+
+    The memory then serves the next pass, where it is not large: fresh pages cost more time than a small circuit.
+    """
+
+    def __init__(self, simulator: Simulator, dtype: torch.dtype, chunks: int) -> None:
+        rows = simulator.workspace(dtype).record.shape[1:]
+        self.spare = simulator.spare
+        self.dtype = dtype
+        room = self.spare.pop(dtype, None)
+        if room is None or len(room) < chunks:
+            room = simulator.kernels.aligned((chunks, *rows), NUMPY[dtype])
+        self.array = room
+
+    def __del__(self) -> None:
+        if self.array.nbytes <= SPARE_BYTES:
+            self.spare[self.dtype] = self.array
 
 
 class Simulator:
-    """Runs one program on the CPU; not to be shared between threads."""
+    """Runs one circuit on the CPU; not to be shared between threads."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, circuit: Circuit) -> None:
         announce()
         from qrlsuite.plugins.circuits.native import kernels
 
-        self.program = program
+        self.program = compile_circuit(circuit)
         self.kernels = kernels
-        self.tables = kernels.tables(program)
+        self.tables = kernels.tables(self.program)
+        self.lanes = {dtype: kernels.lanes(kind) for dtype, kind in NUMPY.items()}
+        self.spare: dict[torch.dtype, np.ndarray[Any, Any]] = {}
         self._workspaces: dict[torch.dtype, _Workspace] = {}
 
     def __call__(self, inputs: Tensor, flat: Tensor) -> Tensor:
@@ -51,15 +76,15 @@ class Simulator:
     def workspace(self, dtype: torch.dtype) -> _Workspace:
         """Return the buffers of a precision."""
         if dtype not in self._workspaces:
-            lanes, kind = LANES[dtype], NUMPY[dtype]
-            size = (1 << self.program.qubits, 2, lanes)
+            lanes, kind, program = self.lanes[dtype], NUMPY[dtype], self.program
+            rows = self.kernels.record_rows(program)
             self._workspaces[dtype] = _Workspace(
-                scratch=self.kernels.scratch(self.program, lanes, kind),
-                pair=np.empty((2, *size), kind),
-                overlap=np.empty((4, lanes), kind),
-                sums=np.empty((max(1, self.program.parameter_count), lanes), kind),
-                slopes=np.empty((self.program.inputs, lanes), kind),
-                state=np.empty((1, *size), kind),
+                scratch=self.kernels.scratch(program, lanes, kind),
+                record=self.kernels.aligned((1, sum(rows), lanes), kind),
+                pair=self.kernels.aligned((2, rows[0], lanes), kind),
+                overlap=self.kernels.aligned((4, lanes), kind),
+                sums=self.kernels.aligned((program.parameters, lanes), kind),
+                slopes=self.kernels.aligned((program.inputs, lanes), kind),
             )
         return self._workspaces[dtype]
 
@@ -73,17 +98,18 @@ class _Expectations(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, flat: Tensor, simulator: Simulator) -> Tensor:
         x, p = inputs.detach().contiguous(), flat.detach().contiguous()
-        lanes, kind = LANES[x.dtype], NUMPY[x.dtype]
+        lanes, kind = simulator.lanes[x.dtype], NUMPY[x.dtype]
         work = simulator.workspace(x.dtype)
         chunks = x.shape[0] * -(-x.shape[1] // lanes)
         needed = any(ctx.needs_input_grad[:2])
-        keep = needed and chunks * work.state.nbytes <= KEEP_BYTES
-        states = np.empty((chunks, *work.state.shape[1:]), kind) if keep else work.state
+        keep = needed and chunks * work.record.nbytes <= KEEP_BYTES
+        kept = _Records(simulator, x.dtype, chunks) if keep else None
+        records = work.record if kept is None else kept.array
         out = np.empty((*x.shape[:2], len(simulator.program.observables)), kind)
         simulator.kernels.forward(
-            simulator.tables, x.numpy(), p.numpy(), states, int(keep), work.scratch, out
+            simulator.tables, x.numpy(), p.numpy(), records, int(keep), work.scratch, out
         )
-        ctx.simulator, ctx.states = simulator, states if keep else None
+        ctx.simulator, ctx.kept = simulator, kept
         ctx.save_for_backward(x, p)
         return torch.from_numpy(out)
 
@@ -92,15 +118,15 @@ class _Expectations(torch.autograd.Function):
         x, p = ctx.saved_tensors
         simulator: Simulator = ctx.simulator
         work = simulator.workspace(x.dtype)
-        kept = ctx.states is not None
+        kept: _Records | None = ctx.kept
         grad_x, grad_p = np.empty(tuple(x.shape), NUMPY[x.dtype]), np.empty(tuple(p.shape), NUMPY[x.dtype])
         simulator.kernels.backward(
             simulator.tables,
             x.numpy(),
             p.numpy(),
             cotangents[0].to(x.dtype).contiguous().numpy(),
-            ctx.states if kept else work.state,
-            int(kept),
+            work.record if kept is None else kept.array,
+            int(kept is not None),
             work.pair,
             work.scratch,
             work.overlap,

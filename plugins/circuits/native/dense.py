@@ -19,6 +19,7 @@ from qrlsuite.plugins.circuits.native.program import (
     PERMUTE,
     PHASE,
     ROTATE,
+    Component,
     Program,
 )
 
@@ -58,46 +59,63 @@ class _Expectations(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, angles: Tensor, program: Program) -> Tensor:
-        state = _begin(program, angles)
-        for step in program.steps.tolist():
-            _apply(program, state, step, angles)
+        states = [_begin(component, angles) for component in _components(program)]
+        for component, state in zip(_components(program), states):
+            for step in _steps(program, component):
+                _apply(program, component.qubits, state, step, angles)
         ctx.program = program
-        ctx.save_for_backward(angles, state)
-        return state.abs().square() @ _diagonals(program, angles)
+        ctx.save_for_backward(angles, *states)
+        diagonals = [_diagonals(program, component, angles) for component in _components(program)]
+        total = angles.new_zeros((len(angles), len(program.observables)))
+        for state, diagonal in zip(states, diagonals):
+            total += state.abs().square() @ diagonal
+        return total
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None]:
-        angles, final = ctx.saved_tensors
+        angles, *finals = ctx.saved_tensors
         program: Program = ctx.program
-        psi = final.clone()
-        lam = (cotangents[0] @ _diagonals(program, angles).T) * psi
         gradient = torch.zeros_like(angles)
-        for step in reversed(program.steps.tolist()):
-            if step[0] == ROTATE:
-                _collect(program, psi, lam, step, angles, gradient)
-            _apply(program, psi, step, angles, inverse=True)
-            _apply(program, lam, step, angles, inverse=True)
+        for component, final in zip(_components(program), finals):
+            psi = final.clone()
+            lam = (cotangents[0] @ _diagonals(program, component, angles).T) * psi
+            for step in reversed(_steps(program, component)):
+                if step[0] == ROTATE:
+                    _collect(program, psi, lam, step, angles, gradient)
+                for state in (psi, lam):
+                    _apply(program, component.qubits, state, step, angles, inverse=True)
         return gradient, None
 
 
-def _diagonals(program: Program, angles: Tensor) -> Tensor:
-    """Return the diagonals of the observables, (2^n, O), +1 or -1."""
-    states = torch.arange(1 << program.qubits, device=angles.device)
-    bits = torch.from_numpy(program.observables).to(angles.device)
-    return (1 - 2 * ((states[:, None] >> bits) & 1)).to(angles.dtype)
+def _components(program: Program) -> list[Component]:
+    return [Component(*row) for row in program.components.tolist()]
 
 
-def _begin(program: Program, angles: Tensor) -> Tensor:
+def _steps(program: Program, component: Component) -> list[list[int]]:
+    steps: list[list[int]] = program.steps[component.first : component.last].tolist()
+    return steps
+
+
+def _diagonals(program: Program, component: Component, angles: Tensor) -> Tensor:
+    """Return the diagonals of the observables on a component, (2^n, O): +1 or -1, 0 where one is not on it."""
+    states = torch.arange(1 << component.qubits, device=angles.device)
+    bits = torch.from_numpy(program.observables).to(angles.device) - component.bit
+    here = ((bits >= 0) & (bits < component.qubits)).to(angles.dtype)
+    return here * (1 - 2 * ((states[:, None] >> bits.clamp(0, component.qubits - 1)) & 1)).to(angles.dtype)
+
+
+def _begin(component: Component, angles: Tensor) -> Tensor:
     """Return |0...0> with the opening Hadamards applied, (L, 2^n)."""
-    states = torch.arange(1 << program.qubits, device=angles.device)
-    closed = ~sum(1 << bit for bit in program.start.tolist())
-    amplitude = 2.0 ** (-0.5 * len(program.start))
-    first = (states & closed == 0).to(angles.dtype) * amplitude
+    states = torch.arange(1 << component.qubits, device=angles.device)
+    amplitude = 2.0 ** (-0.5 * component.opening.bit_count())
+    first = (states & ~component.opening == 0).to(angles.dtype) * amplitude
     state: Tensor = first.to(COMPLEX[angles.dtype]).repeat(len(angles), 1)
     return state
 
 
-def _apply(program: Program, state: Tensor, step: list[int], angles: Tensor, inverse: bool = False) -> None:
+def _apply(
+    program: Program, qubits: int, state: Tensor, step: list[int], angles: Tensor, inverse: bool = False
+) -> None:
     """Apply a step, or its inverse, in place."""
     kind = step[0]
     if kind == ROTATE:
@@ -118,10 +136,10 @@ def _apply(program: Program, state: Tensor, step: list[int], angles: Tensor, inv
                 p0.copy_(new0)
                 p1.copy_(new1)
     elif kind == PERMUTE:
-        source = torch.from_numpy(program.source(step[1], step[2])).to(state.device)
+        source = torch.from_numpy(program.source(step[1], step[2], qubits)).to(state.device)
         state.copy_(state[:, source.argsort() if inverse else source])
     else:
-        state.mul_(torch.from_numpy(program.signs[step[1]]).to(state.device))
+        state[:, torch.from_numpy(program.negative[step[1] : step[2]]).to(state.device)] *= -1
 
 
 def _halves(state: Tensor, control: int, target: int) -> tuple[Tensor, Tensor]:

@@ -16,13 +16,17 @@ of signs. S, T and Y equal rotations by constant angles up to a global phase.
 A gate joins an earlier step where everything between acts on other qubits. Hadamards that open the circuit
 cost nothing: the state begins in their product.
 
-Qubit q of n is bit n - 1 - q of a basis state's index.
+Qubits that no gate connects, directly or through others, never share a state. Each connected *component* has a
+state and steps of its own, so that 64 separate qubits take 64 times 2 amplitudes. The qubits of a component are
+counted in order: of n, the first is bit n - 1 of a basis state's index, the last bit 0.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,20 +38,37 @@ ROTATE, HADAMARD, PERMUTE, SIGN = 0, 1, 2, 3
 NONE = -1
 
 
+class Component(NamedTuple):
+    """Qubits that gates connect: a row of `Program.components`."""
+
+    qubits: int
+    amplitude: int
+    """Where its 2^qubits amplitudes begin among those of all components."""
+    bit: int
+    """Where its expectation values, bit by bit, begin among those of all components."""
+    first: int
+    """Its steps are `first` up to, but not including, `last`."""
+    last: int
+    opening: int
+    """The bits that begin with a Hadamard, as a mask."""
+
+
 @dataclass(frozen=True)
 class Program:
     """A compiled circuit; every array is C-contiguous, indices are 64-bit.
 
     Attributes
     ----------
-    qubits, inputs:
-        Numbers n and I.
-    parameters:
-        Names of the parameters in the order in which they are laid out flat, with their sizes.
+    qubits, inputs, parameters:
+        Numbers n of qubits, I of input features and P of trainable scalars.
+    amplitudes:
+        Number of amplitudes of all components together.
+    components:
+        (C, 6) int64: see `Component`.
     steps:
         (M, 5) int64: kind and arguments. ROTATE: control bit or -1, target bit, block, whether the block has a
         phase. HADAMARD: up to three bits, -1 where fewer. PERMUTE: first and last position in `cycles`. SIGN:
-        row of `signs`.
+        first and last position in `negative`.
     angles:
         (A, 3) int64: input, flat index of scale, flat index of weight; -1 where absent.
     constants:
@@ -59,18 +80,18 @@ class Program:
     blocks:
         (G + 1,) int64: block g consists of rotations blocks[g] to blocks[g + 1], in order of application.
     cycles:
-        (C,) int64: basis states along each cycle of each permutation; the last of a cycle is marked by ~state.
-    signs:
-        (K, 2^n) int8: +1 or -1.
-    start:
-        Bits on which the circuit opens with a Hadamard.
+        (X,) int64: basis states along each cycle of each permutation; the last of a cycle is marked by ~state.
+    negative:
+        (Y,) int64: basis states whose sign changes.
     observables:
-        (O,) int64: measured bits.
+        (O,) int64: the measured bits, counted through all components.
     """
 
     qubits: int
     inputs: int
-    parameters: tuple[tuple[str, int], ...]
+    parameters: int
+    amplitudes: int
+    components: NDArray[np.int64]
     steps: NDArray[np.int64]
     angles: NDArray[np.int64]
     constants: NDArray[np.float64]
@@ -78,18 +99,12 @@ class Program:
     factors: NDArray[np.float64]
     blocks: NDArray[np.int64]
     cycles: NDArray[np.int64]
-    signs: NDArray[np.int8]
-    start: NDArray[np.int64]
+    negative: NDArray[np.int64]
     observables: NDArray[np.int64]
 
-    @property
-    def parameter_count(self) -> int:
-        """Number of trainable scalars P."""
-        return sum(size for _, size in self.parameters)
-
-    def source(self, first: int, last: int) -> NDArray[np.int64]:
+    def source(self, first: int, last: int, qubits: int) -> NDArray[np.int64]:
         """Return a permutation, given by its positions in `cycles`, as new[i] = old[source[i]]."""
-        source = np.arange(1 << self.qubits)
+        source = np.arange(1 << qubits)
         start = first
         for position in range(first, last):
             state = self.cycles[position]
@@ -113,19 +128,105 @@ class _Step:
     gates: list[tuple[str, tuple[int, ...]]] = field(default_factory=list)
 
 
+class _Steps:
+    """The steps of one component, as its gates come in."""
+
+    def __init__(self) -> None:
+        self.steps: list[_Step] = []
+
+    def find(self, touched: set[int], fits: Callable[[_Step], bool]) -> _Step | None:
+        """Return the latest step that fits, if nothing after it touches these bits."""
+        for step in reversed(self.steps):
+            if fits(step):
+                return step
+            if step.touched & touched:
+                return None
+        return None
+
+    def rotate(self, control: int, target: int, rotations: list[tuple[int, int, float]]) -> None:
+        touched = {target} | ({control} if control != NONE else set())
+        step = self.find(touched, lambda s: (s.kind, s.control, s.target) == (ROTATE, control, target))
+        if step is None:
+            step = _Step(ROTATE, touched, control, target)
+            self.steps.append(step)
+        step.rotations += rotations
+
+    def hadamard(self, bit: int) -> None:
+        step = self.find({bit}, lambda s: s.kind == HADAMARD and bit not in s.bits and len(s.bits) < 3)
+        if step is None:
+            step = _Step(HADAMARD, set())
+            self.steps.append(step)
+        step.bits.append(bit)
+        step.touched.add(bit)
+
+    def fixed(self, kind: int, gate: str, bits: tuple[int, ...]) -> None:
+        step = self.find(set(bits), lambda s: s.kind == kind)
+        if step is None:
+            step = _Step(kind, set())
+            self.steps.append(step)
+        step.gates.append((gate, bits))
+        step.touched |= set(bits)
+
+
 class _Compiler:
+    """The arrays of a program, as they grow component by component."""
+
     def __init__(self, circuit: Circuit) -> None:
-        self.circuit = circuit
-        self.n = circuit.qubits
         offsets = np.cumsum([0, *(p.size for p in circuit.parameters.values())])
         self.offset = {name: int(start) for name, start in zip(circuit.parameters, offsets)}
+        self.components: list[Component] = []
+        self.steps: list[tuple[int, int, int, int, int]] = []
         self.angles: list[tuple[int, int, int]] = []
         self.constants: list[float] = []
-        self.steps: list[_Step] = []
-        self.start: list[int] = []
+        self.rotations: list[tuple[int, int, float]] = []
+        self.blocks = [0]
+        self.cycles: list[int] = []
+        self.negative: list[int] = []
 
-    def bit(self, wire: int) -> int:
-        return self.n - 1 - wire
+    def component(self, operations: list[Operation], wires: list[int]) -> None:
+        """Append a connected component: the gates on these wires."""
+        n = len(wires)
+        bit = {wire: n - 1 - place for place, wire in enumerate(wires)}
+        steps, first = _Steps(), len(self.steps)
+        opening, touched = 0, set[int]()
+        for operation in operations:
+            bits = tuple(bit[wire] for wire in operation.wires)
+            if operation.gate == "H" and bits[0] not in touched:
+                opening |= 1 << bits[0]
+            elif operation.gate == "H":
+                steps.hadamard(bits[0])
+            elif operation.gate in ("CNOT", "X", "SWAP"):
+                steps.fixed(PERMUTE, operation.gate, bits)
+            elif operation.gate in ("CZ", "Z"):
+                steps.fixed(SIGN, operation.gate, bits)
+            else:
+                control = NONE if operation.control is None else bit[operation.control]
+                steps.rotate(control, bits[0], self.as_rotations(operation))
+            touched.update(bit[wire] for wire in operation.qubits)
+        for step in steps.steps:
+            self.step(step, n)
+        amplitude = sum(1 << c.qubits for c in self.components)
+        place = sum(c.qubits for c in self.components)
+        self.components.append(Component(n, amplitude, place, first, len(self.steps), opening))
+
+    def step(self, step: _Step, qubits: int) -> None:
+        """Lay a step out in the arrays."""
+        if step.kind == ROTATE:
+            phase = any(axis == PHASE for axis, _, _ in step.rotations)
+            self.steps.append((ROTATE, step.control, step.target, len(self.blocks) - 1, int(phase)))
+            self.rotations += step.rotations
+            self.blocks.append(len(self.rotations))
+        elif step.kind == HADAMARD:
+            high, middle, low = [*sorted(step.bits, reverse=True), NONE, NONE][:3]
+            self.steps.append((HADAMARD, high, middle, low, 0))
+        elif step.kind == PERMUTE:
+            first = len(self.cycles)
+            self.cycles += _cycles(_source(step.gates, qubits))
+            self.steps.append((PERMUTE, first, len(self.cycles), 0, 0))
+        else:
+            first = len(self.negative)
+            self.negative += _negative(step.gates, qubits)
+            self.steps.append((SIGN, first, len(self.negative), 0, 0))
 
     def angle(self, angle: Angle) -> int:
         """Add an angle to the table; returns its index."""
@@ -136,19 +237,6 @@ class _Compiler:
         self.angles.append((NONE if angle.input is None else angle.input, scale, weight))
         self.constants.append(angle.constant)
         return len(self.angles) - 1
-
-    def add(self, operation: Operation) -> None:
-        """Append an operation to the steps, or join it to an earlier one."""
-        bits = tuple(self.bit(wire) for wire in operation.wires)
-        control = NONE if operation.control is None else self.bit(operation.control)
-        if operation.gate == "H":
-            self.hadamard(bits[0])
-        elif operation.gate in ("CNOT", "X", "SWAP"):
-            self.fixed(PERMUTE, operation.gate, bits)
-        elif operation.gate in ("CZ", "Z"):
-            self.fixed(SIGN, operation.gate, bits)
-        else:
-            self.rotate(control, bits[0], self.as_rotations(operation))
 
     def as_rotations(self, operation: Operation) -> list[tuple[int, int, float]]:
         """Write a gate on its target as (axis, angle, factor) in order of application."""
@@ -170,102 +258,30 @@ class _Compiler:
             return rotations
         return [({"RX": AXIS_X, "RY": AXIS_Y, "RZ": AXIS_Z}[operation.gate], index[0], 1.0)]
 
-    def find(self, touched: set[int], fits: object) -> _Step | None:
-        """Return the latest step that fits, if nothing after it touches these bits."""
-        for step in reversed(self.steps):
-            if callable(fits) and fits(step):
-                return step
-            if step.touched & touched:
-                return None
-        return None
 
-    def rotate(self, control: int, target: int, rotations: list[tuple[int, int, float]]) -> None:
-        touched = {target} | ({control} if control != NONE else set())
-        step = self.find(touched, lambda s: (s.kind, s.control, s.target) == (ROTATE, control, target))
-        if step is None:
-            step = _Step(ROTATE, touched, control, target)
-            self.steps.append(step)
-        step.rotations += rotations
-
-    def hadamard(self, bit: int) -> None:
-        if bit not in self.start and not any(bit in step.touched for step in self.steps):
-            self.start.append(bit)
-            return
-        step = self.find({bit}, lambda s: s.kind == HADAMARD and bit not in s.bits and len(s.bits) < 3)
-        if step is None:
-            step = _Step(HADAMARD, set())
-            self.steps.append(step)
-        step.bits.append(bit)
-        step.touched.add(bit)
-
-    def fixed(self, kind: int, gate: str, bits: tuple[int, ...]) -> None:
-        step = self.find(set(bits), lambda s: s.kind == kind)
-        if step is None:
-            step = _Step(kind, set())
-            self.steps.append(step)
-        step.gates.append((gate, bits))
-        step.touched |= set(bits)
-
-    def program(self) -> Program:
-        """Lay everything out in arrays."""
-        rows: list[tuple[int, int, int, int, int]] = []
-        rotations: list[tuple[int, int, float]] = []
-        blocks, cycles = [0], [np.empty(0, np.int64)]
-        signs: list[NDArray[np.int8]] = []
-        for step in self.steps:
-            if step.kind == ROTATE:
-                phase = any(axis == PHASE for axis, _, _ in step.rotations)
-                rows.append((ROTATE, step.control, step.target, len(blocks) - 1, int(phase)))
-                rotations += step.rotations
-                blocks.append(len(rotations))
-            elif step.kind == HADAMARD:
-                high, middle, low = [*sorted(step.bits, reverse=True), NONE, NONE][:3]
-                rows.append((HADAMARD, high, middle, low, 0))
-            elif step.kind == PERMUTE:
-                first = sum(map(len, cycles))
-                cycles.append(_cycles(self.source(step.gates)))
-                rows.append((PERMUTE, first, first + len(cycles[-1]), 0, 0))
-            else:
-                rows.append((SIGN, len(signs), 0, 0, 0))
-                signs.append(self.sign(step.gates))
-        return Program(
-            qubits=self.n,
-            inputs=self.circuit.inputs,
-            parameters=tuple((name, p.size) for name, p in self.circuit.parameters.items()),
-            steps=np.array(rows, np.int64).reshape(-1, 5),
-            angles=np.array(self.angles, np.int64).reshape(-1, 3),
-            constants=np.array(self.constants, np.float64),
-            rotations=np.array([r[:2] for r in rotations], np.int64).reshape(-1, 2),
-            factors=np.array([r[2] for r in rotations], np.float64),
-            blocks=np.array(blocks, np.int64),
-            cycles=np.concatenate(cycles),
-            signs=np.array(signs, np.int8).reshape(-1, 1 << self.n),
-            start=np.array(self.start, np.int64),
-            observables=np.array([self.bit(wire) for wire in self.circuit.observables], np.int64),
-        )
-
-    def source(self, gates: list[tuple[str, tuple[int, ...]]]) -> NDArray[np.int64]:
-        """Return, for every basis state after the gates, the one whose amplitude it takes."""
-        state = np.arange(1 << self.n)
-        for gate, bits in reversed(gates):  # each gate is its own inverse
-            if gate == "X":
-                state = state ^ (1 << bits[0])
-            elif gate == "CNOT":
-                state = state ^ (((state >> bits[0]) & 1) << bits[1])
-            else:
-                differ = ((state >> bits[0]) ^ (state >> bits[1])) & 1
-                state = state ^ (differ << bits[0]) ^ (differ << bits[1])
-        return state
-
-    def sign(self, gates: list[tuple[str, tuple[int, ...]]]) -> NDArray[np.int8]:
-        """Return the product of the gates' diagonals."""
-        state, odd = np.arange(1 << self.n), np.zeros(1 << self.n, np.int64)
-        for _, bits in gates:
-            odd ^= np.bitwise_and.reduce([(state >> bit) & 1 for bit in bits])
-        return (1 - 2 * odd).astype(np.int8)
+def _source(gates: list[tuple[str, tuple[int, ...]]], qubits: int) -> NDArray[np.int64]:
+    """Return, for every basis state after the gates, the one whose amplitude it takes."""
+    state = np.arange(1 << qubits)
+    for gate, bits in reversed(gates):  # each gate is its own inverse
+        if gate == "X":
+            state = state ^ (1 << bits[0])
+        elif gate == "CNOT":
+            state = state ^ (((state >> bits[0]) & 1) << bits[1])
+        else:
+            differ = ((state >> bits[0]) ^ (state >> bits[1])) & 1
+            state = state ^ (differ << bits[0]) ^ (differ << bits[1])
+    return state
 
 
-def _cycles(source: NDArray[np.int64]) -> NDArray[np.int64]:
+def _negative(gates: list[tuple[str, tuple[int, ...]]], qubits: int) -> list[int]:
+    """Return the basis states to which CZ and Z gates give the sign -1."""
+    state, odd = np.arange(1 << qubits), np.zeros(1 << qubits, np.int64)
+    for _, bits in gates:
+        odd ^= np.bitwise_and.reduce([(state >> bit) & 1 for bit in bits])
+    return [int(i) for i in np.flatnonzero(odd)]
+
+
+def _cycles(source: NDArray[np.int64]) -> list[int]:
     """Write new[i] = old[source[i]] as cycles i, source[i], source[source[i]], ...; the last is marked by ~."""
     result: list[int] = []
     seen = source == np.arange(len(source))
@@ -278,12 +294,42 @@ def _cycles(source: NDArray[np.int64]) -> NDArray[np.int64]:
             result.append(state)
             state = int(source[state])
         result[-1] = ~result[-1]
-    return np.array(result, np.int64)
+    return result
 
 
 def compile_circuit(circuit: Circuit) -> Program:
-    """Compile a circuit description into a program."""
+    """Compile a circuit description into a program.
+
+    Raises
+    ------
+    OptionError
+        If gates connect more than `MAX_QUBITS` qubits.
+    """
+    circuit.require_simulable()
     compiler = _Compiler(circuit)
+    places: dict[int, int] = {}
+    components = circuit.components()
+    member = {wire: number for number, wires in enumerate(components) for wire in wires}
+    operations: list[list[Operation]] = [[] for _ in components]
     for operation in circuit.operations:
-        compiler.add(operation)
-    return compiler.program()
+        operations[member[operation.wires[0]]].append(operation)
+    for wires, gates in zip(components, operations):
+        compiler.component(gates, wires)
+        for wire in reversed(wires):  # bit by bit
+            places[wire] = len(places)
+    return Program(
+        qubits=circuit.qubits,
+        inputs=circuit.inputs,
+        parameters=circuit.parameter_count,
+        amplitudes=sum(1 << c.qubits for c in compiler.components),
+        components=np.array(compiler.components, np.int64),
+        steps=np.array(compiler.steps, np.int64).reshape(-1, 5),
+        angles=np.array(compiler.angles, np.int64).reshape(-1, 3),
+        constants=np.array(compiler.constants, np.float64),
+        rotations=np.array([r[:2] for r in compiler.rotations], np.int64).reshape(-1, 2),
+        factors=np.array([r[2] for r in compiler.rotations], np.float64),
+        blocks=np.array(compiler.blocks, np.int64),
+        cycles=np.array(compiler.cycles, np.int64),
+        negative=np.array(compiler.negative, np.int64),
+        observables=np.array([places[wire] for wire in circuit.observables], np.int64),
+    )

@@ -1,6 +1,6 @@
 """Passes over the state of one chunk of lanes: forward, and backward with the overlaps that gradients need.
 
-A state is an array (2^n, 2, lanes): real and imaginary part of every amplitude, one lane per sample. Row 2 i is
+A state is an array (2^(n + 1), lanes): real and imaginary part of every amplitude, one lane per sample. Row 2 i is
 the real part of amplitude i. A block's matrix in SU(2) is given by two numbers per lane,
 
     U = [[a, -conj(b)], [b, conj(a)]],
@@ -257,10 +257,10 @@ def unpermute(state: Any, cycles: Any, first: int, last: int) -> None:
 
 
 @inlined
-def flip(state: Any, signs: Any, row: int) -> None:
-    """Negate the amplitudes whose sign is -1."""
+def flip(state: Any, negative: Any, first: int, last: int) -> None:
+    """Change the sign of the amplitudes of some basis states."""
     zero = splat(state, 0.0)
-    for i in range(signs.shape[1]):
-        if signs[row, i] < 0:
-            store(state, 2 * i, zero - load(state, 2 * i))
-            store(state, 2 * i + 1, zero - load(state, 2 * i + 1))
+    for position in range(first, last):
+        i = 2 * negative[position]
+        store(state, i, zero - load(state, i))
+        store(state, i + 1, zero - load(state, i + 1))

@@ -1,8 +1,10 @@
 """Sine and cosine of a vector, by polynomials: scalar library calls would cost more than the gates.
 
-x is reduced by the nearest multiple k of pi to r in [-pi/2, pi/2], in two parts with fused multiplications; then,
-with z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and both change sign with odd k. S and C interpolate at
-Chebyshev nodes; their largest errors are 2e-8 and 1e-9 (float32), 2e-17 and 9e-18 (float64).
+x is reduced by the nearest multiple k of pi to r in [-pi/2, pi/2]. Where the processor fuses multiplication and
+addition, pi is written in two parts. Elsewhere it is written in three, of which the first two have so few bits that
+their products with k are exact (Cody & Waite 1980, "Software Manual for the Elementary Functions"). Then, with
+z = r^2, sin r = r + r z S(z), cos r = 1 + z C(z), and both change sign with odd k. S and C interpolate at Chebyshev
+nodes; their largest errors are 2e-8 and 1e-9 (float32), 2e-17 and 9e-18 (float64).
 """
 
 from __future__ import annotations
@@ -13,11 +15,14 @@ from numba import types
 from numba.extending import overload
 
 from qrlsuite.plugins.circuits.native.cache import inlined
-from qrlsuite.plugins.circuits.native.vectors import Vector, constant, floor, fma, nearest
+from qrlsuite.plugins.circuits.native.vectors import FUSED, Vector, constant, floor, fma, nearest
 
 INVERSE_PI = 0.3183098861837907
-PI32, PI32_REST = 3.1415927410125732, -8.742277657347586e-08
-PI64, PI64_REST = 3.141592653589793, 1.2246467991473532e-16
+PI32 = (3.1415927410125732, -8.742277657347586e-08, 0.0)
+PI64 = (3.141592653589793, 1.2246467991473532e-16, 0.0)
+if not FUSED:
+    PI32 = (3.140625, 0.0009675025939941406, 1.5099580252808664e-07)
+    PI64 = (3.1415926534682512, 1.2154201013012384e-10, 0.0)
 
 S32 = (-0.16666665958226323, 0.008333241592520583, -0.00019822666349960692, 2.6345196812009277e-06)
 C32 = (
@@ -38,10 +43,11 @@ C64 = (
 
 
 @inlined
-def _reduced(x: Any, pi: float, rest: float) -> Any:
+def _reduced(x: Any, pi: float, middle: float, rest: float) -> Any:
     """Return r in [-pi/2, pi/2] with x = k pi + r, and (-1)^k."""
     k = nearest(x * constant(x, INVERSE_PI))
     r = fma(k, constant(x, -pi), x)
+    r = fma(k, constant(x, -middle), r)
     r = fma(k, constant(x, -rest), r)
     half = floor(k * constant(x, 0.5))
     return r, constant(x, 1.0) - constant(x, 2.0) * (k - half - half)
@@ -55,7 +61,7 @@ def _combined(r: Any, sign: Any, s: Any, c: Any) -> Any:
 
 @inlined
 def _sine_cosine32(x: Any) -> Any:
-    r, sign = _reduced(x, PI32, PI32_REST)
+    r, sign = _reduced(x, PI32[0], PI32[1], PI32[2])
     z = r * r
     s = constant(x, S32[3])
     s = fma(s, z, constant(x, S32[2]))
@@ -71,7 +77,7 @@ def _sine_cosine32(x: Any) -> Any:
 
 @inlined
 def _sine_cosine64(x: Any) -> Any:
-    r, sign = _reduced(x, PI64, PI64_REST)
+    r, sign = _reduced(x, PI64[0], PI64[1], PI64[2])
     z = r * r
     s = constant(x, S64[7])
     for coefficient in (S64[6], S64[5], S64[4], S64[3], S64[2], S64[1], S64[0]):

@@ -1,9 +1,9 @@
 """A vector of lanes as a numba value: explicit SIMD in `njit` code.
 
 `Vector` wraps LLVM's `<lanes x float>` or `<lanes x double>`. Arrays are read as rows of one vector each: the
-last axis has `LANES` elements, and `load(array, row)` counts rows through all other axes in C order. LLVM
-turns every operation into what the processor has; with 16 lanes of float32 (8 of float64) a row is one
-AVX-512 register, else two AVX2 registers or four NEON ones.
+last axis has `LANES` elements, and `load(array, row)` counts rows through all other axes in C order. A row fills
+one register of the processor that numba compiles for: 16 lanes of float32 with AVX-512, 8 with AVX2, 4 with NEON
+or SSE; half as many of float64.
 
 Why not leave it to numba's auto-vectorizer? Measured, its loops are 2 to 10 times slower here: it cannot
 prove that arrays do not overlap, and reloads coefficients in every pass.
@@ -14,17 +14,40 @@ from __future__ import annotations
 import operator
 from typing import Any
 
+import llvmlite.binding
 from llvmlite import ir
 from numba import extending
 from numba.core import cgutils, types
 from numba.core.datamodel import models
+from numba.core.registry import cpu_target
 from numba.extending import lower_builtin, register_model, type_callable
 
 intrinsic: Any = extending.intrinsic
 """Untyped on purpose: inside kernels its products are called without the typing context."""
 
-LANES = {types.float32: 16, types.float64: 8}
-"""Lanes of a vector by element type; a row is 64 bytes."""
+
+def _target() -> tuple[int, bool]:
+    """Return what numba compiles for: bytes of a vector register, and whether it fuses a * b + c.
+
+    Both are read off the assembly of one multiplication and addition of 16 floats.
+    """
+    row = ir.VectorType(ir.FloatType(), 16)
+    module = ir.Module()
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [row.as_pointer()]), "multiply_add")
+    builder = ir.IRBuilder(function.append_basic_block())
+    value = builder.load(function.args[0])
+    fused = ir.Function(module, ir.FunctionType(row, [row] * 3), "llvm.fmuladd.v16f32")
+    builder.store(builder.call(fused, [value] * 3), function.args[0])
+    builder.ret_void()
+    machine = cpu_target.target_context.codegen()._tm
+    assembly = machine.emit_assembly(llvmlite.binding.parse_assembly(str(module)))
+    size = 64 if "zmm" in assembly else 32 if "ymm" in assembly else 16
+    return size, "fmadd" in assembly or "fmla" in assembly
+
+
+_BYTES, FUSED = _target()
+LANES = {types.float32: _BYTES // 4, types.float64: _BYTES // 8}
+"""Lanes of a vector by element type."""
 
 
 class Vector(types.Type):
@@ -174,8 +197,8 @@ def _function(name: str, arguments: int) -> Any:
 
 nearest = _function("nearbyint", 1)
 floor = _function("floor", 1)
-fma = _function("fma", 3)
-"""`fma(a, b, c)` is a * b + c, rounded once."""
+fma = _function("fmuladd", 3)
+"""`fma(a, b, c)` is a * b + c, rounded once where the processor has such an instruction, else twice."""
 
 
 @intrinsic
