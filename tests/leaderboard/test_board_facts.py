@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qrlsuite.cli.commands import leaderboard as command
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import board, collect, origin, published, report
+from qrlsuite.leaderboard import board, collect, origin, published, report, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.export import export
 from qrlsuite.leaderboard.pictures import tiers
@@ -49,11 +48,11 @@ def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
     assert [row.outperformed_by for row in section.rows[1:]] == [("best one",)] * 2
     rows = board.as_dict(mostly_at_the_cap)["sections"][0]["rows"]
     assert [row["verdict"].partition(":")[0] for row in rows] == ["ranked", "not reached", "not reached"]
-    text = command._markdown(mostly_at_the_cap)
+    text = tables.markdown(mostly_at_the_cap)
     assert "| not reached | - | poor one |" in text
     assert "not reached: at the cap in every cell" in text
     assert "not reached: at the cap in every cell" in report.render(mostly_at_the_cap)
-    written = [row["verdict"] for row in csv.DictReader(io.StringIO(command._csv(mostly_at_the_cap)))]
+    written = [row["verdict"] for row in csv.DictReader(io.StringIO(tables.csv_text(mostly_at_the_cap)))]
     assert written == [row["verdict"] for row in rows]
 
 
@@ -77,8 +76,8 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     first, second = made.sections[0].rows
     assert first.rests_on is None
     assert second.rests_on == board.Support("best one", "later one", cells=7, at_cap=42, total=49)
-    assert "| 2 | 7 of 7 | later one |" in command._markdown(made)
-    (row,) = [r for r in csv.DictReader(io.StringIO(command._csv(made))) if r["tier"] == "2"]
+    assert "| 2 | 7 of 7 | later one |" in tables.markdown(made)
+    (row,) = [r for r in csv.DictReader(io.StringIO(tables.csv_text(made))) if r["tier"] == "2"]
     assert (row["rests_on_cells"], row["rests_on_at_cap"], row["rests_on_total"]) == ("7", "42", "49")
     (told,) = [r["rests_on"] for r in board.as_dict(made)["sections"][0]["rows"] if r["tier"] == 2]
     assert json.loads(json.dumps(told))["cells"] == 7
@@ -98,11 +97,11 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     marked = [replace(entries[0], tuning={"steps": 1, "on_protocol_seeds": True}), entries[1]]
     made = boards.of(marked)
     note = f"settings chosen after seeing runs on protocol seeds, which may flatter: {entries[0].label}"
-    assert note in command._markdown(made)
+    assert note in tables.markdown(made)
     assert note[1:] in report.render(made)
-    rows = list(csv.DictReader(io.StringIO(command._csv(made))))
+    rows = list(csv.DictReader(io.StringIO(tables.csv_text(made))))
     assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
-    assert "protocol seeds, which" not in command._markdown(boards.of(entries))
+    assert "protocol seeds, which" not in tables.markdown(boards.of(entries))
 
 
 def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path: Path) -> None:
@@ -125,7 +124,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
         made = board.build(collect.collect(tmp_path / "runs")[0])
         rows = board.as_dict(made)["sections"][0]["rows"]
         counts = {row["label"].split()[0]: row["parameters"]["classical"] for row in rows}
-        return counts, command._markdown(made), report.render(made)
+        return counts, tables.markdown(made), report.render(made)
 
     both = {"ppo": 387 + 353, "ddqn": 387}
     counts, text, page = told()
@@ -158,9 +157,9 @@ def test_devices_that_mix_within_an_entry_are_named() -> None:
     one, two = boards.graded(2)
     made = boards.of([replace(one, devices=("cpu", "cuda")), replace(two, devices=("cpu",))])
     note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
-    assert note in command._markdown(made).split("  \n")
+    assert note in tables.markdown(made).split("  \n")
     assert origin.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
-    assert "several kinds of device" not in command._markdown(boards.of([one, two]))
+    assert "several kinds of device" not in tables.markdown(boards.of([one, two]))
 
 
 def test_what_tuning_took_is_said() -> None:
@@ -168,4 +167,4 @@ def test_what_tuning_took_is_said() -> None:
     tuning = {"trials": 7, "steps": 10_500_000, "core_hours": 0.12}
     made = boards.of([replace(one, tuning=tuning), replace(two, tuning={"trials": None}), three])
     text = f"{one.label} (7 trials, 10,500,000 steps, 0.12 core-hours), {two.label} (budget not known)"
-    assert f"settings found by tuning: {text}" in command._markdown(made).split("  \n")
+    assert f"settings found by tuning: {text}" in tables.markdown(made).split("  \n")
