@@ -2,9 +2,11 @@
 
     python benchmarks/speeds.py [--only qubits=14] [--write tasks/speeds/reference.toml]
 
-Every entry is trained for a few epochs in groups of the size that stands beside it; the first epoch (compilation, an
-empty replay buffer) does not count, of the others the median does. Processor time, one thread: other work on the
-machine changes it little. `--write` puts the rows into the file, in the place of those for the same entries.
+Every entry is trained for a few epochs in a group of the size that stands beside it, and a seed of it alone; the first
+half of the epochs (compilation, an empty replay buffer, episodes that end at once) does not count, of the others the
+median does. CartPole's episodes become longer with training: give it `--epochs 100`. Processor time, one thread: other
+work on the machine changes it little. `--write` puts the rows into the file, in the place of those for the same
+entries, and this machine's calibration beside them.
 """
 
 from __future__ import annotations
@@ -16,16 +18,19 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from qrlsuite.experiment.entry import resolve
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.results import provenance
+from qrlsuite.results import provenance, speed
 from qrlsuite.results.store import EntryStore, read_lines
 from qrlsuite.training.group import GroupRun
 
 HEADER = """\
-# Processor seconds of one epoch of one seed, training and validation, measured by benchmarks/speeds.py in groups of
-# 2 to 50 seeds. They serve estimates before anything was measured on a machine, and for the ratios between entries
-# after that. Sizes between those measured are near enough to one of them.
+# Processor seconds of one epoch of one seed, training and validation: `seconds` as its share of a group of `group`
+# seeds, `alone` for a seed trained by itself (without it, the size of the group makes no difference). Measured by
+# benchmarks/speeds.py where no source is given. They serve estimates before anything was measured on a machine, and
+# for the ratios between entries and sizes of groups after that. Sizes between those measured are near enough to one
+# of them. `calibration` is what qrlsuite.results.speed.measure_calibration() returns on this machine (processor time;
+# the median of three calls): where it returns twice as much, estimates from these speeds are twice as long.
 format_version = 1
 """
 
@@ -56,32 +61,40 @@ Row = dict[str, Any]
 
 
 def measure(task: str, algorithm: str, model: str, options: dict[str, int], seeds: int, epochs: int) -> Row:
-    """Train a group and return its row."""
+    """Train a group, and a seed alone, and return their row."""
     entry = resolve(
         task, model, algorithm, [parse_setting(f"{name}={value}") for name, value in options.items()]
     )
-    with tempfile.TemporaryDirectory() as folder:
-        store = EntryStore.create(Path(folder), entry)
-        GroupRun(entry, store, range(seeds), epochs).run()
-        lines = read_lines(store.seed(0).timings)
-    seconds = statistics.median(float(line["cpu"]) for line in lines[1:])
+    together, alone = (_seconds(entry, size, epochs) for size in (seeds, 1))
     return {
         "environment": entry.task.environment.name,
         "algorithm": algorithm,
         "model": model,
         "options": options,
-        "seconds": float(f"{seconds:.2g}"),
+        "seconds": float(f"{together:.2g}"),
+        "group": seeds,
+        "alone": float(f"{alone:.2g}"),
     }
+
+
+def _seconds(entry: Entry, seeds: int, epochs: int) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        store = EntryStore.create(Path(folder), entry)
+        GroupRun(entry, store, range(seeds), epochs).run()
+        lines = read_lines(store.seed(0).timings)
+    return statistics.median(float(line["cpu"]) for line in lines[len(lines) // 2 :])
 
 
 def written(row: Row) -> str:
     """Return a row as TOML."""
     options = ", ".join(f"{name} = {value}" for name, value in row["options"].items())
     names = "".join(f'{name} = "{row[name]}"\n' for name in ("environment", "algorithm", "model"))
-    return f"\n[[speeds]]\n{names}options = {{ {options} }}\nseconds = {row['seconds']}\n"
+    numbers = "".join(f"{name} = {row[name]}\n" for name in ("seconds", "group", "alone") if name in row)
+    source = f'source = "{row["source"]}"\n' if "source" in row else ""
+    return f"\n[[speeds]]\n{names}options = {{ {options} }}\n{numbers}{source}"
 
 
-def merge(path: Path, machine: str, rows: list[Row]) -> str:
+def merge(path: Path, machine: str, calibration: float, rows: list[Row]) -> str:
     """Return the file's text with new rows; rows of other entries stay if they are of the same machine."""
     before = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     kept = before.get("speeds", []) if before.get("machine") == machine else []
@@ -93,7 +106,8 @@ def merge(path: Path, machine: str, rows: list[Row]) -> str:
     merged = sorted(
         [*(row for row in kept if str(key(row)) not in new), *rows], key=lambda row: str(key(row)[:3])
     )
-    return f'{HEADER}machine = "{machine}"\n' + "".join(map(written, merged))
+    start = f'{HEADER}machine = "{machine}"\ncalibration = {calibration:.3g}\n'
+    return start + "".join(map(written, merged))
 
 
 def main() -> None:
@@ -105,15 +119,19 @@ def main() -> None:
     parser.add_argument("--write", type=Path, help="a file of reference speeds")
     given = parser.parse_args()
     machine = f"one core of {provenance.processor()}"
+    calibration = statistics.median(speed.measure_calibration() for _ in range(3))
     rows: list[Row] = []
     for task, algorithm, model, options, seeds in ENTRIES:
         name = " ".join([task, algorithm, model, *(f"{key}={value}" for key, value in options.items())])
         if given.only not in name:
             continue
         rows.append(measure(task, algorithm, model, options, seeds, given.epochs))
-        print(f"{name}: {rows[-1]['seconds']} s per epoch and seed, {seeds} seeds together", flush=True)
+        print(
+            f"{name}: {rows[-1]['seconds']} s per epoch and seed, {seeds} seeds together; {rows[-1]['alone']} s alone",
+            flush=True,
+        )
         if given.write:
-            given.write.write_text(merge(given.write, machine, rows), encoding="utf-8")
+            given.write.write_text(merge(given.write, machine, calibration, rows), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -221,6 +221,8 @@ class RunDisplay:
         self.bar = Bar(self.console)
         self.deadline: float | None = None
         """The moment, by `time.monotonic`, at which training is stopped."""
+        self.expected: str | None = None
+        """What is said at the beginning about how long it will take."""
         self.endless = False
         """Whether more than a day is left, by what was measured."""
         self._announced = False
@@ -264,6 +266,8 @@ class RunDisplay:
         )
         end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
+        if self.expected is not None:
+            self.console.print(self.expected, markup=False, soft_wrap=True)
         if submits:
             return
         self.bar.start(todo * self.epochs, "starting")

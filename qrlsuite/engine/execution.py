@@ -19,13 +19,16 @@ from qrlsuite import registry, specs
 from qrlsuite.engine import api
 from qrlsuite.engine.api import Engine, Outcome
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import speed
 from qrlsuite.results.claims import living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import Group, plan_groups
 from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import duration_range
 from qrlsuite.training import device as devices
+from qrlsuite.training import memory
 
 if TYPE_CHECKING:
     from qrlsuite.engine.display import RunDisplay  # which imports this module
@@ -88,6 +91,16 @@ class Plan:
     def missing(self) -> list[int]:
         """The seeds of the groups, sorted."""
         return sorted(seed for group in self.groups for seed in group.seeds)
+
+    @property
+    def left(self) -> int:
+        """Epochs to train, summed over the seeds."""
+        return sum(len(group.seeds) * (self.epochs - group.epoch) for group in self.groups)
+
+    @property
+    def together(self) -> int | None:
+        """Seeds of the largest group, None where there is none."""
+        return max((len(group.seeds) for group in self.groups), default=None)
 
 
 def create(
@@ -202,6 +215,7 @@ def train(
     display.deadline = None if minutes is None else began + 60 * minutes
     if not execution.submits and work.groups:
         _check_device(execution.device)
+        check_memory(work, execution)
     fresh = not work.store.path.exists()
     EntryStore.create(work.runs, work.entry)
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in living(work.store)})
@@ -227,6 +241,31 @@ def train(
     for message in outcome.taken.values():
         display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
     return outcome
+
+
+def expected(work: Plan, execution: Execution) -> str | None:
+    """Say how long training should take, None where nothing is known before the first epoch."""
+    if not work.groups or execution.submits or execution.device != "cpu":
+        return None
+    try:
+        estimate = speed.known(work.runs).estimate(work.entry, work.together)
+    except TaskError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
+        return None
+    seconds = estimate.range(work.left / min(execution.workers, len(work.groups)))
+    return seconds and f"it should take {duration_range(*seconds)} ({speed.BASES[estimate.basis]})"
+
+
+def check_memory(work: Plan, execution: Execution) -> None:
+    """Refuse what does not fit into this machine's memory; a GPU's and a cluster's are not known.
+
+    Raises
+    ------
+    OptionError
+        Saying how many seeds would fit.
+    """
+    if execution.device == "cpu" and not execution.submits:
+        groups = [group.seeds for group in work.groups]
+        memory.require(work.entry, groups, execution.workers, memory.available())
 
 
 def summarize(work: Plan) -> dict[str, Any]:

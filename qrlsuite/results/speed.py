@@ -1,45 +1,73 @@
 """How long training takes here: from what was measured, scaled by reference measurements where need be.
 
 A speed is the time of one epoch of one seed, training and validation, on one core, as its share of the group that
-it was trained in. An estimate says what it rests on, from the best evidence to the weakest:
+it was trained in. That share depends on the size of the group: a small network alone takes thirty times as long as
+in a group of fifty. So every estimate is for groups of a given size. It is a range, and says what it rests on, from the
+best evidence to the weakest:
 
-- `measured`: epochs of this very entry in this results folder;
-- `scaled`: epochs of the most similar entry in it, times the ratio of the two entries' reference speeds;
-- `alike`: epochs of the most similar entry, as they are, where there is no reference;
-- `reference`: the speed of the most similar entry on another machine;
+- `measured`: epochs of this very entry in this results folder, in groups of about this size;
+- `scaled`: epochs of this entry in other groups, or of the most similar entry, times the ratio of reference speeds;
+- `alike`: the same without a reference to scale them by;
+- `reference`: the speed of the most similar entry on another machine, times the ratio of the two machines'
+  calibrations (see `calibration`);
 - `unknown`: there is nothing to go by until a first epoch has been trained.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import json
 import math
+import os
 import statistics
+import time
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import StoreError, TaskError
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results.store import EntryStore, entries, read_lines
+from qrlsuite.results import provenance
+from qrlsuite.results.store import EntryStore, entries, read_lines, write_atomically
 
 SAMPLED_SEEDS = 8
 """Seeds of an entry whose timings are read; those of a group hardly differ."""
 
 BASES = {
     "measured": "measured on its own epochs",
-    "scaled": "measured on a similar entry, scaled by reference speeds",
-    "alike": "measured on a similar entry, not scaled",
-    "reference": "reference speeds of another machine",
+    "scaled": "measured on a similar entry or group size, scaled by reference speeds",
+    "alike": "measured on a similar entry or group size, not scaled",
+    "reference": "reference speeds, scaled by a calibration of this machine",
     "unknown": "not known before a first epoch is trained",
 }
 
 Basis = Literal["measured", "scaled", "alike", "reference", "unknown"]
+
+WITHIN: Mapping[Basis, float] = {
+    "measured": 1.25,
+    "scaled": 2.0,
+    "alike": 3.0,
+    "reference": 3.0,
+    "unknown": 1.0,
+}
+"""An estimate ranges from what it says divided by this factor to what it says times it. For `reference`, it covers the
+distance between the reference speeds and the hours of all published entries (a test holds it to that). What was
+measured ranges at least this far, and as far as the 10th and 90th percentile of its epochs."""
+
+SAME_SIZE = 2.0
+"""Speeds measured in groups up to this many times larger or smaller count as measured in groups of the same size."""
+
+CALIBRATION_FILE = "qrlsuite/speed.json"
+REPETITIONS, PRODUCTS = 5, 1500
 
 
 @dataclass(frozen=True)
@@ -53,21 +81,58 @@ class Speed:
     options:
         Everything else that may matter, by name.
     seconds:
-        Seconds per seed and epoch on one core.
+        Seconds per seed and epoch on one core, in groups of `group` seeds.
+    group:
+        Seeds trained together, 1 or more.
+    alone:
+        Seconds per epoch of a seed that is trained alone; None where not known.
+    calibration:
+        Of a reference: what `calibration()` is on its machine; None where not known.
+    within:
+        Of what was measured: the factor by which its epochs spread, from their 10th to their 90th percentile.
     """
 
     kind: tuple[str, str, str]
     options: Mapping[str, Any]
     seconds: float
     hash: str = ""
+    group: int = 1
+    alone: float | None = None
+    calibration: float | None = None
+    within: float = 1.0
+
+    def together(self, seeds: int) -> float:
+        """Return the seconds per seed and epoch in a group of `seeds`, `seconds` where `alone` is not known.
+
+        An epoch of a group costs a fixed time, whatever its size, and a time for every seed: a seed's share of it in
+        a group of G is `fixed / G + own`. Two measurements, alone and in a group, give both.
+
+        >>> speed = Speed(("beam6g", "ddqn", "mlp"), {}, 0.02, group=50, alone=0.51)
+        >>> [round(speed.together(seeds), 3) for seeds in (1, 5, 50)]
+        [0.51, 0.11, 0.02]
+        """
+        if self.alone is None or self.group == 1:
+            return self.seconds
+        fixed = max(0.0, self.alone - self.seconds) / (1 - 1 / self.group)
+        return self.seconds + fixed / seeds - fixed / self.group
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Seconds per seed and epoch on one core, None where unknown, and what that rests on."""
+    """Seconds per seed and epoch on one core, None where unknown, and what that rests on.
+
+    The truth is expected between `seconds / within` and `seconds * within`.
+    """
 
     seconds: float | None
     basis: Basis
+    within: float = 1.0
+
+    def range(self, epochs: float) -> tuple[float, float] | None:
+        """Return the least and the most seconds that this many epochs of one seed should take; None where unknown."""
+        if self.seconds is None:
+            return None
+        return self.seconds * epochs / self.within, self.seconds * epochs * self.within
 
 
 class _Row(BaseModel):
@@ -77,39 +142,60 @@ class _Row(BaseModel):
     model: str
     options: Annotated[dict[str, Any], Field(description="of the model, the algorithm or the task")] = {}
     seconds: Annotated[float, Field(gt=0, lt=1e9)]
+    group: Annotated[int, Field(ge=1, description="seeds that were trained together")] = 1
+    alone: Annotated[float | None, Field(gt=0, lt=1e9, description="seconds of a seed by itself")] = None
+    source: Annotated[str, Field(description="where the seconds are from, if not from the benchmark")] = ""
 
 
 class SpeedFile(BaseModel):
-    """A file of reference speeds: where they were measured, and one row per measurement."""
+    """A file of reference speeds: where they were measured, and one row per measurement.
+
+    Without `calibration`, the speeds are taken as they are on every machine.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     format_version: Literal[1]
     machine: str
+    calibration: Annotated[float | None, Field(gt=0, lt=1e9, description="of that machine, in seconds")] = (
+        None
+    )
     speeds: list[_Row]
 
 
 @dataclass
 class Speeds:
-    """What was measured in a results folder, and reference speeds."""
+    """What was measured in a results folder, and reference speeds.
+
+    Attributes
+    ----------
+    calibrate:
+        Returns this machine's calibration; called when an estimate rests on another machine's speed.
+    """
 
     measured: list[Speed] = field(default_factory=list)
     references: list[Speed] = field(default_factory=list)
+    calibrate: Callable[[], float] = field(default_factory=lambda: calibration)
 
-    def estimate(self, entry: Entry) -> Estimate:
-        """Return the best estimate for an entry."""
+    def estimate(self, entry: Entry, together: int | None) -> Estimate:
+        """Return the best estimate for an entry in groups of `together` seeds; None for as many as were measured."""
         subject = _subject(entry)
-        for speed in self.measured:
-            if speed.hash == entry.hash:
-                return Estimate(speed.seconds, "measured")
         reference = _nearest(subject, self.references)
-        alike = _nearest(subject, self.measured)
+        own = next((speed for speed in self.measured if speed.hash == entry.hash), None)
+        size = together or (own.group if own is not None else None)
+        if own is not None and size and max(own.group / size, size / own.group) <= SAME_SIZE:
+            return Estimate(own.seconds, "measured", max(own.within, WITHIN["measured"]))
+        alike = own or _nearest(subject, self.measured)
         if alike is not None:
             base = _nearest(alike, self.references)
             if reference is None or base is None:
-                return Estimate(alike.seconds, "alike")
-            return Estimate(alike.seconds * reference.seconds / base.seconds, "scaled")
-        return (
-            Estimate(reference.seconds, "reference") if reference is not None else Estimate(None, "unknown")
+                return Estimate(alike.seconds, "alike", WITHIN["alike"])
+            ratio = reference.together(size or alike.group) / base.together(alike.group)
+            return Estimate(alike.seconds * ratio, "scaled", WITHIN["scaled"])
+        if reference is None:
+            return Estimate(None, "unknown")
+        machine = 1.0 if reference.calibration is None else self.calibrate() / reference.calibration
+        return Estimate(
+            reference.together(size or reference.group) * machine, "reference", WITHIN["reference"]
         )
 
     def note(self, store: EntryStore) -> None:
@@ -170,8 +256,58 @@ def load(path: Path) -> list[Speed]:
     except pydantic.ValidationError as error:
         raise TaskError(f"{path.name}: " + "; ".join(options.file_problems(error, SpeedFile))) from None
     return [
-        Speed((row.environment, row.algorithm, row.model), row.options, row.seconds) for row in file.speeds
+        Speed(
+            (row.environment, row.algorithm, row.model),
+            row.options,
+            row.seconds,
+            group=row.group,
+            alone=row.alone,
+            calibration=file.calibration,
+        )
+        for row in file.speeds
     ]
+
+
+@functools.cache
+def calibration() -> float:
+    """Return the processor seconds of a fixed piece of work on this machine: measured once, in a second, and kept.
+
+    It is kept per processor and version of the suite in `qrlsuite/speed.json`, in the folder that `QRLSUITE_CACHE`
+    names, else in the user's cache folder. What cannot be read there is measured anew.
+    """
+    standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    path = Path(os.environ.get("QRLSUITE_CACHE") or standard).expanduser() / CALIBRATION_FILE
+    key = f"{provenance.processor()}, qrlsuite {metadata.version('qrlsuite')}"
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        found = {}
+    kept = found if isinstance(found, dict) else {}
+    seconds = kept.get(key)
+    if isinstance(seconds, int | float) and 0 < seconds < 1e9:
+        return float(seconds)
+    seconds = measure_calibration()
+    with contextlib.suppress(StoreError):  # without a folder for it, every command measures
+        write_atomically(path, json.dumps({**kept, key: seconds}).encode())
+    return seconds
+
+
+def measure_calibration() -> float:
+    """Return the median processor seconds of a fixed piece of work, over a few repetitions.
+
+    The work is what training small networks mostly is: 1500 times the products of 50 matrices (64, 32) with 50
+    matrices (32, 32), and the hyperbolic tangent of each, in float32 on one thread. The time is the thread's own, on
+    which other work on the machine has little influence.
+    """
+    times = []
+    for _ in range(REPETITIONS):
+        x = np.linspace(-1, 1, 50 * 64 * 32, dtype=np.float32).reshape(50, 64, 32)
+        weight = np.linspace(-1, 1, 50 * 32 * 32, dtype=np.float32).reshape(50, 32, 32)
+        began = time.thread_time()
+        for _ in range(PRODUCTS):
+            x = np.tanh(x @ weight / 32)
+        times.append(time.thread_time() - began)
+    return statistics.median(times)
 
 
 def measure(store: EntryStore) -> Speed | None:
@@ -192,17 +328,26 @@ def measure(store: EntryStore) -> Speed | None:
         for line in read_lines(store.seed(seed).timings)[1:]:
             values = [line.get(name) for name in ("train", "validate")]
             group = line.get("group", 1)
-            if isinstance(group, int) and all(isinstance(v, int | float) and 0 <= v < 1e9 for v in values):
+            if (
+                isinstance(group, int)
+                and group > 0
+                and all(isinstance(v, int | float) and 0 <= v < 1e9 for v in values)
+            ):
                 by_group.setdefault(group, []).append(sum(values))  # type: ignore[arg-type]
-    seconds = by_group[max(by_group)] if by_group else []
+    largest = max(by_group, default=1)
+    seconds = by_group.get(largest, [])
     if not seconds or not statistics.median(seconds) > 0:
         return None
+    median = float(statistics.median(seconds))
+    low, high = (float(value) for value in np.percentile(seconds, [10, 90]))
     task = record["task_file"]
     return Speed(
         (str(task["environment"]["name"]), str(identity["algorithm"]), str(identity["model"])),
         _options(task, identity),
-        float(statistics.median(seconds)),
+        median,
         str(record["hash"]),
+        group=largest,
+        within=max(median / low if low > 0 else 1.0, high / median),
     )
 
 

@@ -38,6 +38,16 @@ def duration(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days"
 
 
+def duration_range(low: float, high: float) -> str:
+    """Write a range of time spans: 3 min to 27 min; one of them where both read the same."""
+    return " to ".join(dict.fromkeys(map(duration, (low, high))))
+
+
+def hours_range(low: float, high: float) -> str:
+    """Write a range of core-hours: 0.5 to 4.5; one of them where both read the same."""
+    return " to ".join(dict.fromkeys(map(hours_text, (low, high))))
+
+
 def size_text(size: int) -> str:
     """Write a number of bytes: 812 B, 9.3 kB, 42 MB."""
     amount = float(size)

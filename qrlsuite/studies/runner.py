@@ -21,7 +21,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
-from qrlsuite.results.text import duration, hours_text
+from qrlsuite.results.text import duration, duration_range, hours_range
 from qrlsuite.studies.study import Member, Study
 
 
@@ -51,8 +51,12 @@ class Item:
             return 0.0
         if self.estimate.seconds is None:
             return None
-        left = sum(len(group.seeds) * (self.plan.epochs - group.epoch) for group in self.plan.groups)
-        return left * self.estimate.seconds
+        return self.plan.left * self.estimate.seconds
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """The least and the most core-seconds left, None where unknown."""
+        return self.estimate.range(self.plan.left) if self.plan.groups else (0.0, 0.0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -71,6 +75,7 @@ class Item:
             "seconds_per_seed_epoch": self.estimate.seconds,
             "basis": self.estimate.basis,
             "core_seconds_left": self.seconds,
+            "core_seconds_range": self.range,
         }
 
 
@@ -91,6 +96,7 @@ class Overview(Shown):
             "entries": [item.as_dict() for item in self.items],
             "workers": self.workers,
             "core_hours_left": sum(known) / 3600,
+            "core_hours_range": [seconds / 3600 for seconds in _total(self.items)],
             "hours_left": sum(known) / 3600 / self.workers,
             "complete_estimate": len(known) == len(costs),
         }
@@ -108,12 +114,12 @@ class Overview(Shown):
         if self.items and not lacking:
             yield Text("everything is there")
         elif self.items:
-            known = sum(item.seconds or 0.0 for item in lacking)
+            low, high = _total(lacking)
             unknown = sum(item.seconds is None for item in lacking)
             more = f", and {unknown} entries of unknown cost" if unknown else ""
             yield Text(
-                f"left: about {duration(known / self.workers)} with {self.workers} "
-                f"worker{'s' * (self.workers != 1)} ({hours_text(known / 3600)} core-hours{more})"
+                f"left: {duration_range(low / self.workers, high / self.workers)} with {self.workers} "
+                f"worker{'s' * (self.workers != 1)} ({hours_range(low / 3600, high / 3600)} core-hours{more})"
             )
             for basis in dict.fromkeys(item.estimate.basis for item in lacking):
                 yield Text(f"  {basis}: {BASES[basis]}")
@@ -135,11 +141,17 @@ class Overview(Shown):
                 item.plan.entry.label,
                 f"{item.finished}/{len(item.plan.seeds)}{busy}",
                 str(item.plan.epochs),
-                "-" if cost == 0 else "?" if cost is None else duration(cost),
+                "-" if cost == 0 else "?" if item.range is None else duration_range(*item.range),
                 "" if cost == 0 else item.estimate.basis,
             )
             table.add_row(*map(Text, cells))
         return table
+
+
+def _total(items: Sequence[Item]) -> tuple[float, float]:
+    """Return the least and the most core-seconds left of the items whose cost is known."""
+    ranges = [item.range or (0.0, 0.0) for item in items]
+    return sum(low for low, _ in ranges), sum(high for _, high in ranges)
 
 
 def select(
@@ -205,7 +217,8 @@ def survey(
     unique = {(m.entry.task.name, m.entry.name): m.entry for m in members}
     for key, entry in unique.items():
         work = plan(runs, entry, execution, seeds, epochs)
-        items.append(Item(work, tuple(dict.fromkeys(groups[key])), speeds.estimate(entry)))
+        estimate = speeds.estimate(entry, work.together)
+        items.append(Item(work, tuple(dict.fromkeys(groups[key])), estimate))
     return items
 
 
@@ -270,15 +283,16 @@ def check_budget(items: Sequence[Item], budget: float, workers: int) -> None:
     if not order or any(fitting(item, budget, workers) for item in order):
         return
     costs = [
-        ((item.plan.epochs - group.epoch) * item.estimate.seconds, item)
+        ((item.plan.epochs - group.epoch) * item.estimate.seconds, item.plan.epochs - group.epoch, item)
         for item in order
         for group in item.plan.groups
         if item.estimate.seconds is not None
     ]
-    least, item = min(costs, key=lambda pair: pair[0])
+    least, epochs, item = min(costs, key=lambda cost: cost[0])
+    span = duration_range(*(item.estimate.range(epochs) or (least, least)))
     raise OptionError(
         f"--budget of {duration(budget)} cannot hold one group: a seed of '{item.plan.entry.label}' to epoch "
-        f"{item.plan.epochs} takes about {duration(least)} ({BASES[item.estimate.basis]}); "
+        f"{item.plan.epochs} takes about {duration(least)} ({span}; {BASES[item.estimate.basis]}); "
         "give a longer budget, or fewer --epochs"
     )
 
@@ -351,4 +365,4 @@ class Session:
             stuck = set(part.missing) - done  # another process has them
             wanted = [seed for seed in work.seeds if seed not in stuck]
             rest = plan(self.runs, work.entry, self.execution, wanted, work.epochs)
-        return Item(rest, item.groups, self.speeds.estimate(work.entry))
+        return Item(rest, item.groups, self.speeds.estimate(work.entry, rest.together))

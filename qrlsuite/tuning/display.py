@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -12,8 +13,8 @@ from qrlsuite.engine.display import Bar
 from qrlsuite.engine.execution import Plan
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
-from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.text import counted, duration, hours_text, steps_text
+from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
+from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
 from qrlsuite.tuning.objective import cell_text
 from qrlsuite.tuning.samplers import NAMES
 from qrlsuite.tuning.search import Search, Trial, merit_text
@@ -46,7 +47,7 @@ class TuneDisplay:
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
-        total: float | None = 0.0
+        total: tuple[float, float] | None = (0.0, 0.0)
         bases: dict[str, None] = {}
         for search in self.searches:
             request, base = search.request, search.base
@@ -59,25 +60,25 @@ class TuneDisplay:
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
             ]
             self.console.print("\n".join(lines), markup=False)
-            hours, basis = self._hours(search)
+            cost, basis = self._cost(search)
             bases.setdefault(basis)
-            total = None if total is None or hours is None else total + hours
+            total = None if total is None or cost is None else (total[0] + cost[0], total[1] + cost[1])
         cores = self.workers
         if total is None:
             self.console.print("what it costs will be known after the first trial")
         else:
+            low, high = total
             self.console.print(
-                f"about {hours_text(total)} core-hours, {duration(total * 3600 / cores)} with "
+                f"{hours_range(low / 3600, high / 3600)} core-hours, {duration_range(low / cores, high / cores)} with "
                 f"{counted(cores, 'process', 'processes')} ({'; '.join(bases)}); finished trials cost nothing again"
             )
 
-    def _hours(self, search: Search) -> tuple[float | None, str]:
-        """Return the core-hours of a whole search, None where unknown, and what that rests on."""
-        found = speed.known(search.runs, search.results).estimate(search.base)
-        basis = speed.BASES[found.basis]
-        if found.seconds is None:
-            return None, basis
-        return found.seconds * search.planned * len(search.request.seeds) * search.epochs / 3600, basis
+    def _cost(self, search: Search) -> tuple[tuple[float, float] | None, str]:
+        """Return the least and the most core-seconds of a whole search, None where unknown, and what that rests on."""
+        seeds = len(search.request.seeds)
+        together = min(LARGEST_GROUP, math.ceil(seeds / self.workers))
+        found = speed.known(search.runs, search.results).estimate(search.base, together)
+        return found.range(search.planned * seeds * search.epochs), speed.BASES[found.basis]
 
     def trial(self, entry: Entry, work: Plan) -> None:
         """Show that a trial begins."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qrlsuite.engine import api
-from qrlsuite.engine.execution import Execution, plan
+from qrlsuite.engine.execution import Execution, check_memory, plan
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.store import EntryStore
@@ -93,6 +93,7 @@ def _run(
 ) -> bool:
     def train(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
         work = plan(runs / FOLDER, entry, execution, seeds, epochs)
+        check_memory(work, execution)
         EntryStore.create(work.runs, entry)
         display.trial(entry, work)
         if work.groups:

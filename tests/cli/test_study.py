@@ -203,12 +203,25 @@ def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp
     ]
     done = CliRunner().invoke(build(), [*plain, "--engine", "here"], catch_exceptions=False)
     assert done.exit_code == 0
+    assert re.search(r"it should take \d.* to \d.* \(reference speeds, scaled by a calibration", done.stderr)
     (folder,) = (tmp_path / "runs" / "tiny").iterdir()
     before = results(folder, 3)
     content = answer("show", widths, "--runs", runs)
     assert [entry["finished"] for entry in content["entries"]] == [4, 0, 0]
     assert [entry["basis"] for entry in content["entries"]] == ["measured", "scaled", "reference"]
     assert content["hours_left"] > 0
+    low, high = content["core_hours_range"]
+    assert 0 < low < content["core_hours_left"] < high
+    ranges = [entry["core_seconds_range"] for entry in content["entries"]]
+    factors = [speed.WITHIN[basis] ** 2 for basis in ("scaled", "reference")]
+    assert ranges[0] == [0, 0]
+    assert [high / low for low, high in ranges[1:]] == pytest.approx(factors)
+    shown = say("show", widths, "--runs", runs).stdout
+    assert re.search(r"left: .* to .* with \d+ workers? \(.* to .* core-hours\)", shown)
+    assert re.search(
+        r"would train 4 of 4 missing \(.* to .* of core time",
+        say("run", widths, "--dry-run", "--runs", runs).stdout,
+    )
     Here.trained.clear()
     say("run", widths, "--engine", "here", "--runs", runs)
     assert sorted(label for label, _ in Here.trained) == [
@@ -323,7 +336,8 @@ def test_a_budget_that_cannot_hold_one_group(widths: str, tmp_path: Path) -> Non
     found = items(widths, tmp_path, speeds(1.0, 50.0))
     check_budget(found, 10, 2)
     with pytest.raises(
-        OptionError, match=r"cannot hold one group: a seed of 'ddqn mlp width=16' .* takes about 10 s"
+        OptionError,
+        match=r"cannot hold one group: a seed of 'ddqn mlp width=16' .* takes about 10 s \(3 s to 30 s; ",
     ):
         check_budget(found, 9, 2)
 

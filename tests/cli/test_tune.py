@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -158,4 +159,7 @@ def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(task: str,
     words = ["tune", "--task", task, "--model", "mlp", "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
     done = qrlsuite(*words, "--seeds", "1", "--runs", str(runs))
     assert done.returncode == 0, done.stderr
-    assert "measured on" in done.stderr
+    assert re.search(
+        r" to .* core-hours, .* with .* process.*\(measured on its own epochs\)",
+        " ".join(done.stderr.split()),
+    )

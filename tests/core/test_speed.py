@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+import qrlsuite
+from qrlsuite import registry
 from qrlsuite.errors import TaskError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.options import parse_setting
-from qrlsuite.results import speed
-from qrlsuite.results.speed import Speed, Speeds
+from qrlsuite.leaderboard import published
+from qrlsuite.options import Setting, parse_setting
+from qrlsuite.results import provenance, speed
+from qrlsuite.results.speed import Estimate, Speed, Speeds
 from qrlsuite.results.store import EntryStore
+from qrlsuite.specs import StudySpec
 
 KIND = ("beam6g", "ddqn", "vqc-native")
 REFERENCES = [Speed(KIND, {"qubits": n}, seconds) for n, seconds in ((4, 1.0), (8, 3.0), (12, 50.0))]
@@ -25,25 +30,105 @@ def vqc(qubits: int, *words: str) -> Entry:
 
 
 def test_without_evidence_nothing_is_claimed() -> None:
-    assert Speeds().estimate(vqc(4)) == speed.Estimate(None, "unknown")
+    assert Speeds().estimate(vqc(4), 1) == Estimate(None, "unknown")
+    assert Estimate(None, "unknown").range(10) is None
     other = Speed(("cartpole", "ddqn", "vqc-native"), {"qubits": 4}, 1.0)
-    assert Speeds(references=[other]).estimate(vqc(4)).basis == "unknown"
+    assert Speeds(references=[other]).estimate(vqc(4), 1).basis == "unknown"
 
 
 def test_a_reference_is_the_nearest_one() -> None:
     known = Speeds(references=REFERENCES)
-    assert known.estimate(vqc(4)) == speed.Estimate(1.0, "reference")
-    assert known.estimate(vqc(11)).seconds == 50.0
-    assert known.estimate(vqc(5, "gate=u3", "environment.degree=5")).seconds == 1.0
+    assert known.estimate(vqc(4), 1) == Estimate(1.0, "reference", 3.0)
+    assert known.estimate(vqc(11), 1).seconds == 50.0
+    assert known.estimate(vqc(5, "gate=u3", "environment.degree=5"), 1).seconds == 1.0
 
 
 def test_what_was_measured_scales_the_references() -> None:
     eight = vqc(8)
-    measured = Speed(KIND, {"qubits": 8, "ansatz": "iqp"}, 6.0, eight.hash)
+    measured = Speed(KIND, {"qubits": 8, "ansatz": "iqp"}, 6.0, eight.hash, within=1.5)
     known = Speeds([measured], REFERENCES)
-    assert known.estimate(eight) == speed.Estimate(6.0, "measured")
-    assert known.estimate(vqc(12)) == speed.Estimate(100.0, "scaled"), "this machine is half as fast"
-    assert Speeds([measured]).estimate(vqc(12)) == speed.Estimate(6.0, "alike")
+    assert known.estimate(eight, 1) == Estimate(6.0, "measured", 1.5)
+    assert known.estimate(vqc(12), 1) == Estimate(100.0, "scaled", 2.0), "this machine is half as fast"
+    assert Speeds([measured]).estimate(vqc(12), 1) == Estimate(6.0, "alike", 3.0)
+
+
+def test_the_worse_the_evidence_the_wider_the_range() -> None:
+    assert Estimate(6.0, "measured", 1.5).range(10) == (40.0, 90.0)
+    measured, scaled, alike, reference = (
+        speed.WITHIN[basis] for basis in ("measured", "scaled", "alike", "reference")
+    )
+    assert 1 < measured < scaled < alike <= reference
+
+
+def test_a_seed_s_share_depends_on_the_size_of_its_group() -> None:
+    """An epoch of a group costs 10 s and 1 s per seed: 11 s alone, 2 s in a group of ten, 1.5 s in one of twenty."""
+    known = Speeds(references=[Speed(KIND, {"qubits": 8}, 2.0, group=10, alone=11.0)])
+    assert [known.estimate(vqc(8), size).seconds for size in (1, 10, 20)] == pytest.approx([11.0, 2.0, 1.5])
+    eight = vqc(8)
+    known.measured = [Speed(KIND, {"qubits": 8}, 22.0, eight.hash)]
+    assert known.estimate(eight, 2).basis == "measured", "two seeds are nearly as few as one"
+    assert known.estimate(eight, None).basis == "measured", "there is nothing to train of it"
+    ten = known.estimate(eight, 10)
+    assert (ten.seconds, ten.basis) == (pytest.approx(4.0), "scaled"), (
+        "half as fast as the reference, alone too"
+    )
+    known.references = []
+    assert known.estimate(eight, 10) == Estimate(22.0, "alike", 3.0)
+
+
+def test_references_are_scaled_by_the_calibrations_of_both_machines() -> None:
+    calls = []
+    rows = [Speed(KIND, {"qubits": 8}, 3.0, calibration=0.5)]
+    known = Speeds(references=rows, calibrate=lambda: calls.append(1) or 1.5)  # type: ignore[func-returns-value]
+    assert known.estimate(vqc(8), 1).seconds == 9.0, "this machine takes three times as long"
+    known.measured = [Speed(KIND, {"qubits": 4}, 2.0)]
+    assert known.estimate(vqc(8), 1).seconds == 2.0
+    assert len(calls) == 1, "what was measured here needs no calibration"
+
+
+def test_a_calibration_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("QRLSUITE_CACHE", str(tmp_path))
+    monkeypatch.setattr(speed, "PRODUCTS", 2)
+    kept = tmp_path / "qrlsuite" / "speed.json"
+    calibration = speed.calibration.__wrapped__
+    first = calibration()
+    assert first > 0
+    (key,) = json.loads(kept.read_text())
+    assert key == f"{provenance.processor()}, qrlsuite {qrlsuite.__version__}"
+    kept.write_text(json.dumps({key: 7.0, "another processor, qrlsuite 0.0.1": 3.0}))
+    assert calibration() == 7.0
+    for damaged in ('{"', "[1]", json.dumps({key: "x"}), json.dumps({key: -1}), "\xff"):
+        kept.write_text(damaged, encoding="latin-1")
+        assert 0 < calibration() < 7.0, damaged
+        assert json.loads(kept.read_text())[key] > 0, "measured anew, and kept"
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("QRLSUITE_CACHE", str(tmp_path / "file"))
+    assert calibration() > 0, "no folder to keep it in"
+
+
+def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> None:
+    """Of every published entry: its seconds per seed and epoch lie in the range that the reference speeds give."""
+    (path,) = {
+        Path(registered.spec.speeds)
+        for kind, registered in registry.load()
+        if kind == "studies" and isinstance(registered.spec, StudySpec) and registered.spec.speeds
+    }
+    known = Speeds(references=[replace(row, calibration=None) for row in speed.load(path)])
+    found = [*published.SHIPPED.glob("*/*/entry.json")]
+    assert len(found) >= 11
+    for file in found:
+        record = json.loads(file.read_text())
+        words = record["identity"]
+        settings = [
+            Setting(kind, name, value)
+            for kind in ("model", "algorithm")
+            for name, value in words[f"{kind}_options"].items()
+        ]
+        entry = resolve(record["task_name"], words["model"], words["algorithm"], settings)
+        hours = record["published"]
+        seconds = hours["core_hours"] * 3600 / hours["seeds"] / hours["epochs"]
+        low, high = known.estimate(entry, 50).range(1) or (0.0, 0.0)
+        assert low <= seconds <= high, (record["label"], seconds, low, high)
 
 
 def test_the_median_of_an_entrys_epochs_is_measured(train: Callable[..., Path], tmp_path: Path) -> None:
@@ -55,7 +140,7 @@ def test_the_median_of_an_entrys_epochs_is_measured(train: Callable[..., Path], 
     assert [each.seconds for each in found.measured] == [3.0], (
         "the first epoch holds the start of the process"
     )
-    assert found.estimate(store.entry()) == speed.Estimate(3.0, "measured")
+    assert found.estimate(store.entry(), 1) == Estimate(3.0, "measured", 1.25)
     assert found.measured[0].options["antennas"] == 3, "a list counts by its length"
 
     store.seed(1).timings.write_text(
@@ -74,6 +159,8 @@ def test_the_median_of_an_entrys_epochs_is_measured(train: Callable[..., Path], 
     measured = speed.measure(store)
     assert measured is not None
     assert measured.seconds == pytest.approx(1.05), "a group of fifty tells more than a seed alone"
+    assert measured.group == 50
+    assert measured.within == pytest.approx(1.05 / 0.69), "of .6 and 1.5, .69 and 1.41 are the percentiles"
     store.seed(1).timings.unlink()
     assert speed.measure(store) is None, "one epoch tells nothing"
     (store.path / "entry.json").write_text("{")
@@ -90,6 +177,11 @@ def test_files_of_speeds(tmp_path: Path) -> None:
     ):
         speed.load(path)
     path.write_text(f'format_version = 1\nmachine = "m"\n{row}seconds = 0.5\n')
-    assert speed.load(path) == [Speed(("beam6g", "ddqn", "mlp"), {}, 0.5)]
+    assert speed.load(path) == [Speed(("beam6g", "ddqn", "mlp"), {}, 0.5)], "as files of earlier versions are"
+    path.write_text(
+        f'format_version = 1\nmachine = "m"\ncalibration = 0.2\n{row}seconds = 0.5\ngroup = 4\nalone = 1.5\n'
+    )
+    (read,) = speed.load(path)
+    assert (read.group, read.alone, read.calibration) == (4, 1.5, 0.2)
     with pytest.raises(TaskError, match=r"gone\.toml cannot be read"):
         speed.load(tmp_path / "gone.toml")

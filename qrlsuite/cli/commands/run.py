@@ -99,6 +99,8 @@ def run(
     execution.check_minutes(minutes, where)
     work = execution.plan(runs, entry, where, wanted, last)
     display = RunDisplay(work, where.workers, quiet=json_output)
+    if not json_output:
+        display.expected = execution.expected(work, where)
     try:
         outcome = execution.train(work, where, display, minutes, confirmed=yes)
     except KeyboardInterrupt:

@@ -27,7 +27,7 @@ from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.studies import NOTHING, Drawn
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import parse_seeds
-from qrlsuite.results.text import counted, duration
+from qrlsuite.results.text import counted, duration_range
 from qrlsuite.studies import runner
 from qrlsuite.studies.study import Member, Study, load
 
@@ -253,9 +253,11 @@ def _dry_run(study: Study, steps: Sequence[dict[str, Any]], json_output: bool) -
         typer.echo(json.dumps({"name": study.name, "steps": steps}))
         return
     for step in steps:
-        cost = step["core_seconds_left"]
+        cost = step["core_seconds_range"]
         text = (
-            "of unknown cost" if cost is None else f"{duration(cost)} of core time for all, {step['basis']}"
+            "of unknown cost"
+            if cost is None
+            else f"{duration_range(*cost)} of core time for all, {step['basis']}"
         )
         typer.echo(
             f"{step['task']}  {step['label']}: {step['finished']} of {counted(step['seeds'], 'seed')} there, would "
