@@ -103,6 +103,10 @@ class LocalEngine:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        for job in self._running:
+            if job.output is not None:
+                job.output.close()
+        self._running.clear()
 
 
 def _start(job: _Job, work: Work) -> None:
