@@ -162,6 +162,10 @@ class SpeedFile(BaseModel):
     speeds: list[_Row]
 
 
+def _calibrated() -> float:
+    return calibration()
+
+
 @dataclass
 class Speeds:
     """What was measured in a results folder, and reference speeds.
@@ -174,7 +178,7 @@ class Speeds:
 
     measured: list[Speed] = field(default_factory=list)
     references: list[Speed] = field(default_factory=list)
-    calibrate: Callable[[], float] = field(default_factory=lambda: calibration)
+    calibrate: Callable[[], float] = field(default_factory=lambda: _calibrated)
 
     def estimate(self, entry: Entry, together: int | None) -> Estimate:
         """Return the best estimate for an entry in groups of `together` seeds; None for as many as were measured."""
