@@ -132,6 +132,8 @@ class Section:
     """Shorter than the task's own horizons."""
     cell: str
     rows: tuple[Row, ...]
+    pairs: Board
+    """The verdicts of all pairs, cell by cell."""
 
 
 @dataclass(frozen=True)
@@ -289,7 +291,7 @@ def _section(
     labels = {entry.name: entry.label for entry in entries}
     wanted = entries[0].task_file.protocol.seeds
     rows = []
-    places = board.ranking
+    places, better = board.ranking, board.better_cells
     capped = {place.name for place in places.not_reached}
     for place in places.entries:
         entry = by_name[place.name]
@@ -301,8 +303,8 @@ def _section(
                 reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
                 median_score=float(np.median(values[:, -1])),
                 copeland=place.copeland,
-                wins=int(board.better_cells[board.names.index(place.name)].sum()),
-                losses=int(board.better_cells[:, board.names.index(place.name)].sum()),
+                wins=int(better[board.names.index(place.name)].sum()),
+                losses=int(better[:, board.names.index(place.name)].sum()),
                 outperforms=tuple(labels[name] for name in place.outperforms),
                 outperformed_by=tuple(labels[name] for name in place.outperformed_by),
                 provisional=len(entry.seeds) < wanted,
@@ -310,7 +312,15 @@ def _section(
                 rests_on=_support(board, place.rests_on, labels),
             )
         )
-    return Section(task, entries[0].task_file.summary, horizon, provisional, cell_text(ranking), tuple(rows))
+    return Section(
+        task=task,
+        summary=entries[0].task_file.summary,
+        horizon=horizon,
+        provisional=provisional,
+        cell=cell_text(ranking),
+        rows=tuple(rows),
+        pairs=board,
+    )
 
 
 def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, str]) -> Support | None:
@@ -320,9 +330,9 @@ def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, st
     return Support(
         winner=labels[pair[0]],
         loser=labels[pair[1]],
-        cells=int(board.better_cells[won, lost]),
-        at_cap=int(board.capped_cells[won, lost]),
-        total=board.n_cells,
+        cells=int((board.signs[won, lost] > 0).sum()),
+        at_cap=int(board.capped[won, lost].sum()),
+        total=board.signs[won, lost].size,
     )
 
 

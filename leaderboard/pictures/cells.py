@@ -112,7 +112,7 @@ def level_name(grid: Grid) -> str:
 
 def levels(grid: Grid) -> list[str]:
     """Return the rows of a grid as they are written: epsilons, or thresholds on the return."""
-    return [f"{value:g}" for value in (grid.epsilons or grid.thresholds)]
+    return [f"{value:g}" for value in (grid.levels)]
 
 
 def probabilities(grid: Grid) -> list[str]:

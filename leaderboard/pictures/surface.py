@@ -133,7 +133,7 @@ def _box(
 
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=True)
-    levels = np.array(grid.epsilons or grid.thresholds)
+    levels = np.array(grid.levels)
     deltas = np.array([float(delta) for delta in grid.deltas])
     x, y = np.meshgrid(levels, deltas, indexing="ij")
     handles = []

@@ -1,25 +1,15 @@
-"""Every pair of a section, cell by cell: what `qrlsuite.statistics.compare` says, with shared resamples."""
+"""Every pair of a section, cell by cell, as the board judged it, with the estimates that each verdict rests on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.statistics import (
-    MIN_RUNS,
-    Evidence,
-    Grid,
-    IntervalRule,
-    LearningCurves,
-    Outcome,
-    SignificanceRule,
-    at_cap,
-)
-from qrlsuite.statistics.compare import in_words, never_reached, overall
+from qrlsuite.leaderboard.board import Section, learning_curves, ranking_of
+from qrlsuite.statistics import Board, Evidence, Grid, LearningCurves, Outcome
+from qrlsuite.statistics.compare import in_words, overall
 
 SYMBOLS = {1: "+", -1: "-", 0: ".", 2: "^", 3: "?"}
 """A cell's verdict from the first entry's side: fewer samples, more, no difference, both at cap, undecided."""
@@ -70,7 +60,6 @@ class Judgement:
 
     grid: Grid
     horizon: int
-    rule: str
     entries: tuple[LearningCurves, ...]
     pairs: tuple[Pair, ...]
     evidence: dict[tuple[int, int], Evidence]
@@ -93,34 +82,26 @@ class Judgement:
         return matrix
 
 
-def judge(entries: Sequence[EntryCurves], horizon: int, rule: SignificanceRule | None = None) -> Judgement:
-    """Judge all pairs of a section's entries, which all reach its horizon.
-
-    Parameters
-    ----------
-    rule:
-        None means the paper's, as for the board.
-    """
-    chosen = rule or IntervalRule()
+def judge(section: Section) -> Judgement:
+    """Return the pairs of a section, in the order of its rows, with what each verdict rests on."""
+    entries, horizon, board = [row.entry for row in section.rows], section.horizon, section.pairs
     grid = ranking_of(entries).grid
     curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)
     evidence = {(i, curve.n_runs): Evidence(curve, grid, curve.n_runs) for i, curve in enumerate(curves)}
-    nothing = [never_reached(curve, grid) for curve in curves]
+    places = [board.names.index(entry.name) for entry in entries]
     pairs = []
-    for i in range(len(curves)):
-        for j in range(i + 1, len(curves)):
-            n_runs = min(curves[i].n_runs, curves[j].n_runs)
-            for place in (i, j):
-                if (place, n_runs) not in evidence:
-                    evidence[place, n_runs] = Evidence(curves[place], grid, n_runs)
-            cells = _cells(chosen, evidence[i, n_runs], evidence[j, n_runs], horizon)
-            pairs.append(Pair(i, j, n_runs, cells, nothing[i] and nothing[j]))
-    return Judgement(grid, horizon, chosen.name, curves, tuple(pairs), evidence)
+    for i, j in itertools.combinations(range(len(curves)), 2):
+        n_runs = min(curves[i].n_runs, curves[j].n_runs)
+        for place in (i, j):
+            if (place, n_runs) not in evidence:
+                evidence[place, n_runs] = Evidence(curves[place], grid, n_runs)
+        nothing = bool(board.not_reached[[places[i], places[j]]].all())
+        pairs.append(Pair(i, j, n_runs, _cells(board, places[i], places[j]), nothing))
+    return Judgement(grid, horizon, curves, tuple(pairs), evidence)
 
 
-def _cells(rule: SignificanceRule, first: Evidence, second: Evidence, horizon: int) -> str:
-    if first.n_runs < MIN_RUNS:
-        return SYMBOLS[3] * first.grid.size
-    signs = np.asarray(rule(first, second), dtype=np.int64)
-    capped = at_cap(first.interval(), horizon) & at_cap(second.interval(), horizon)
-    return "".join(SYMBOLS[int(code)] for code in np.where((signs == 0) & capped, 2, signs).ravel())
+def _cells(board: Board, first: int, second: int) -> str:
+    signs = board.signs[first, second].astype(np.int64)
+    if not board.decided[first, second]:
+        return SYMBOLS[3] * signs.size
+    return "".join(SYMBOLS[int(code)] for code in np.where(board.capped[first, second], 2, signs).ravel())

@@ -44,9 +44,7 @@ def render(
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
-    boards = [
-        sections.view(section, number, by_curves, judging) for number, section in enumerate(board.sections)
-    ]
+    boards = [sections.view(section, number, by_curves) for number, section in enumerate(board.sections)]
     scripts = [_file(name) for name in SCRIPTS]
     data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
     now = datetime.datetime.now(datetime.UTC)

@@ -16,7 +16,7 @@ from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.words import listed
 from qrlsuite.results.text import counted, steps_text
-from qrlsuite.statistics import Evidence, Grid, Outcome, SignificanceRule
+from qrlsuite.statistics import Evidence, Grid, Outcome
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
@@ -78,17 +78,15 @@ class SectionView:
         return any(row.entry.quantum for row in self.rows)
 
 
-def view(section: Section, number: int, entries: dict[int, EntryView], rule: SignificanceRule) -> SectionView:
+def view(section: Section, number: int, entries: dict[int, EntryView]) -> SectionView:
     """Return a section of the page.
 
     Parameters
     ----------
     entries:
         The page's entries by the identity of their curves.
-    rule:
-        The one that judged the board.
     """
-    judgement = judge([row.entry for row in section.rows], section.horizon, rule)
+    judgement = judge(section)
     ranking = ranking_of([row.entry for row in section.rows])
     rows = tuple(
         _row(place, row, entries[id(row.entry)], judgement) for place, row in enumerate(section.rows)
@@ -97,7 +95,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
     grid = judgement.grid
     bars = bar_grid(ranking)
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
-    names = [f"{float(value):g}" for value in grid.epsilons or grid.thresholds]
+    names = [f"{float(value):g}" for value in grid.levels]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
     missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
     surfaces = tuple(surface(judgement.own(place), ranking, unit) for place in range(len(rows)))
@@ -124,7 +122,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView], rule: Sig
         ),
         bar_names=tuple(
             f"{symbol(bars)} {float(value):g}, δ {float(delta):g}"
-            for value in bars.epsilons or bars.thresholds
+            for value in bars.levels
             for delta in bars.deltas
         ),
         thresholds=tuple(names),
@@ -210,7 +208,7 @@ def _data(
         "level": level,
         "score": "validation score (received / optimal)" if relative else "validation score",
         "levelName": symbol(judgement.grid),
-        "levels": [f"{float(value):g}" for value in judgement.grid.epsilons or judgement.grid.thresholds],
+        "levels": [f"{float(value):g}" for value in judgement.grid.levels],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],
         "pairs": [[pair.first, pair.second, pair.n_runs, pair.cells] for pair in judgement.pairs],
         "evidence": {
@@ -218,7 +216,7 @@ def _data(
             for (place, n_runs), evidence in judgement.evidence.items()
         },
         "bars": {
-            "levels": [f"{symbol(bars)} = {float(value):g}" for value in bars.epsilons or bars.thresholds],
+            "levels": [f"{symbol(bars)} = {float(value):g}" for value in bars.levels],
             "deltas": [f"δ = {float(delta):g}" for delta in bars.deltas],
             "entries": [_numbers(evidence) for evidence in bar_evidence],
         },

@@ -11,18 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.statistics.compare import MIN_RUNS, never_reached, shown_percentiles
+from qrlsuite.statistics.compare import MIN_RUNS, judge_cells, never_reached
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
-from qrlsuite.statistics.estimator import at_cap
 from qrlsuite.statistics.grid import BoolArray, Grid, IntArray, whole
 from qrlsuite.statistics.ranking import Ranking, rank
-from qrlsuite.statistics.significance import (
-    Evidence,
-    IntervalRule,
-    Resampling,
-    SignificanceRule,
-    check_signs,
-)
+from qrlsuite.statistics.significance import Evidence, IntervalRule, Resampling, SignificanceRule, Signs
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,13 +28,12 @@ class Board:
         The M entries.
     rule:
         Name of the rule that judged.
-    better_cells:
-        Shape (M, M): in how many cells the row's entry needs significantly fewer samples than the column's.
-    capped_cells:
-        Shape (M, M), symmetric: cells without a significant difference in which both intervals end at the
-        horizon: too few steps to tell.
-    n_cells:
-        Cells of the grid.
+    signs:
+        Shape (M, M, E, D): +1 where the row's entry needs significantly fewer samples than the column's, -1 where
+        more, else 0.
+    capped:
+        Shape (M, M, E, D): cells without a significant difference in which both intervals end at the horizon: too few
+        steps to tell.
     decided:
         Shape (M, M): whether both have at least 20 runs.
     not_reached:
@@ -50,16 +42,22 @@ class Board:
 
     names: tuple[str, ...]
     rule: str
-    better_cells: IntArray
-    capped_cells: IntArray
-    n_cells: int
+    signs: Signs
+    capped: BoolArray
     decided: BoolArray
     not_reached: BoolArray
 
     @property
+    def better_cells(self) -> IntArray:
+        """Shape (M, M): in how many cells the row's entry needs significantly fewer samples than the column's."""
+        cells: IntArray = (self.signs > 0).sum(axis=(2, 3))
+        return cells
+
+    @property
     def outperforms(self) -> BoolArray:
         """Shape (M, M): whether the row's entry outperforms the column's."""
-        matrix: BoolArray = (self.better_cells > 0) & (self.better_cells.T == 0)
+        better = self.better_cells
+        matrix: BoolArray = (better > 0) & (better.T == 0)
         return matrix
 
     @property
@@ -91,8 +89,8 @@ def outperformance(
     """
     chosen = rule or IntervalRule()
     size = len(entries)
-    better = np.zeros((size, size), dtype=np.int64)
-    capped = np.zeros((size, size), dtype=np.int64)
+    all_signs = np.zeros((size, size, *grid.shape), dtype=np.int8)
+    all_capped = np.zeros((size, size, *grid.shape), dtype=np.bool_)
     runs = np.array([entry.n_runs for entry in entries], dtype=np.int64)
     ends = np.array([_end(entry, horizon) for entry in entries], dtype=np.int64)
     shared_runs, shared_ends = np.minimum.outer(runs, runs), np.minimum.outer(ends, ends)
@@ -104,21 +102,17 @@ def outperformance(
         group = todo & (shared_runs == n_runs) & (shared_ends == end)
         members = np.flatnonzero(group.any(axis=0) | group.any(axis=1)).tolist()
         evidence = {i: Evidence(entries[i].cut(end), grid, n_runs, resampling) for i in members}
-        at_end = {i: at_cap(evidence[i].interval(shown_percentiles(chosen)), end) for i in members}
         for first in np.flatnonzero(group.any(axis=1)).tolist():
             others = np.flatnonzero(group[first]).tolist()
-            signs = _judge(chosen, evidence[first], [evidence[other] for other in others])
-            better[first, others] = (signs > 0).sum(axis=(1, 2))
-            better[others, first] = (signs < 0).sum(axis=(1, 2))
-            both = at_end[first] & np.stack([at_end[other] for other in others]) & (signs == 0)
-            capped[first, others] = capped[others, first] = both.sum(axis=(1, 2))
+            signs, capped = judge_cells(chosen, evidence[first], [evidence[other] for other in others], end)
+            all_signs[first, others], all_signs[others, first] = signs, -signs
+            all_capped[first, others] = all_capped[others, first] = capped
     reached_nothing = [never_reached(entry.cut(end), grid) for entry, end in zip(entries, ends.tolist())]
     return Board(
         names=tuple(entry.name for entry in entries),
         rule=chosen.name,
-        better_cells=better,
-        capped_cells=capped,
-        n_cells=grid.size,
+        signs=all_signs,
+        capped=all_capped,
         decided=decided,
         not_reached=np.array(reached_nothing, dtype=bool),
     )
@@ -135,12 +129,3 @@ def _check_horizons(
     steps = np.array([entry.steps_per_epoch for entry in entries], dtype=np.int64)
     for i, j in np.argwhere(todo & ((ends % steps[:, None] != 0) | (ends % steps[None, :] != 0))).tolist():
         common_horizon(entries[i], entries[j], horizon)
-
-
-def _judge(rule: SignificanceRule, first: Evidence, others: Sequence[Evidence]) -> IntArray:
-    """Return the signs of one entry against M others, shape (M, E, D)."""
-    shape = (len(others), *first.grid.shape)
-    against = getattr(rule, "against", None)
-    if against is not None:
-        return check_signs(against(first, others), shape, rule)
-    return check_signs(np.stack([rule(first, other) for other in others]), shape, rule)

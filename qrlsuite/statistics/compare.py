@@ -8,6 +8,7 @@ verdict is `undecided`. They are cut to the shorter horizon.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -16,12 +17,13 @@ import numpy as np
 
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.estimator import at_cap, complexity
-from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
+from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid
 from qrlsuite.statistics.significance import (
     Evidence,
     IntervalRule,
     Resampling,
     SignificanceRule,
+    Signs,
     check_signs,
 )
 
@@ -214,29 +216,53 @@ def compare(
     n_runs = min(first.n_runs, second.n_runs)
     pair = [Evidence(entry.cut(steps), grid, n_runs, resampling) for entry in (first, second)]
     intervals = np.stack([evidence.interval(shown_percentiles(chosen)) for evidence in pair])
-    signs = None
-    if n_runs >= MIN_RUNS:
-        signs = check_signs(chosen(*pair), grid.shape, chosen)
+    judged = judge_cells(chosen, pair[0], [pair[1]], steps) if n_runs >= MIN_RUNS else None
     return Comparison(
         names=(first.name, second.name),
         rule=chosen.name,
         grid=grid,
         horizon=steps,
         n_runs=n_runs,
-        verdicts=_verdicts(signs, intervals, steps, grid),
+        verdicts=_verdicts(judged, grid),
         points=np.stack([evidence.point for evidence in pair]),
         intervals=intervals,
         not_reached=(never_reached(first.cut(steps), grid), never_reached(second.cut(steps), grid)),
     )
 
 
-def _verdicts(
-    signs: IntArray | None, intervals: FloatArray, horizon: int, grid: Grid
-) -> tuple[tuple[Verdict, ...], ...]:
+def judge_cells(
+    rule: SignificanceRule, first: Evidence, others: Sequence[Evidence], horizon: int
+) -> tuple[Signs, BoolArray]:
+    """Judge one entry against M others, cell by cell: what every verdict of a pair is made of.
+
+    Returns
+    -------
+    tuple
+        Signs (M, E, D), +1 where `first` needs significantly fewer samples; and (M, E, D) where neither does and both
+        intervals end at the horizon: too few steps to tell.
+
+    Raises
+    ------
+    OptionError
+        If the rule answers something else than signs.
+    """
+    shape, against = first.grid.shape, getattr(rule, "against", None)
+    if against is not None:
+        answered = check_signs(against(first, others), (len(others), *shape), rule)
+    else:
+        answered = np.stack([check_signs(rule(first, other), shape, rule) for other in others])
+    signs: Signs = answered.astype(np.int8)
+    percentiles = shown_percentiles(rule)
+    ends = np.stack([at_cap(evidence.interval(percentiles), horizon) for evidence in (first, *others)])
+    capped: BoolArray = ends[0] & ends[1:] & (signs == 0)
+    return signs, capped
+
+
+def _verdicts(judged: tuple[Signs, BoolArray] | None, grid: Grid) -> tuple[tuple[Verdict, ...], ...]:
     n_thresholds, n_deltas = grid.shape
-    if signs is None:
+    if judged is None:
         return ((Verdict.UNDECIDED,) * n_deltas,) * n_thresholds
-    capped = at_cap(intervals[0], horizon) & at_cap(intervals[1], horizon)
+    signs, capped = (cells[0] for cells in judged)
     named = {1: Verdict.WIN, -1: Verdict.LOSS}
     return tuple(
         tuple(
