@@ -36,16 +36,16 @@ def render(
     board:
         As `qrlsuite.leaderboard.board.build` returns it.
     rule:
-        The rule that judged the board; None means the registered one of that name.
+        The rule that judged the board; None means the registered one that each section names.
     title:
         The page's heading.
     """
-    judging = rule or rules.load(board.rule)
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
     boards = [
-        sections.view(section, number, by_curves, judging) for number, section in enumerate(board.sections)
+        sections.view(section, number, by_curves, rule or rules.load(section.rule))
+        for number, section in enumerate(board.sections)
     ]
     scripts = [_file(name) for name in SCRIPTS]
     data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
@@ -63,8 +63,8 @@ def render(
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,
-            rule=judging.name,
-            promise=clean(judging.promise, LONGEST_REASON),
+            rule=board.rule,
+            promise=clean(board.promise, LONGEST_REASON),
             paper=PAPER,
             policy=_policy(scripts),
             css=Markup(_file("style.css")),
