@@ -16,15 +16,15 @@ from rich.text import Text
 
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard import tables
+from qrlsuite.leaderboard import rules, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
     Board,
     Comparison,
-    IntervalRule,
     LearningCurves,
     SignificanceRule,
     at_cap,
@@ -34,6 +34,7 @@ from qrlsuite.statistics import (
     sample_complexity,
     unsettled,
 )
+from qrlsuite.statistics.times import check_probability
 
 
 @dataclass(frozen=True)
@@ -134,18 +135,35 @@ class Section:
     rows: tuple[Row, ...]
     pairs: Board
     """The verdicts of all pairs, cell by cell."""
+    times: TimeRanking
+    """The same entries by mean time below threshold."""
+    rule: str = DEFAULT
+    """Name of the significance rule that the tiers rest on."""
+    promise: str = ""
+    """What that rule controls."""
 
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """All sections, and what was refused and why. In a notebook, and printed by rich, it is a table per section."""
+    """All sections, and what was refused and why. In a notebook, and printed by rich, it is two tables per section."""
 
     sections: tuple[Section, ...]
     refused: tuple[str, ...]
-    rule: str = DEFAULT
-    """Name of the significance rule that judged."""
-    promise: str = ""
-    """What that rule controls."""
+
+    @property
+    def rules(self) -> dict[str, str]:
+        """Name and promise of every significance rule that judged a section."""
+        return {section.rule: section.promise for section in self.sections}
+
+    @property
+    def rule(self) -> str:
+        """Their names, joined by commas; the paper's where there is no section."""
+        return ", ".join(self.rules) or DEFAULT
+
+    @property
+    def promise(self) -> str:
+        """What they control, joined by semicolons."""
+        return "; ".join(self.rules.values())
 
     def as_dict(self) -> dict[str, Any]:
         """Return the board as plain values, for JSON."""
@@ -154,6 +172,7 @@ class Leaderboard:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for section in self.sections:
             yield tables.section_table(section, options.max_width)
+            yield tables.times_table(section, options.max_width)
         for line in self.refused:
             yield Text(f"left out: {line}")
 
@@ -206,6 +225,7 @@ def build(
     refused: Sequence[str] = (),
     rule: SignificanceRule | None = None,
     horizon: int | None = None,
+    alpha: float = ALPHA,
 ) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
@@ -218,16 +238,21 @@ def build(
     refused:
         Lines about what could not be read, passed on.
     rule:
-        What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means the paper's.
+        What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means each task's own, the paper's
+        where it names none.
     horizon:
         Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
+    alpha:
+        Error probability of the ranking by mean time, see `qrlsuite.leaderboard.times.rank_by_time`.
 
     Raises
     ------
+    OptionError
+        If `alpha` is not between 0 and 1.
     PluginError
         If a plugin's rule fails.
     """
-    chosen = rule or IntervalRule()
+    check_probability(alpha, "alpha")
     sections: list[Section] = []
     problems = list(refused)
     for task in sorted({entry.task for entry in entries}):
@@ -242,12 +267,13 @@ def build(
         ]
         for steps, provisional, group in _by_horizon(good, horizon):
             try:
-                sections.append(_section(task, steps, provisional, group, chosen))
+                chosen = rule or rule_of(group)
+                sections.append(_section(task, steps, provisional, group, chosen, alpha))
             except PluginError:
                 raise
             except QrlSuiteError as error:
                 problems.append(f"task '{task}' at {steps} steps: {error}")
-    return Leaderboard(tuple(sections), tuple(problems), chosen.name, chosen.promise)
+    return Leaderboard(tuple(sections), tuple(problems))
 
 
 def _by_horizon(
@@ -280,8 +306,18 @@ def ranking_of(entries: Sequence[EntryCurves]) -> RankingSection:
     return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
 
 
+def rule_of(entries: Sequence[EntryCurves]) -> SignificanceRule:
+    """Return the rule that a task names in `[ranking]`, the paper's where it names none."""
+    return rules.load(ranking_of(entries).rule or DEFAULT)
+
+
 def _section(
-    task: str, horizon: int, provisional: bool, entries: Sequence[EntryCurves], rule: SignificanceRule
+    task: str,
+    horizon: int,
+    provisional: bool,
+    entries: Sequence[EntryCurves],
+    rule: SignificanceRule,
+    alpha: float,
 ) -> Section:
     ranking = ranking_of(entries)
     if getattr(rule, "paired", False):
@@ -320,6 +356,9 @@ def _section(
         cell=cell_text(ranking),
         rows=tuple(rows),
         pairs=board,
+        times=rank_by_time(entries, ranking.grid, horizon, alpha),
+        rule=rule.name,
+        promise=rule.promise,
     )
 
 
@@ -383,8 +422,8 @@ def compare_entries(
     first, second:
         The entries.
     rule:
-        What counts as significant; None means the paper's. For a paired rule both are reduced to the seeds that
-        they share.
+        What counts as significant; None means the task's own, the paper's where it names none. For a paired rule
+        both are reduced to the seeds that they share.
 
     Raises
     ------
@@ -399,6 +438,7 @@ def compare_entries(
         )
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
+    rule = rule or rule_of([first, second])
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
     grid = ranking_of([first, second]).grid
@@ -443,6 +483,8 @@ def as_dict(board: Leaderboard) -> dict[str, Any]:
                 "horizon": section.horizon,
                 "provisional": section.provisional,
                 "cell": section.cell,
+                "rule": section.rule,
+                "times": section.times.as_dict(),
                 "rows": [_row_dict(row) for row in section.rows],
             }
             for section in board.sections

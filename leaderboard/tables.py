@@ -17,6 +17,7 @@ from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Comparison
 
 if TYPE_CHECKING:  # boards show themselves by this module
+    from qrlsuite.leaderboard.across import AcrossBoard
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
 
 COLUMNS = (
@@ -205,23 +206,87 @@ def table(
     return found
 
 
+NARROW = 105
+"""Characters per line in which the whole table by mean time can be read."""
+LEFT_OUT_OF_TIMES = ("seeds", "at cap", "at half")
+"""What a narrower one leaves out."""
+NAMES = ("entry", "needs less than", "needs more than")
+"""Columns of names, which may be broken into several lines."""
+
+
+def times_title(section: Section) -> str:
+    """Return the heading of a section by mean time below threshold."""
+    return f"{section.task}, {steps_text(section.horizon)} steps, by mean time below threshold"
+
+
+def times_table(section: Section, width: int = WIDE) -> Table:
+    """Return a section by mean time below threshold as a table for a terminal of some width."""
+    times = section.times
+    remarks, columns = times.notes(), times.columns()
+    left_out = LEFT_OUT_OF_TIMES if width < NARROW else ()
+    if left_out:
+        remarks.append(
+            f"a terminal of {NARROW} columns, or --format markdown, shows {', '.join(left_out)} too"
+        )
+    kept = [place for place, name in enumerate(columns) if name not in left_out]
+    shown = [columns[place] for place in kept]
+    found = table(
+        shown,
+        title=times_title(section),
+        caption="\n".join(remarks),
+        left=[name for name in shown if name not in LEFT_OUT_OF_TIMES],
+        fixed=[name for name in shown if name not in NAMES],
+    )
+    for row in times.rows:
+        texts = times.cells(row)
+        found.add_row(*(Text(texts[place]) for place in kept))
+    return found
+
+
+def across_table(board: AcrossBoard) -> Table:
+    """Return a comparison over several tasks as a table."""
+    columns = board.columns()
+    fixed = [name for name in columns if name not in NAMES]
+    found = table(columns, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed)
+    for place in range(len(board.order)):
+        found.add_row(*map(Text, board.cells(place)))
+    return found
+
+
 def markdown(board: Leaderboard) -> str:
-    """Return a board as Markdown: a heading, a table and notes per section."""
+    """Return a board as Markdown: for each section two tables, each with heading and notes."""
     lines = []
     for section in board.sections:
-        lines += [f"### {title(section)}", "", f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
-        for row in section.rows:
-            texts = (cell.replace("|", "\\|").replace("<", "&lt;") for cell in cells(section, row))
-            lines.append(f"| {' | '.join(texts)} |")
-        lines += ["", *(f"{note.replace('*', chr(92) + '*')}  " for note in notes(section)), ""]
+        times = section.times
+        rows = [cells(section, row) for row in section.rows]
+        lines += _markdown_table(title(section), COLUMNS, rows, notes(section))
+        by_time = [times.cells(row) for row in times.rows]
+        lines += _markdown_table(times_title(section), times.columns(), by_time, times.notes())
     return "\n".join(lines)
+
+
+def across_markdown(board: AcrossBoard) -> str:
+    """Return a comparison over several tasks as Markdown."""
+    rows = [board.cells(place) for place in range(len(board.order))]
+    return "\n".join(_markdown_table(board.title, board.columns(), rows, board.notes()))
+
+
+def _markdown_table(
+    heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]], remarks: Sequence[str]
+) -> list[str]:
+    lines = [f"### {heading}", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    for row in rows:
+        texts = (cell.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;") for cell in row)
+        lines.append(f"| {' | '.join(texts)} |")
+    shown = (line.replace("\\", "\\\\").replace("*", "\\*").replace("<", "&lt;") for line in remarks)
+    return [*lines, "", *(f"{line}  " for line in shown), ""]
 
 
 def csv_text(board: Leaderboard) -> str:
     """Write one line per entry and section; lists are separated by semicolons."""
-    rows = []
-    for section in board.as_dict()["sections"]:
-        for row in section["rows"]:
+    rows: list[dict[str, object]] = []
+    for made, section in zip(board.sections, board.as_dict()["sections"]):
+        for of, row in zip(made.rows, section["rows"]):
             low, high = row.pop("interval")
             count = row.pop("parameters")
             tuning = row.pop("tuning") or {}
@@ -238,13 +303,21 @@ def csv_text(board: Leaderboard) -> str:
                 "interval_high": high,
                 "tuned": tuned,
                 "tuned_on_protocol_seeds": on_protocol_seeds,
-                "rule": board.rule,
+                "rule": section["rule"],
+                **made.times.flat(of.entry),
             }
-            rows.append({k: "; ".join(v) if isinstance(v, list) else v for k, v in flat.items()})
+            rows.append(flat)
+    return csv_rows(rows)
+
+
+def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
+    """Write rows of equal columns; lists are separated by semicolons."""
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _harmless(value) for name, value in row.items()} for row in rows)
+    for row in rows:
+        flat = {name: "; ".join(value) if isinstance(value, list) else value for name, value in row.items()}
+        writer.writerow({name: _harmless(value) for name, value in flat.items()})
     return buffer.getvalue()
 
 
@@ -259,6 +332,9 @@ def board_html(board: Leaderboard) -> str:
     for section in board.sections:
         rows = [cells(section, row) for row in section.rows]
         parts.append(html_table(COLUMNS, rows, title(section), notes(section)))
+        times = section.times
+        by_time = [times.cells(row) for row in times.rows]
+        parts.append(html_table(times.columns(), by_time, times_title(section), times.notes()))
     parts += [f"<p>left out: {escape(line)}</p>" for line in board.refused]
     return "\n".join(parts) or "<p>no entries</p>"
 

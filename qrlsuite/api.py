@@ -37,6 +37,7 @@ from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.studies import Drawn
+from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
 from qrlsuite.results import lookup, speed
 from qrlsuite.results.seeds import read_seeds
@@ -103,7 +104,8 @@ def board(
     *,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
-    rule: str = rules.DEFAULT,
+    rule: str | None = None,
+    alpha: float = ALPHA,
     horizon: int | None = None,
     entries: Sequence[str | EntryCurves] = (),
     min_seeds: int = 1,
@@ -117,7 +119,9 @@ def board(
     runs, published:
         As for `load`.
     rule:
-        What counts as significant: a name of `qrlsuite list significance-tests`.
+        What counts as significant: a name of `qrlsuite list significance-tests`; None means each task's own.
+    alpha:
+        Probability of any false decision by mean time below threshold.
     horizon:
         Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
     entries:
@@ -151,7 +155,7 @@ def board(
     folder, wanted = Path(runs), _several(tasks)
     lookup.check_tasks(folder, *wanted)
     found, left_out = collect.select(folder, wanted, entries, published, horizon, min_seeds)
-    return boards.build(found, left_out, rules.load(rule), horizon)
+    return boards.build(found, left_out, rules.load(rule) if rule else None, horizon, alpha)
 
 
 def compare(
@@ -161,7 +165,7 @@ def compare(
     task: str | None = None,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
-    rule: str = rules.DEFAULT,
+    rule: str | None = None,
 ) -> EntryComparison:
     """Say whether the first of two entries outperforms the second, cell by cell of the task's ranking grid.
 
@@ -200,7 +204,7 @@ def compare(
         entry if isinstance(entry, EntryCurves) else load(entry, task=task, runs=runs, published=published)
         for entry in (first, second)
     )
-    return boards.compare_entries(one, other, rules.load(rule))
+    return boards.compare_entries(one, other, rules.load(rule) if rule else None)
 
 
 def plot(

@@ -11,21 +11,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import qrlsuite
-from qrlsuite.leaderboard import rules
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.report import entries, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
-from qrlsuite.statistics import MIN_RUNS, SignificanceRule
+from qrlsuite.statistics import MIN_RUNS
 
 PAPER = "https://arxiv.org/abs/2501.15893"
 SCRIPTS = ("plotly-basic.min.js", "page.js", "pairs.js", "figures.js")
 LONGEST_REASON = 600
 
 
-def render(
-    board: Leaderboard, rule: SignificanceRule | None = None, title: str = "Sample complexity leaderboard"
-) -> str:
+def render(board: Leaderboard, title: str = "Sample complexity leaderboard") -> str:
     """Return a leaderboard as one self-contained HTML page.
 
     It loads nothing: style, scripts, plotly.js and the learning curves are inside, and its content security
@@ -35,12 +32,9 @@ def render(
     ----------
     board:
         As `qrlsuite.leaderboard.board.build` returns it.
-    rule:
-        The rule that judged the board; None means the registered one of that name.
     title:
         The page's heading.
     """
-    judging = rule or rules.load(board.rule)
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
@@ -61,8 +55,8 @@ def render(
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,
-            rule=judging.name,
-            promise=clean(judging.promise, LONGEST_REASON),
+            rule=board.rule,
+            promise=clean(board.promise, LONGEST_REASON),
             paper=PAPER,
             policy=_policy(scripts),
             css=Markup(_file("style.css")),

@@ -9,7 +9,7 @@ from typing import Any
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.absent import absent
 from qrlsuite.leaderboard.board import Row, Section, ranking_of
-from qrlsuite.leaderboard.report import ladder
+from qrlsuite.leaderboard.report import ladder, timed
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.report.judge import Judgement, judge
@@ -66,6 +66,7 @@ class SectionView:
     deltas: tuple[str, ...]
     unit: str
     data: dict[str, Any]
+    times: timed.TimesView
 
     @property
     def others(self) -> int:
@@ -132,6 +133,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         deltas=deltas,
         unit="thousands of environment steps" if unit == 1000 else "environment steps",
         data=_data(section, judgement, rows, bars, bar_evidence, ranking),
+        times=timed.view(section.times, entries),
     )
 
 

@@ -53,7 +53,12 @@ BUILT_IN = {
         ),
         Command("evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"),
         Command("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
-        Command("export", "Write entries to publish on a leaderboard.", f"{_ROOM}.export:export"),
+        Command(
+            "export",
+            "Write entries to publish on a leaderboard.",
+            f"{_ROOM}.export:export",
+            "qrlsuite.cli.across:SeveralTasksCommand",
+        ),
         Command("import", "Import released result files as one entry.", f"{_ROOM}.import_:import_results"),
         Command("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
         Command("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),

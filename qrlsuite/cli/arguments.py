@@ -35,11 +35,17 @@ RunsOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")
 ]
 RuleOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--rule",
         metavar="NAME",
-        help="What counts as significant: qrlsuite list significance-tests; qrlsuite show NAME.",
+        help="What counts as significant: qrlsuite list significance-tests; default: the task's, else intervals.",
+    ),
+]
+AlphaOption = Annotated[
+    float,
+    typer.Option(
+        "--alpha", metavar="P", help="Probability of any false decision by mean time, between 0 and 1."
     ),
 ]
 PublishedOption = Annotated[
@@ -47,3 +53,11 @@ PublishedOption = Annotated[
     typer.Option("--published", help="With the published entries that come with the suite."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+AcrossOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--across",
+        metavar="TASK TASK ...",
+        help="Entries that were trained on all of these tasks, over all of them.",
+    ),
+]

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
@@ -108,6 +115,14 @@ class RankingSection(_Section):
             description="environment steps at which S_hat is capped: one section of a board each",
         ),
     ]
+    rule: Annotated[
+        str | None, Field(description="significance test of its boards; the paper's where absent")
+    ] = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_rule(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out an absent rule: files stay as earlier versions wrote them, and can read them."""
+        return {name: value for name, value in write(self).items() if name != "rule" or value is not None}
 
     @model_validator(mode="after")
     def _consistent(self) -> RankingSection:
@@ -216,6 +231,11 @@ class Task:
             "score": file.score.model_dump(mode="json"),
         }
         self.hash = digest(self.definition)
+        if file.ranking.rule is not None:
+            try:
+                registry.load().get("significance_tests", file.ranking.rule)
+            except UnknownNameError as error:
+                raise TaskError(f"{source}: ranking.rule: {error}") from None
         epoch = file.protocol.interactions
         for horizon in file.ranking.horizons:
             if horizon % epoch:

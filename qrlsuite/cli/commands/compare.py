@@ -11,7 +11,7 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RuleOption, RunsOption
-from qrlsuite.leaderboard import rules, tables
+from qrlsuite.leaderboard import tables
 
 
 def compare(
@@ -21,7 +21,7 @@ def compare(
     ],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
     task: AmongOption = None,
-    rule: RuleOption = rules.DEFAULT,
+    rule: RuleOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.arguments import AcrossOption, JsonOption, RunsOption, TaskOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.leaderboard import across as several
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.export import export as write
 from qrlsuite.results import lookup
+from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted
 
 
@@ -27,6 +31,15 @@ def export(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/TASK/ENTRY/.")] = Path(
         "leaderboard/entries"
     ),
+    rliable: Annotated[
+        Path | None,
+        typer.Option(
+            "--rliable",
+            metavar="FILE",
+            help="Instead, write the scores of --across as rliable's arrays, {entry: (runs, tasks)}, to FILE.npz.",
+        ),
+    ] = None,
+    across: AcrossOption = None,
     force: Annotated[
         bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
     ] = False,
@@ -38,8 +51,15 @@ def export(
     Only finished seeds are written. `qrlsuite leaderboard verify` checks what was written, and can train some
     seeds again.
 
+    With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
+    thresholds (in [0, 1], more is better), of every entry that was trained on all tasks of --across with the same
+    options. `dict(numpy.load("FILE.npz"))` is what rliable takes.
+
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """
+    if rliable is not None or across is not None:
+        _rliable(rliable, across, task, entries or [], runs, json_output)
+        return
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
     lookup.check_tasks(runs, task)
@@ -79,3 +99,38 @@ def export(
         typer.echo(json.dumps(written))
     else:
         typer.echo(f"next: {command('leaderboard', 'verify', str(out), '--rerun', '2')}")
+
+
+def _rliable(
+    file: Path | None,
+    across: list[str] | None,
+    task: str | None,
+    names: list[str],
+    runs: Path,
+    json_output: bool,
+) -> None:
+    """Write rliable's arrays."""
+    if file is None or across is None:
+        given, missing = (
+            ("--rliable", "--across TASK TASK") if across is None else ("--across", "--rliable FILE")
+        )
+        raise OptionError(f"{given}: add {missing}")
+    if task is not None:
+        raise OptionError(f"--task {task}: --across names the tasks; leave it out")
+    if file.suffix != ".npz":
+        raise OptionError(f"--rliable {file}: the file's ending must be .npz")
+    found, refused = several.collected(runs, across, names)
+    shares = several.shares(found, across, refused=refused)
+    arrays: dict[str, Any] = shares.rliable()
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_atomically(file, content.getvalue())
+    if json_output:
+        shapes = {name: list(values.shape) for name, values in arrays.items()}
+        typer.echo(json.dumps({"file": str(file), "tasks": list(shares.tasks), "shapes": shapes}))
+        return
+    for line in shares.refused:
+        typer.echo(f"left out: {line}", err=True)
+    for name, values in arrays.items():
+        typer.echo(f"{name}: {values.shape[0]} runs, {values.shape[1]} tasks")
+    typer.echo(f"wrote {file}; in Python: scores = dict(numpy.load({str(file)!r}))")

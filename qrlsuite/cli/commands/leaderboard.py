@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,10 @@ from typing import Annotated
 import typer
 
 from qrlsuite import api
+from qrlsuite.cli.across import SeveralTasksGroup
 from qrlsuite.cli.arguments import (
+    AcrossOption,
+    AlphaOption,
     EntryOption,
     HorizonOption,
     MinSeedsOption,
@@ -22,7 +26,9 @@ from qrlsuite.cli.arguments import (
 from qrlsuite.cli.commands import verify
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard import report, rules, tables
+from qrlsuite.leaderboard import across as several
+from qrlsuite.leaderboard import latex, report, rules, tables
+from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
 
 
@@ -34,9 +40,10 @@ class Format(StrEnum):
     json = "json"
     csv = "csv"
     html = "html"
+    latex = "latex"
 
 
-app = typer.Typer(invoke_without_command=True)
+app = typer.Typer(cls=SeveralTasksGroup, invoke_without_command=True)
 app.command("verify")(verify.verify)
 
 
@@ -54,7 +61,9 @@ def leaderboard(
             "--out", metavar="FILE", help="For html; default: leaderboard.html in the results folder."
         ),
     ] = None,
-    rule: RuleOption = rules.DEFAULT,
+    rule: RuleOption = None,
+    alpha: AlphaOption = ALPHA,
+    across: AcrossOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
@@ -65,6 +74,10 @@ def leaderboard(
     until (and whenever) fewer than delta of the runs score 1 - epsilon, with its 5th to 95th percentile.
     With --published, an entry that you trained less far than the published one is shown beside it.
 
+    A second table ranks the same entries by mean time below threshold, with the differences in percent and the ranks
+    that the decided pairs leave, at one error probability for all pairs (--alpha). --across compares entries that were
+    trained on several tasks with the same options.
+
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """
     if context.invoked_subcommand is not None:
@@ -72,11 +85,15 @@ def leaderboard(
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
+    if across is not None:
+        _across(across, task, entry or [], horizon, min_seeds, format_, rule, alpha, published, runs)
+        return
     board = api.board(
         task,
         runs=runs,
         published=published,
         rule=rule,
+        alpha=alpha,
         horizon=horizon,
         entries=entry or (),
         min_seeds=min_seeds,
@@ -99,9 +116,51 @@ def leaderboard(
         typer.echo(tables.markdown(board))
     elif format_ is Format.csv:
         typer.echo(tables.csv_text(board), nl=False)
+    elif format_ is Format.latex:
+        typer.echo(latex.tables(board), nl=False)
     else:
         console = table_console(tables.WIDE)
         for section in board.sections:
             console.print(tables.section_table(section, console.width))
-    if board.rule != rules.DEFAULT and format_ not in (Format.html, Format.csv):
-        typer.echo(f"rule '{board.rule}': {board.promise}")
+            console.print(tables.times_table(section, console.width))
+    for name, promise in board.rules.items() if format_ in (Format.table, Format.markdown) else ():
+        if name != rules.DEFAULT:
+            typer.echo(f"rule '{name}': {promise}")
+
+
+def _across(
+    across: Sequence[str],
+    task: str | None,
+    entries: Sequence[str],
+    horizon: int | None,
+    min_seeds: int,
+    format_: Format,
+    rule: str | None,
+    alpha: float,
+    published: bool,
+    runs: Path,
+) -> None:
+    """Compare entries over several tasks."""
+    if format_ is Format.html:
+        raise OptionError(
+            "--across: no page shows several tasks; --format table, markdown, json, csv or latex"
+        )
+    if task is not None:
+        raise OptionError(f"--across {across[0]}: leave --task {task} out, --across names the tasks")
+    if rule is not None:
+        raise OptionError(f"--rule {rule} judges single tasks: leave it out with --across")
+    found, refused = several.collected(runs, across, entries, published, horizon, min_seeds)
+    board = several.compare(found, across, horizon, alpha, refused)
+    if format_ is Format.json:
+        typer.echo(json.dumps(board.as_dict()))
+        return
+    for line in board.refused:
+        typer.echo(f"left out: {line}", err=True)
+    if format_ is Format.table:
+        table_console(tables.WIDE).print(tables.across_table(board))
+    elif format_ is Format.markdown:
+        typer.echo(tables.across_markdown(board))
+    elif format_ is Format.latex:
+        typer.echo(latex.across_table(board), nl=False)
+    else:
+        typer.echo(tables.csv_rows(board.flat()), nl=False)

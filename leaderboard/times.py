@@ -1,0 +1,348 @@
+"""A section of a board by mean time below threshold: which pairs are decided, and which ranks that leaves.
+
+Beside the tiers of the paper's definition. `rank_by_time` computes everything once; tables, files and the page
+write what it returns. The statistics are in `qrlsuite.statistics.times_board`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
+
+ALPHA = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class TimeRow:
+    r"""One entry, ordered by M: its mean time below threshold over its runs and the grid's thresholds, in steps.
+
+    Attributes
+    ----------
+    place:
+        1 for the smallest M; None below 20 seeds.
+    place_at_half:
+        The same if all entries had ended at half the horizon.
+    ranks:
+        Best and worst rank that the decided pairs leave; None below 20 seeds.
+    at_cap:
+        Share of the times that are the horizon, over runs and thresholds: these runs never got there.
+    difference:
+        M over that of the first entry, minus 1, and its interval; None for the first, and below 20 seeds.
+    few:
+        Whether it has fewer than 50 seeds, and another ranked entry another number.
+    joined:
+        `/` where the entry is not told apart from the next, `\` from the one before, `|` from both; else empty.
+    """
+
+    entry: EntryCurves
+    place: int | None
+    place_at_half: int | None
+    ranks: tuple[int, int] | None
+    mean: MeanTime
+    at_cap: float
+    difference: tuple[float, float, float] | None
+    few: bool
+    joined: str
+
+    @property
+    def rank_text(self) -> str:
+        """`3`, `3-5` or `undecided`."""
+        if self.ranks is None:
+            return "undecided"
+        best, worst = self.ranks
+        return str(best) if best == worst else f"{best}-{worst}"
+
+    @property
+    def difference_text(self) -> str:
+        """`+12% (+8% to +17%)`, `-` where there is none."""
+        if self.difference is None:
+            return "-"
+        value, low, high = map(percent, self.difference)
+        return f"{value} ({low} to {high})"
+
+
+@dataclass(frozen=True, eq=False)
+class TimeRanking:
+    """The result of `rank_by_time`.
+
+    Attributes
+    ----------
+    board:
+        All pairs, in the order in which the entries were given.
+    rows:
+        In the order of M.
+    order:
+        Index in `board` of each row.
+    kind, levels:
+        What the grid's thresholds are, `epsilon` or `threshold`, and their values.
+    """
+
+    board: TimesBoard
+    rows: tuple[TimeRow, ...]
+    order: tuple[int, ...]
+    kind: str
+    levels: tuple[str, ...]
+
+    @property
+    def level(self) -> str:
+        """The level of every interval: `95%`."""
+        return f"{100 * (1 - self.board.alpha):g}%"
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs that were tested, and over which Holm's procedure goes."""
+        ranked = sum(row.ranks is not None for row in self.rows)
+        return ranked * (ranked - 1) // 2
+
+    @property
+    def n_decided(self) -> int:
+        """Pairs of them that are decided, trade-offs among them."""
+        return sum(decided(self.board.directions[i][j]) for i, j in self._pairs())
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the heads of the table that `cells` fills."""
+        return (
+            "rank",
+            "",
+            "entry",
+            "seeds",
+            f"M ({self.level})",
+            "at cap",
+            "at half",
+            f"above the first ({self.level})",
+        )
+
+    def cells(self, row: TimeRow) -> tuple[str, ...]:
+        """Return a row as text."""
+        low, high = row.mean.interval
+        return (
+            row.rank_text,
+            row.joined,
+            row.entry.label,
+            f"{len(row.entry.seeds)}{'!' * row.few}",
+            f"{thousands(row.mean.mean)} ({thousands(low)} to {thousands(high)})",
+            f"{row.at_cap:.0%}",
+            "-" if row.place_at_half is None else str(row.place_at_half),
+            row.difference_text,
+        )
+
+    def trade_offs(self) -> list[str]:
+        """Name every pair of which each needs fewer steps at some threshold."""
+        return [
+            f"trade-off: {self._label(i)} needs fewer steps at {self._thresholds(i, j)}; "
+            f"{self._label(j)} at {self._thresholds(j, i)}"
+            for i, j in self._pairs()
+            if self.board.directions[i][j] is Direction.TRADE_OFF
+        ]
+
+    def against_the_order(self) -> list[str]:
+        """Name every decided pair whose better entry has the larger M."""
+        return [
+            f"against the order of M: {self._label(j)} needs significantly fewer steps than {self._label(i)} at "
+            f"{self._thresholds(j, i) or 'a threshold'}, and more at others, not significantly"
+            for i, j in self._pairs()
+            if self.board.directions[i][j] is Direction.MORE
+        ]
+
+    def notes(self) -> list[str]:
+        """Explain the columns, and the marks that occur."""
+        lines = [
+            "M: environment steps that a run spends below threshold, mean over seeds and the task's thresholds; "
+            "a run that never gets there counts with the horizon",
+            f"rank: what the decided pairs leave ({self.n_decided} of {self.n_pairs}: rule 'times', Holm over all "
+            f"pairs, error {self.board.alpha:g}); intervals: of each entry or pair by itself",
+            "at cap: share of the seeds that never get there, mean over thresholds; at half: place by M at half the "
+            "horizon",
+        ]
+        if any(row.joined for row in self.rows):
+            lines.append(
+                "/ | \\ join neighbors that are not told apart, which does not mean that they are equal"
+            )
+        lines += self.trade_offs() + self.against_the_order()
+        if any(row.few for row in self.rows):
+            lines.append("! fewer than 50 seeds against another number: errors are likelier than alpha says")
+        if any(row.ranks is None for row in self.rows):
+            lines.append(f"undecided: fewer than {MIN_RUNS} seeds")
+        return lines
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
+        order = list(self.order)
+        return {
+            "alpha": self.board.alpha,
+            "level": 1 - self.board.alpha,
+            self.kind: [float(level) for level in self.levels],
+            "pairs": self.n_pairs,
+            "decided": self.n_decided,
+            "entries": [self.row_dict(row) for row in self.rows],
+            "adjusted_p": [[_number(self.board.adjusted[i, j]) for j in order] for i in order],
+            "verdicts": [
+                [None if i == j else str(self.board.directions[i][j]) for j in order] for i in order
+            ],
+            "difference": [[_number(self.board.difference[i, j]) for j in order] for i in order],
+            "difference_interval": [
+                [[_number(end) for end in self.board.difference_interval[i, j]] for j in order] for i in order
+            ],
+            "unequal_and_few": [[bool(self.board.few[i, j]) for j in order] for i in order],
+            "trade_offs": self.trade_offs(),
+            "against_the_order": self.against_the_order(),
+        }
+
+    def row_dict(self, row: TimeRow) -> dict[str, Any]:
+        """Return one entry's plain values."""
+        index = self.rows.index(row)
+        following = self.rows[index + 1] if index + 1 < len(self.rows) else None
+        apart = None
+        if row.ranks is not None and following is not None and following.ranks is not None:
+            apart = self.board.neighbors_told_apart[index]
+        return {
+            "entry": row.entry.name,
+            "place": row.place,
+            "place_at_half": row.place_at_half,
+            "ranks": None if row.ranks is None else list(row.ranks),
+            "mean_time": row.mean.mean,
+            "interval": list(row.mean.interval),
+            "mean_time_at_half": row.mean.half,
+            "at_cap": row.at_cap,
+            "at_cap_by_threshold": [float(share) for share in row.mean.at_cap],
+            "difference_to_first": None if row.difference is None else row.difference[0],
+            "difference_interval": None if row.difference is None else list(row.difference[1:]),
+            "told_apart_from_next": apart,
+            "few_and_unequal": row.few,
+        }
+
+    def flat(self, entry: EntryCurves) -> dict[str, object]:
+        """Return the columns of one entry for a spreadsheet; p of pairs as `entry: p; ...` under the entry's name."""
+        row = next(row for row in self.rows if row.entry is entry)
+        i = self.order[self.rows.index(row)]
+        low, high = row.mean.interval
+        difference = row.difference or (None, None, None)
+        names = self.board.names
+        return {
+            "time_rank_best": None if row.ranks is None else row.ranks[0],
+            "time_rank_worst": None if row.ranks is None else row.ranks[1],
+            "time_place": row.place,
+            "time_place_at_half": row.place_at_half,
+            "mean_time": row.mean.mean,
+            "mean_time_low": low,
+            "mean_time_high": high,
+            "times_at_cap": row.at_cap,
+            "times_few_and_unequal": row.few,
+            "difference_to_first": difference[0],
+            "difference_low": difference[1],
+            "difference_high": difference[2],
+            "adjusted_p": [
+                f"{names[j]}: {self.board.adjusted[i, j]:.6g}"
+                for j in self.order
+                if not math.isnan(self.board.adjusted[i, j])
+            ],
+            "trade_offs": [
+                names[j] for j in self.order if self.board.directions[i][j] is Direction.TRADE_OFF
+            ],
+            "alpha": self.board.alpha,
+        }
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """All pairs, the one with the smaller M first."""
+        return [(i, j) for place, i in enumerate(self.order) for j in self.order[place + 1 :]]
+
+    def _thresholds(self, i: int, j: int) -> str:
+        """Name the thresholds at which an entry needs significantly fewer steps than another."""
+        levels = [level for level, found in zip(self.levels, self.board.signs[i, j]) if found > 0]
+        return f"{self.kind} {', '.join(levels)}" if levels else ""
+
+    def _label(self, index: int) -> str:
+        return self.rows[self.order.index(index)].entry.label
+
+
+def rank_by_time(
+    entries: Sequence[EntryCurves], grid: Grid, horizon: int, alpha: float = ALPHA
+) -> TimeRanking:
+    """Rank the entries of a section by mean time below threshold.
+
+    Parameters
+    ----------
+    entries:
+        All of one task, all reaching the horizon.
+    grid:
+        The task's; its deltas do not count.
+    horizon:
+        Environment steps at which all are cut.
+    alpha:
+        In (0, 1): probability of any false decision among entries of equal laws; intervals have level 1 - alpha.
+
+    Raises
+    ------
+    OptionError
+        As `qrlsuite.statistics.times_board`.
+    """
+    curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
+    board = times_board(curves, grid, alpha, horizon)
+    ranked = [index for index in board.order if board.n_runs[index] >= MIN_RUNS]
+    at_half = [index for index in board.order_at_half if index in ranked]
+    rows = []
+    for place, index in enumerate(board.order):
+        known = index in ranked
+        difference = None
+        if known and place and not math.isnan(board.difference[index, ranked[0]]):
+            low, high = board.difference_interval[index, ranked[0]]
+            difference = (float(board.difference[index, ranked[0]]), float(low), float(high))
+        best, worst = board.ranks[index].tolist()
+        rows.append(
+            TimeRow(
+                entry=entries[index],
+                place=place + 1 if known else None,
+                place_at_half=at_half.index(index) + 1 if known else None,
+                ranks=(best, worst) if known else None,
+                mean=board.means[index],
+                at_cap=float(board.means[index].at_cap.mean()),
+                difference=difference,
+                few=known
+                and any(
+                    board.few[index, other] and board.n_runs[index] < board.n_runs[other] for other in ranked
+                ),
+                joined=_joined(board, ranked, place) if known else "",
+            )
+        )
+    return TimeRanking(
+        board, tuple(rows), board.order, grid.level_name, tuple(f"{float(level):g}" for level in grid.levels)
+    )
+
+
+def _joined(board: TimesBoard, ranked: Sequence[int], place: int) -> str:
+    apart = board.neighbors_told_apart
+    before = place > 0 and not apart[place - 1]
+    after = place + 1 < len(ranked) and not apart[place]
+    return {(False, True): "/", (True, True): "|", (True, False): "\\"}.get((before, after), "")
+
+
+def decided(direction: Direction) -> bool:
+    """Return whether a pair is told apart, be it by a trade-off."""
+    return direction in (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
+
+
+def percent(share: float) -> str:
+    """Write a difference: `+12%`, `-3.4%`."""
+    value = 100 * share
+    return f"{value:+.0f}%" if abs(value) >= 9.95 else f"{value:+.1f}%"
+
+
+def thousands(steps: float) -> str:
+    """Write a mean number of steps: `58.2k`, `812`."""
+    return f"{steps / 1000:.1f}k" if steps >= 1000 else f"{steps:.0f}"
+
+
+def p_text(p: float) -> str:
+    """Write a p value: `0.021`, `<.001`; empty where there is none."""
+    if math.isnan(p):
+        return ""
+    return "<.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

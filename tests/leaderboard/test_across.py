@@ -1,0 +1,199 @@
+"""Several tasks at once: which entries are one configuration, what is printed of them, and rliable's arrays."""
+
+from __future__ import annotations
+
+import csv
+import doctest
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from qrlsuite.cli import across as words
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import across, latex
+from qrlsuite.leaderboard.curves import EntryCurves
+from tests.conftest import POLE, TINY
+from tests.leaderboard import boards
+
+TASKS = ("beam6g", "cartpole")
+
+
+def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) -> EntryCurves:
+    """Runs that score 0, and 1 from an epoch on."""
+    entry = boards.entry(label, len(epochs_below), 500 if task == "cartpole" else 100, task=task)
+    curves = np.ones(entry.curves.shape)
+    for run, epoch in enumerate(epochs_below):
+        curves[run, :epoch] = 0
+    return replace(entry, curves=curves, identity={**entry.identity, **identity})
+
+
+def both(label: str, share: float, seeds: int = 20) -> list[EntryCurves]:
+    """Below threshold for a share of the horizon of both tasks; every second run a twentieth longer."""
+    return [
+        runs_of(label, "beam6g", [round(100 * share) + 5 * (i % 2) for i in range(seeds)]),
+        runs_of(label, "cartpole", [round(500 * share) + 25 * (i % 2) for i in range(seeds)]),
+    ]
+
+
+def test_shares_means_and_decided_pairs_by_hand() -> None:
+    board = across.compare([*both("slow", 0.6), *both("quick", 0.2)], TASKS)
+    assert board.shares.horizons == (200_000, 500_000)
+    assert [board.found.names[i] for i in board.order] == ["quick", "slow"]
+    assert board.found.mean[list(board.order)] == pytest.approx([0.225, 0.625])
+    assert board.found.interquartile_mean[list(board.order)] == pytest.approx([0.225, 0.625])
+    assert board.cells(0)[4:] == ("1.00", "slow", "-")
+    assert board.cells(1)[4:] == ("-", "-", "quick")
+    assert board.cells(0)[2].startswith("0.225 (0.2")
+    told = json.loads(json.dumps(board.as_dict(), allow_nan=False))
+    assert [row["label"] for row in told["entries"]] == ["quick", "slow"]
+    assert told["better"] == [[0, 1], [-1, 0]]
+    assert told["improvement"] == [[0.5, 1.0], [0.0, 0.5]]
+    (first, _) = board.flat()
+    assert (first["needs_less_than"], first["needs_more_than"]) == (["slow"], [])
+
+
+def test_a_configuration_is_algorithm_model_and_options() -> None:
+    one, other = both("same", 0.2)
+    assert across.configuration(one) == across.configuration(other)
+    options = {"algorithm_options": {"gamma": 0.9}}
+    assert across.configuration(runs_of("same", "beam6g", [1], **options)) != across.configuration(one)
+    mixed = [one, runs_of("same", "cartpole", [1] * 20, **options)]
+    board = across.compare([*both("quick", 0.2), *mixed], TASKS)
+    assert board.found.names == ("quick",)
+    assert {line.partition(":")[2] for line in board.refused} == {
+        " no result with these options on cartpole",
+        " no result with these options on beam6g",
+    }
+    with pytest.raises(OptionError, match="no entry has 20 seeds or more with the same algorithm, model and"):
+        across.compare(mixed, TASKS)
+
+
+def test_what_is_left_out_says_why() -> None:
+    short = replace(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 100)))
+    entries = [*both("quick", 0.2), *both("few", 0.2, 19), runs_of("short", "beam6g", [1] * 20), short]
+    board = across.compare(entries, TASKS)
+    assert "cartpole: short: ends at 100000 of 500000 steps" in board.refused
+    assert "few: 19 seeds on beam6g, fewer than 20: undecided" in board.refused
+    cut = across.compare(entries, TASKS, horizon=100_000)
+    assert set(cut.found.names) == {"quick", "short"}
+    assert cut.shares.horizons == (100_000, 100_000)
+    with pytest.raises(OptionError, match=r"alpha = 1.5 is outside \(0, 1\)"):
+        across.compare(entries, TASKS, alpha=1.5)
+
+
+def test_latex_of_several_tasks() -> None:
+    text = latex.across_table(across.compare([*both("a & b", 0.2), *both("c_d", 0.6)], TASKS))
+    assert r"a \& b" in text
+    assert r"c\_d" in text
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert {line.count(" & ") for line in rows} == {6}
+
+
+def test_rliables_arrays_are_shares_at_or_above_threshold() -> None:
+    made = across.shares([*both("quick", 0.2), *both("slow", 0.6, 30)], TASKS)
+    arrays = made.rliable()
+    assert {name: values.shape for name, values in arrays.items()} == {"quick": (20, 2), "slow": (30, 2)}
+    assert arrays["quick"][:2] == pytest.approx(np.array([[0.8, 0.8], [0.75, 0.75]]))
+
+
+def test_rliable_says_the_same() -> None:
+    metrics = pytest.importorskip("rliable.metrics", reason="needs rliable: pip install rliable")
+    generator = np.random.default_rng(0)
+    entries = []
+    for label, shift in (("one", 10), ("two", 20)):
+        entries.append(runs_of(label, "beam6g", (shift + generator.integers(0, 40, 25)).tolist()))
+        entries.append(runs_of(label, "cartpole", (5 * shift + generator.integers(0, 200, 25)).tolist()))
+    board = across.compare(entries, TASKS)
+    arrays = board.shares.rliable()
+    for index, name in enumerate(board.found.names):
+        assert 1 - metrics.aggregate_mean(arrays[name]) == pytest.approx(board.found.mean[index])
+        assert 1 - metrics.aggregate_iqm(arrays[name]) == pytest.approx(board.found.interquartile_mean[index])
+    one, two = (board.found.names.index(name) for name in ("one", "two"))
+    improvement = metrics.probability_of_improvement(arrays["one"], arrays["two"])
+    assert improvement == pytest.approx(board.found.improvement[one, two])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty seeds of two epochs of two models on two tasks, and of a third model on one."""
+    folder = tmp_path_factory.mktemp("several")
+    for name, text in (("tiny", TINY), ("pole", POLE)):
+        (folder / f"{name}.toml").write_text(text.replace("[180]", "[120]"))
+    for name, width in (("tiny", 4), ("pole", 4), ("tiny", 8), ("pole", 8), ("tiny", 6)):
+        done = qrlsuite(
+            folder / "runs",
+            *("run", "--task", str(folder / f"{name}.toml"), "--algorithm", "ddqn", "--model", "mlp"),
+            *("--set", f"width={width}", "--seeds", "20", "--epochs", "2"),
+        )
+        assert done.exit_code == 0, done.output
+    return folder / "runs"
+
+
+def qrlsuite(runs: Path, *given: str) -> Result:
+    return CliRunner().invoke(build(), [*given, "--runs", str(runs)])
+
+
+def test_the_commands_on_stored_runs(trained: Path, tmp_path: Path) -> None:
+    board = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", "json")
+    told = json.loads(board.stdout)
+    assert [each["task"] for each in told["tasks"]] == ["tiny", "pole"]
+    assert {row["label"] for row in told["entries"]} == {"ddqn mlp width=4", "ddqn mlp width=8"}
+    assert told["refused"] == ["ddqn mlp width=6: no result with these options on pole"]
+    for format_, mark in (("table", "IQM (95%)"), ("markdown", "| entry | seeds |"), ("latex", r"\toprule")):
+        result = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", format_)
+        assert mark in result.stdout
+        assert "left out: ddqn mlp width=6" in result.stderr
+    written = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", "csv").stdout
+    rows = list(csv.DictReader(io.StringIO(written)))
+    assert [float(row["mean"]) for row in rows] == [row["mean"] for row in told["entries"]]
+
+    file = tmp_path / "scores.npz"
+    result = qrlsuite(trained, "export", "--rliable", str(file), "--across", "tiny", "pole")
+    assert result.exit_code == 0, result.output
+    with np.load(file, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    assert {name: values.shape for name, values in arrays.items()} == {
+        "ddqn mlp width=4": (20, 2),
+        "ddqn mlp width=8": (20, 2),
+    }
+    for row in told["entries"]:
+        assert 1 - arrays[row["label"]].mean() == pytest.approx(row["mean"])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["leaderboard", "--across", "tiny"], "name two tasks or more"),
+        (["leaderboard", "--across", "tiny", "tiny"], "task tiny is named twice"),
+        (["leaderboard", "--across", "tiny", "pola"], "unknown task 'pola'; did you mean 'pole'"),
+        (["leaderboard", "--across", "tiny", "cartpole"], "holds no results of task cartpole"),
+        (["leaderboard", "--across", "tiny", "pole", "--format", "html"], "no page shows several tasks"),
+        (["leaderboard", "--across", "tiny", "pole", "--rule", "times"], "judges single tasks"),
+        (["leaderboard", "--across", "tiny", "pole", "--task", "tiny"], "leave --task tiny out"),
+        (["leaderboard", "--across", "tiny", "pole", "--alpha", "0"], "alpha = 0.0 is outside (0, 1)"),
+        (["leaderboard", "--across", "tiny", "pole", "--horizon", "60", "--entry", "mlp width=9"], "width=9"),
+        (["export", "--rliable", "a.npz"], "--rliable: add --across TASK TASK"),
+        (["export", "--across", "tiny", "pole"], "--across: add --rliable FILE"),
+        (["export", "--rliable", "a.csv", "--across", "tiny", "pole"], "must be .npz"),
+    ],
+)
+def test_wrong_input_says_what_to_type(given: list[str], message: str, trained: Path) -> None:
+    result = qrlsuite(trained, *given)
+    assert result.exception is not None
+    assert message in str(result.exception)
+    assert "\n" not in str(result.exception)
+
+
+def test_words_up_to_the_next_option_belong_to_it() -> None:
+    assert doctest.testmod(words).failed == 0
+    assert words.spread(["--across", "a", "b", "c"]) == ["--across", "a", "--across", "b", "--across", "c"]
+    assert words.spread(["x", "--across", "a", "--across", "b", "c", "-h"]) == [
+        *("x", "--across", "a", "--across", "b", "--across", "c", "-h"),
+    ]
