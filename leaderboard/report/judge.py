@@ -103,5 +103,5 @@ def judge(section: Section) -> Judgement:
 def _cells(board: Board, first: int, second: int) -> str:
     signs = board.signs[first, second].astype(np.int64)
     if not board.decided[first, second]:
-        return SYMBOLS[3] * signs.size
+        return SYMBOLS[3] * int(signs.size)
     return "".join(SYMBOLS[int(code)] for code in np.where(board.capped[first, second], 2, signs).ravel())
