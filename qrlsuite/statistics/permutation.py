@@ -44,9 +44,25 @@ Blocks = tuple[tuple[int, int], ...]
 """Runs of the first and the second entry in each block within which labels are exchanged."""
 
 
+MOST = 10_000_000
+"""Relabelings that take minutes for a board: a level that needs more is refused."""
+
+
 def relabelings_for(level: float) -> int:
-    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands."""
-    return CHUNK * max(1, math.ceil(20 / check_probability(level, "level") / CHUNK))
+    """Return how many relabelings decide at a level: 20 / level, 10,000 or more, in whole ten thousands.
+
+    Raises
+    ------
+    OptionError
+        If the level is outside (0, 1), or needs more than `MOST`.
+    """
+    wanted = 20 / check_probability(level, "level")
+    if wanted > MOST:
+        raise OptionError(
+            f"a level of {level:.2g} for each test takes {wanted:.2g} relabelings, more than {MOST:,}: "
+            "choose a larger alpha, or fewer entries"
+        )
+    return CHUNK * max(1, math.ceil(wanted / CHUNK))
 
 
 @functools.lru_cache(maxsize=12)  # all pairs of equal sizes share their relabelings

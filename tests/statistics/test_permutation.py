@@ -148,6 +148,13 @@ def test_equal_keys_do_not_change_the_number_of_labels() -> None:
     assert smallest(keys, 2).tolist() == [[False, True, True, False], [False, False, True, True]]
 
 
+def test_a_level_that_would_take_hours_is_refused() -> None:
+    with pytest.raises(
+        OptionError, match=r"a level of 1e-07 for each test takes 2e\+08 relabelings.*larger alpha"
+    ):
+        relabelings_for(1e-7)
+
+
 def test_twenty_over_the_level_and_ten_thousand_or_more() -> None:
     assert [relabelings_for(level) for level in (0.5, 0.05, 0.002, 0.0019)] == [
         CHUNK,
