@@ -67,7 +67,7 @@ class PlanFile(_Section):
 
     format_version: Literal[1]
     name: Annotated[
-        str, Field(pattern=specs.NAME.pattern, max_length=64, description="of the results' folder")
+        str, Field(pattern=f"^(?:{specs.NAME.pattern})$", max_length=64, description="of the results' folder")
     ]
     written: AwareDatetime
     task: Annotated[str, Field(min_length=1)]
