@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
 from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.worker import train_group
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.specs import EngineSpec
 from tests.conftest import HANGS, TINY, Hold, results
@@ -288,7 +290,7 @@ def test_a_changed_plan_is_refused_once_it_began(refused: Refused) -> None:
         )
 
 
-def test_seeds_of_others_are_refused(refused: Refused, train: Callable[..., Path]) -> None:
+def test_seeds_of_others_are_refused(refused: Refused) -> None:
     write("mlp width=16", "mlp width=4", "--epochs", "1")
     subject = EntryStore.create(Path("runs"), _entry("width=4"))
     put(subject, 10003, 1, 1)
@@ -317,6 +319,21 @@ def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:
     message = refused("status", "widths.toml")
     assert "the look at 20 seeds found 'first needs fewer' for mlp width=16 and mlp width=4" in message
     assert "now give 'None'" in message
+
+
+def test_every_record_of_a_seed_has_the_hash_of_its_plan() -> None:
+    entry = _entry("width=4")
+    for runs, subject in (("planned", replace(entry, plan="ab" * 8)), ("runs", entry)):
+        store = EntryStore.create(Path(runs), subject)
+        train_group(store.path, [0], 1)
+        expected = {"plan": "ab" * 8} if runs == "planned" else {}
+        record = json.loads((store.seed(0).path / "run.json").read_text())
+        assert {key: value for key, value in record.items() if key == "plan"} == expected
+        assert (subject.hash, subject.name) == (entry.hash, entry.name)
+    planned, plain = (
+        EntryStore(Path(runs) / "tiny" / entry.name).seed(0).path for runs in ("planned", "runs")
+    )
+    assert (planned / "epochs.parquet").read_bytes() == (plain / "epochs.parquet").read_bytes()
 
 
 def _entry(setting: str) -> Any:
