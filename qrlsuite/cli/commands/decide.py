@@ -256,7 +256,7 @@ def _hours(study: DecisionStudy, name: str, seeds: int) -> float | None:
     done = len(study.seeds(name))
     if done:
         return seeds * study.hours(name) / done
-    found = speed.known(study.folder, study.runs).estimate(study.entries[name])
+    found = speed.known(study.folder, study.runs).estimate(study.entries[name], None)
     return None if found.seconds is None else seeds * study.file.epochs * found.seconds / 3600
 
 

@@ -105,13 +105,13 @@ def _core_hours(
     total, bases = 0.0, []
     for entry, learned in ((found[0], curves[0]), (found[-1], curves[-1])):
         try:
-            estimate = speeds.estimate(EntryStore(entry.folder).entry())
+            estimate = speeds.estimate(EntryStore(entry.folder).entry(), None)
         except StoreError:  # imported curves, or an entry of another version
             return None, BASES["unknown"]
         if estimate.seconds is None:
             return None, BASES["unknown"]
         total += estimate.seconds * learned.values.shape[1] / 3600
-        bases.append(BASES[estimate.basis])
+        bases.append(f"{BASES[estimate.basis]}, to within a factor of {estimate.within:.3g}")
     return total, "; ".join(dict.fromkeys(bases))
 
 
