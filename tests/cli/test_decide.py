@@ -336,6 +336,17 @@ def test_every_record_of_a_seed_has_the_hash_of_its_plan() -> None:
     assert (planned / "epochs.parquet").read_bytes() == (plain / "epochs.parquet").read_bytes()
 
 
+def test_no_rule_for_a_fixed_number_of_seeds_judges_a_plans_entries() -> None:
+    write()
+    say("run", "widths.toml", "--engine", "scripted")
+    where = ("--runs", "runs/decisions/widths")
+    ranked = CliRunner().invoke(build(), ["leaderboard", *where, "--format", "json"])
+    assert json.loads(ranked.stdout)["sections"] == []
+    assert ranked.output.count("trained by a decision plan") == 3
+    compared = CliRunner().invoke(build(), ["compare", "mlp width=16", "mlp width=4", *where])
+    assert "'ddqn mlp width=16' was trained by a decision plan" in str(compared.exception)
+
+
 def _entry(setting: str) -> Any:
     from qrlsuite.experiment.entry import resolve
     from qrlsuite.options import parse_setting
@@ -397,7 +408,7 @@ def test_wrong_input_is_refused_in_one_line(words: tuple[str, ...], message: str
 def test_a_wrong_plan_file_is_refused_in_one_line(old: str, new: str, message: str, refused: Refused) -> None:
     write("mlp width=16", "mlp width=4", plan="p.toml")
     edit("p.toml", old, new)
-    assert message in refused("run", "p.toml")
+    assert message in refused("status", "p.toml")
 
 
 def test_looks_below_20_seeds_are_marked() -> None:
