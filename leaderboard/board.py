@@ -220,6 +220,12 @@ def learning_curves(entry: EntryCurves) -> LearningCurves:
     return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
 
 
+_PLANNED = (
+    "trained by a decision plan, which stops by what the seeds show, so that no rule for a fixed number of seeds "
+    "applies; `qrlsuite decide status` has its verdicts"
+)
+
+
 def build(
     entries: Sequence[EntryCurves],
     refused: Sequence[str] = (),
@@ -229,7 +235,8 @@ def build(
 ) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
-    Entries of one task that were made under another definition of it are refused: the majority's stands.
+    Entries of one task that were made under another definition of it are refused: the majority's stands. So are those
+    of a decision plan, whose number of seeds depends on what they showed.
 
     Parameters
     ----------
@@ -254,9 +261,10 @@ def build(
     """
     check_probability(alpha, "alpha")
     sections: list[Section] = []
-    problems = list(refused)
-    for task in sorted({entry.task for entry in entries}):
-        members = [entry for entry in entries if entry.task == task]
+    problems = list(refused) + [f"{entry.folder}: {_PLANNED}" for entry in entries if entry.plan]
+    fixed = [entry for entry in entries if not entry.plan]
+    for task in sorted({entry.task for entry in fixed}):
+        members = [entry for entry in fixed if entry.task == task]
         hashes = [entry.task_hash for entry in members]
         definition = max(sorted(set(hashes)), key=hashes.count)
         good = [entry for entry in members if entry.task_hash == definition]
@@ -428,14 +436,17 @@ def compare_entries(
     Raises
     ------
     QrlSuiteError
-        If they belong to different tasks, their lengths have no common horizon, or a paired rule finds no
-        common seed.
+        If they belong to different tasks, one was trained by a decision plan, their lengths have no common horizon,
+        or a paired rule finds no common seed.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
+    for entry in (first, second):
+        if entry.plan:
+            raise QrlSuiteError(f"'{entry.label}' was {_PLANNED}")
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     rule = rule or rule_of([first, second])

@@ -284,6 +284,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         processors=origin.texts(provenance, "processor"),
         devices=origin.devices(provenance),
         tuning=record["tuning"],
+        plan=record.get("plan"),
         executions=sum(run.executions for run in runs),
         records={
             run.seed: {

@@ -56,6 +56,8 @@ class EntryCurves:
         Circuit executions of these runs in all.
     tuning:
         How the settings were found, where their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
+    plan:
+        Hash of the decision plan that trained it; None for a number of seeds that was fixed in advance.
     source:
         Whether the curves were read from a results folder or from a published entry.
     color:
@@ -87,6 +89,7 @@ class EntryCurves:
     devices: tuple[str, ...] = ()
     executions: int = 0
     tuning: Mapping[str, Any] | None = None
+    plan: str | None = None
     source: Literal["runs", "published"] = "runs"
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     color: int | None = None

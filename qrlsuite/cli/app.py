@@ -65,6 +65,8 @@ BUILT_IN = {
         Command("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
         Command("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
         Command("study", "Run a paper's experiments by name.", f"{_ROOM}.study:app"),
+        Command("decide", "Compare entries with as many seeds as it takes.", f"{_ROOM}.decide:app"),
+        Command("power", "Say how many seeds find a difference.", f"{_ROOM}.power:power"),
         Command("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
     )
 }

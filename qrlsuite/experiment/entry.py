@@ -31,6 +31,8 @@ class Entry:
         The preset that supplied defaults; not part of the identity, its values are.
     tuning:
         How the settings were found, where their preset says so; not part of the identity either.
+    plan:
+        Hash of the decision plan that trains it, where one does; not part of the identity either.
     """
 
     task: Task
@@ -40,6 +42,7 @@ class Entry:
     model_options: Any
     preset: str | None
     tuning: dict[str, Any] | None = field(default=None, compare=False)
+    plan: str | None = field(default=None, compare=False)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -101,12 +104,14 @@ class Entry:
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
         tuned = {} if self.tuning is None else {"tuning": self.tuning}
+        planned = {} if self.plan is None else {"plan": self.plan}
         return {
             "name": self.name,
             "hash": self.hash,
             "label": self.label,
             "preset": self.preset,
             **tuned,
+            **planned,
             "task_name": self.task.name,
             "task_hash": self.task.hash,
             "task_file": self.task.file.model_dump(mode="json", exclude={"tuning"}),
@@ -256,6 +261,7 @@ def from_record(record: Mapping[str, Any], source: str) -> Entry:
         model_options=options.build(specs.resolve(model.options), values[1], source),
         preset=preset,
         tuning=record.get("tuning"),
+        plan=record.get("plan"),
     )
     if entry.hash != expected:
         raise StoreError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.calibration import SmoothedRuns, draw_times, judge_times, play, slower
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Grid, IntArray, whole
-from qrlsuite.statistics.sequential import Decided, DecisionPlan, Spending
+from qrlsuite.statistics.sequential import Decided, Decision, DecisionPlan, PairDecision, Spending
 from qrlsuite.statistics.times import check_probability
 
 LADDER = (20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400)
@@ -104,6 +105,32 @@ def runs_to_detect(pilot: SmoothedRuns, grid: Grid, slower_by: float, **options:
     """
     other = SmoothedRuns(slower(pilot.entry, 1 + slower_by), pilot.jitter, pilot.bounds)
     return runs_needed(pilot, other, grid, **options)  # type: ignore[arg-type]  # checked there
+
+
+def runs_at_difference(decision: Decision, pair: PairDecision, power: float = 0.8) -> int | None:
+    """Return about how many runs would find an open pair's present difference with a power, if it is real.
+
+    By the normal approximation of the log ratio of mean times, at the level of the pair's next look: a rule of thumb,
+    for the present difference is an estimate itself. None before the pair's first look, or where its difference is 0
+    or has no standard error.
+
+    Raises
+    ------
+    OptionError
+        If the power is not between 0 and 1.
+    """
+    check_probability(power, "power")
+    plan, normal = decision.plan, NormalDist()
+    if not pair.p or not math.isfinite(pair.interval[1]) or pair.difference == 0:
+        return None
+    look = len(pair.p) - 1
+    ratio = math.log1p(pair.difference)
+    width = math.log1p(pair.interval[1]) - ratio
+    error = width / -normal.inv_cdf(plan.level(look, len(plan.family)) / 2)
+    undecided = sum(not each.differs for each in decision.pairs)
+    level = plan.level(min(look + 1, len(plan.looks) - 1), undecided)
+    factor = (normal.inv_cdf(power) - normal.inv_cdf(level / 2)) * error / ratio
+    return math.ceil(pair.n_runs * factor**2)
 
 
 def _fixed(drawn: Sequence[IntArray], powers: Sequence[float], alpha: float, most: int) -> list[int | None]:

@@ -202,16 +202,17 @@ def _listed(words: str | list[str]) -> list[str]:
     return [words] if isinstance(words, str) else words
 
 
-def _setting(key: str, word: str, value: Any) -> Setting:
+def setting(key: str, word: str, value: Any) -> Setting:
+    """Return what `NAME = VALUE` or `"SIDE.NAME" = VALUE` in a file's table `key` sets."""
     side, dot, name = word.rpartition(".")
     return Setting(side if dot else None, name, value, f"{key}.")
 
 
 def _drafts(group: EntriesSection) -> Iterator[_Draft]:
-    fixed = [_setting("options", word, value) for word, value in group.options.items()]
+    fixed = [setting("options", word, value) for word, value in group.options.items()]
     for task, model in itertools.product(_listed(group.task), _listed(group.model)):
         for values in itertools.product(*group.grid.values()):
-            varied = [_setting("grid", word, value) for word, value in zip(group.grid, values)]
+            varied = [setting("grid", word, value) for word, value in zip(group.grid, values)]
             yield _Draft(task, model, (*fixed, *varied))
 
 

@@ -138,7 +138,9 @@ class GroupRun:
             self.events.send("run_started", run={**record, "folder": str(folder.path)})
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
+        planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
         return {
+            **planned,
             "task": self.entry.task.name,
             "task_hash": self.entry.task.hash,
             "entry": self.entry.name,

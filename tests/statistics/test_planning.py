@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import doctest
 import math
+from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from qrlsuite.statistics import (
     times_rates,
 )
 from qrlsuite.statistics.calibration import draw_times, judge_times
+from qrlsuite.statistics.sequential import Decision, PairDecision
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))
@@ -87,3 +90,17 @@ def test_bad_arguments_are_named() -> None:
         runs_needed(PILOT, PILOT, SURFACE, powers=(1,))
     with pytest.raises(OptionError, match="most = 10"):
         runs_needed(PILOT, PILOT, SURFACE, most=10)
+
+
+def test_runs_that_the_present_difference_needs() -> None:
+    """A ratio of z / sqrt(2) standard errors at 20 runs is z standard errors at 40: found there in half of cases."""
+    plan = DecisionPlan(("a", "b"))
+    now, following = (NormalDist().inv_cdf(1 - plan.level(look, 1) / 2) for look in (0, 1))
+    ratio = 0.1 * following / math.sqrt(2)
+    interval = (math.expm1(ratio - 0.1 * now), math.expm1(ratio + 0.1 * now))
+    pair = PairDecision("a", "b", None, 20, (0.1,), (0.0147,), math.expm1(ratio), interval)
+    decision = Decision(plan, (pair,), {"a": 40, "b": 40})
+    assert abs((planning.runs_at_difference(decision, pair, power=0.5) or 0) - 40) <= 1
+    assert (planning.runs_at_difference(decision, pair) or 0) > 60, "more power needs more"
+    assert planning.runs_at_difference(decision, replace(pair, p=())) is None
+    assert planning.runs_at_difference(decision, replace(pair, difference=0.0)) is None
