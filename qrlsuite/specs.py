@@ -14,6 +14,8 @@ from typing import Any, Literal
 from qrlsuite.errors import PluginError
 
 NAME = re.compile(r"[a-z][a-z0-9]*(?:[-_.][a-z0-9]+)*")
+WHOLE_NAME = f"^(?:{NAME.pattern})$"
+"""The same for pydantic, whose patterns match anywhere in a text."""
 """Names are lower case, digits, and single hyphens, underscores or dots: safe in a path and on a command line."""
 
 

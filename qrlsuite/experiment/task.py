@@ -158,7 +158,7 @@ class TaskFile(_Section):
     """A whole task file."""
 
     format_version: Literal[1]
-    name: Annotated[str, Field(pattern=specs.NAME.pattern, max_length=64)]
+    name: Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]
     summary: Annotated[str, Field(min_length=1)]
     description: str = ""
     environment: EnvironmentSection

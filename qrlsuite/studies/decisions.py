@@ -66,9 +66,7 @@ class PlanFile(_Section):
     """A whole plan file."""
 
     format_version: Literal[1]
-    name: Annotated[
-        str, Field(pattern=f"^(?:{specs.NAME.pattern})$", max_length=64, description="of the results' folder")
-    ]
+    name: Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64, description="of the results' folder")]
     written: AwareDatetime
     task: Annotated[str, Field(min_length=1)]
     epochs: Annotated[

@@ -23,7 +23,7 @@ from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting
 from qrlsuite.studies.sizes import nearest_size
 
-Name = Annotated[str, Field(pattern=specs.NAME.pattern, max_length=64)]
+Name = Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]
 LARGEST = 1000
 """Entries that a study may have."""
 

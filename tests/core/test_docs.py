@@ -114,8 +114,10 @@ def test_every_command_is_documented() -> None:
 
 
 def every_option() -> set[str]:
-    """Return the options of all commands."""
-    waiting, found = [application()[0]], {"--help"}
+    """Return the options of all commands, built-in ones imported."""
+    from qrlsuite.cli.app import BUILT_IN, load
+
+    waiting, found = [application()[0], *map(load, BUILT_IN.values())], {"--help"}
     while waiting:
         command = waiting.pop()
         found |= {

@@ -43,6 +43,7 @@ def test_the_hash_covers_the_definition_and_nothing_else() -> None:
             'name = "beam6h"',
             "t.toml: environment.name: unknown environment 'beam6h'; did you mean 'beam6g'",
         ),
+        ('name = "tiny"', 'name = "tiny task"', "name = 'tiny task'"),
         ("degree = 3", "degre = 3", "no option 'degre'; did you mean 'degree'"),
         ("deltas = [0.5, 0.75]", "deltas = [0.5, 1.5]", "ranking.deltas.1 = 1.5"),
         ("epsilons = [0.6, 0.8]", "", "give either epsilons"),
