@@ -1,7 +1,7 @@
 """A section of a board by mean time below threshold: which pairs are decided, and which ranks that leaves.
 
 Beside the tiers of the paper's definition. `rank_by_time` computes everything once; tables, files and the page
-write what it returns. The statistics are in `qrlsuite.statistics.times_board`.
+write what it returns. The statistics are in `qrlsuite.statistics.standings`.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ def rank_by_time(
     Raises
     ------
     OptionError
-        As `qrlsuite.statistics.times_board`.
+        As `qrlsuite.statistics.standings`.
     """
     curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
     board = times_board(curves, grid, alpha, horizon)

@@ -41,7 +41,7 @@ def _placement(base: str, antennas: int, index: int) -> str:
     """Return the task file of one random placement."""
     changed = _headed(
         base,
-        f"# Random placement a{antennas}-{index}. The paper's own instances were never published: these numbers are\n"
+        f"# Random placement a{antennas}-{index}. The paper's own instances are not known to us: these numbers are\n"
         f"# ours, drawn by the paper's rule with seed ({SEED}, {antennas}, {index}).\n"
         "# Written by `python -m qrlsuite.tasks.variants`.",
         f"beam6g-a{antennas}-{index}",

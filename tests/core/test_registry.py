@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import types
@@ -16,6 +15,7 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
+from tests.conftest import installed
 
 MODEL: dict[str, Any] = {"summary": "One", "family": "classical", "options": "a:B", "build": "a:C"}
 
@@ -242,5 +242,4 @@ def test_a_plugin_may_import_gymnasium_while_it_is_loaded(tmp_path: Path) -> Non
         "import qrlsuite.registry as registry; assert not registry.load().problems, registry.load().problems; "
         "import gymnasium; gymnasium.make('heavy/Pole-v0'); gymnasium.make('qrlsuite/BeamManagement6G-v1')"
     )
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
-    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, env=env)
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, env=installed(site))

@@ -412,9 +412,10 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     assert "2 seeds of 3 epochs; shown once" in refused[0]
     train("short", range(9), 1)
     entries, refused = collect.collect(tmp_path / "short", shipped=True)
-    assert [entry.curves.shape for entry in entries] == [(8, 3)], (
-        "many seeds of few epochs take no one's place"
-    )
+    assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [
+        ((9, 1), False),
+        ((8, 3), True),
+    ], "an own entry that is shorter stands beside the published one"
     assert len(collect.collect(tmp_path / "nothing", shipped=True)[0]) == 1
 
 

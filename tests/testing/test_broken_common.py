@@ -59,6 +59,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         install(folder, name, code)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
+        patch.setenv(registry.LOAD_PLUGINS, ",".join(DISTRIBUTIONS))
         notebook = types.ModuleType("notebook_of_mine")
         notebook.build = print  # type: ignore[attr-defined]
         patch.setitem(sys.modules, "notebook_of_mine", notebook)

@@ -128,6 +128,7 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     install(folder, "strange", STRANGE)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
+        patch.setenv(registry.LOAD_PLUGINS, "strange")
         registry.load.cache_clear()
         yield
     registry.load.cache_clear()
