@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from qrlsuite import hookspecs, registry, specs
+
 HEAVY = (
     "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "plotly", "pandas", "sklearn",
     "jax", "tensorflow",
@@ -41,7 +43,7 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
         capture_output=True,
         text=True,
         check=False,
-        env=environment(),
+        env={**environment(), registry.LOAD_PLUGINS: ""},  # importing Gymnasium would load the plugins of others
     )
     for line in done.stdout.splitlines():
         if line.startswith(_MARK):
@@ -53,15 +55,13 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
     """Do what `fresh_process` says, in this process."""
-    from qrlsuite import registry, specs
-
     failed: dict[str, str] = {}
     for name in modules:
         try:
             plugin = importlib.import_module(name)
-            for kind in registry.KINDS:
-                hook = getattr(plugin, f"register_{kind}", None)
-                if hook is not None:
+            for hook_name in ("register", *(f"register_{kind}" for kind in registry.KINDS)):
+                hook = getattr(plugin, hook_name, None)
+                if hasattr(hook, f"{hookspecs.PROJECT}_impl"):
                     hook(register=lambda spec: None)
         except (Exception, SystemExit) as error:
             failed[name] = registry.words(error)

@@ -127,7 +127,7 @@ def every_option() -> set[str]:
     return found
 
 
-OTHERS = {"--config-settings"}
+OTHERS = {"--config-settings", "--pairs"}
 """Options of other programs."""
 
 
