@@ -168,7 +168,7 @@ def build(observations, actions, options, generator):
 @hookimpl
 def register_models(register):
     options = "qrlsuite.plugins.models.mlp:Options"
-    register(ModelSpec("breaks", "Cannot be built", options, "broken_model:build", family="classical"))
+    register(ModelSpec("breaks", "Cannot be built", "classical", options, "broken_model:build"))
 """
 
 
@@ -190,7 +190,9 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
             capture_output=True, text=True, check=False, env=installed(site),
         )  # fmt: skip
         assert done.returncode == 2, done.stderr
-        (line,) = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+        lines = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+        assert len(lines) == 1, done.stderr
+        (line,) = lines
         assert message in line
         assert "Traceback" not in done.stderr
         assert "times" not in line
