@@ -43,7 +43,10 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
         capture_output=True,
         text=True,
         check=False,
-        env={**environment(), registry.LOAD_PLUGINS: ""},  # importing Gymnasium would load the plugins of others
+        env={
+            **environment(),
+            registry.LOAD_PLUGINS: "",
+        },  # importing Gymnasium would load the plugins of others
     )
     for line in done.stdout.splitlines():
         if line.startswith(_MARK):
@@ -61,7 +64,7 @@ def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
             plugin = importlib.import_module(name)
             for hook_name in ("register", *(f"register_{kind}" for kind in registry.KINDS)):
                 hook = getattr(plugin, hook_name, None)
-                if hasattr(hook, f"{hookspecs.PROJECT}_impl"):
+                if hook is not None and hasattr(hook, f"{hookspecs.PROJECT}_impl"):
                     hook(register=lambda spec: None)
         except (Exception, SystemExit) as error:
             failed[name] = registry.words(error)
