@@ -7,7 +7,7 @@ group of seeds can be split and merged by slicing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,3 @@ class Algorithm(Protocol):
 
         The tensors themselves, not copies: `qrlsuite evaluate` loads trained parameters into them.
         """
-
-
-AlgorithmFactory = Callable[..., Any]

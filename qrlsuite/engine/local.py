@@ -120,7 +120,7 @@ def _start(job: _Job, work: Work) -> None:
         stdout=job.output,
         stderr=job.output,
         start_new_session=True,
-        preexec_fn=_ignore_warnings,  # this process has one thread
+        preexec_fn=_ignore_warnings,  # sets signals only: takes no lock that another thread may hold
     )
 
 
