@@ -17,14 +17,14 @@ from collections.abc import Callable
 import gymnasium
 import numpy as np
 
-from qrlsuite.plugins.environments.beam6g import ID, Options, make_vector
+from qrlsuite.plugins.environments.beam6g import ID, BeamOptions, make_vector
 
 GROUP = 100
 RELEASED_EPOCH = 11.0
 """Seconds of a 100-lane validation epoch with the paper's released code, on a core of a 2-core AMD EPYC."""
 
 
-def lanes(options: Options, count: int) -> None:
+def lanes(options: BeamOptions, count: int) -> None:
     """Run one epoch of `count` lanes, random actions."""
     env = make_vector(options, count)
     env.seed_lanes([np.random.default_rng(g) for g in range(count // GROUP)])
@@ -33,7 +33,7 @@ def lanes(options: Options, count: int) -> None:
         env.step(row)
 
 
-def sync(options: Options, count: int) -> None:
+def sync(options: BeamOptions, count: int) -> None:
     """Run the same through Gymnasium's own vector environment over single environments."""
     mode = gymnasium.vector.AutoresetMode.SAME_STEP
     make = [lambda: gymnasium.make(ID, degree=options.degree) for _ in range(count)]
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--degree", type=int, default=3)
     arguments = parser.parse_args()
-    options = Options(degree=arguments.degree)
+    options = BeamOptions(degree=arguments.degree)
     jobs: dict[str, tuple[int, Callable[[], None]]] = {
         "lanes, 100": (100, lambda: lanes(options, 100)),
         "lanes, 10,000": (10_000, lambda: lanes(options, 10_000)),

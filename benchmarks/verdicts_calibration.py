@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from qrlsuite.leaderboard.published import SHIPPED, read
+from qrlsuite.leaderboard.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
@@ -50,7 +50,7 @@ HORIZON = 200_000
 
 def published() -> dict[str, LearningCurves]:
     """Return the published entries of beam6g by name."""
-    entries = [read(folder).entry_curves() for folder in sorted((SHIPPED / "beam6g").iterdir())]
+    entries = [read(folder).entry_curves() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
     return {each.label: LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries}
 
 

@@ -184,7 +184,7 @@ def collected(
     runs: Path,
     tasks: Sequence[str],
     names: Iterable[str] = (),
-    shipped: bool = False,
+    published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
 ) -> tuple[list[EntryCurves], list[str]]:
@@ -212,7 +212,7 @@ def collected(
     lookup.check_tasks(runs, *tasks)
     found, refused = list[EntryCurves](), list[str]()
     for task in tasks:
-        there, left_out = collect.select(runs, [task], names, shipped, horizon, min_seeds)
+        there, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)
         if not there:
             raise UnknownNameError(
                 f"--across: {runs} holds no results of task {task}: qrlsuite run --task {task}"

@@ -43,7 +43,7 @@ HALF_LEAST = 2
 
 
 @dataclass(frozen=True)
-class Finding:
+class CalibrationResult:
     """One line of the result.
 
     Attributes
@@ -107,7 +107,7 @@ class Job:
     Attributes
     ----------
     part, entry, rule:
-        As in `Finding`.
+        As in `CalibrationResult`.
     draws:
         Pairs or boards to be simulated.
     measure:
@@ -118,9 +118,9 @@ class Job:
     entry: str
     rule: str
     draws: int
-    measure: Callable[[int, Callable[[], object] | None], Finding]
+    measure: Callable[[int, Callable[[], object] | None], CalibrationResult]
 
-    def run(self, tick: Callable[[], object] | None = None) -> Finding:
+    def run(self, tick: Callable[[], object] | None = None) -> CalibrationResult:
         """Compute the line."""
         return self.measure(self.draws, tick)
 
@@ -172,7 +172,7 @@ def choose(
         tasks = [task] if task else []
         found = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
     else:
-        found, refused = collect.collect(runs, task, shipped=published)
+        found, refused = collect.collect(runs, task, published=published)
         lines += refused
     lines += [f"{entry.label}: a single seed has no spread" for entry in found if len(entry.seeds) < 2]
     found = [entry for entry in found if len(entry.seeds) >= 2]
@@ -276,9 +276,11 @@ def estimate(jobs: Sequence[Job]) -> float:
     return sum(job.draws * seconds[job.part, job.rule] for job in jobs)
 
 
-def _of_pairs(part: Part, entry: str, rates: Rates, winner: float, factor: float | None = None) -> Finding:
+def _of_pairs(
+    part: Part, entry: str, rates: Rates, winner: float, factor: float | None = None
+) -> CalibrationResult:
     cells = rates.per_cell
-    return Finding(
+    return CalibrationResult(
         part=part,
         entry=entry,
         rule=rates.rule,
@@ -293,7 +295,7 @@ def _of_pairs(part: Part, entry: str, rates: Rates, winner: float, factor: float
 
 
 def _halves(entry: LearningCurves, grid: Grid, rule: SignificanceRule, draws: int) -> Job:
-    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+    def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
         rates = split_halves(entry, grid, rule, count, tick=tick)
         return _of_pairs("halves", entry.name, rates, rates.winner)
 
@@ -303,7 +305,7 @@ def _halves(entry: LearningCurves, grid: Grid, rule: SignificanceRule, draws: in
 def _pairs(
     model: SmoothedRuns, n_runs: tuple[int, int], grid: Grid, rule: SignificanceRule, draws: int
 ) -> Job:
-    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+    def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
         rates = false_winners(model, *n_runs, grid, rule, count, tick=tick)
         return _of_pairs("pairs", model.entry.name, rates, rates.winner)
 
@@ -313,9 +315,9 @@ def _pairs(
 def _boards(
     model: SmoothedRuns, size: int, n_runs: int, grid: Grid, rule: SignificanceRule, draws: int
 ) -> Job:
-    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+    def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
         rate = board_false_winners(model, [n_runs] * size, grid, rule, count, tick=tick)
-        return Finding("boards", model.entry.name, rule.name, (n_runs, n_runs), count, rate)
+        return CalibrationResult("boards", model.entry.name, rule.name, (n_runs, n_runs), count, rate)
 
     return Job("boards", model.entry.name, rule.name, draws, measure)
 
@@ -329,7 +331,7 @@ def _power(
     rule: SignificanceRule,
     draws: int,
 ) -> Job:
-    def measure(count: int, tick: Callable[[], object] | None) -> Finding:
+    def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
         rates = power(model, other, n_runs, n_runs, grid, rule, count, tick=tick)
         return _of_pairs("power", model.entry.name, rates, rates.first_wins, factor)
 

@@ -12,14 +12,15 @@ import numpy as np
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard import origin, published
+from qrlsuite.leaderboard import origin
+from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
 
 def collect(
-    runs: Path, task: str | None = None, shipped: bool = False
+    runs: Path, task: str | None = None, published: bool = False
 ) -> tuple[list[EntryCurves], list[str]]:
     """Read every entry below a folder of results or of published entries.
 
@@ -37,7 +38,7 @@ def collect(
     """
     good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
-    for store in _folders(runs, shipped, task):
+    for store in _folders(runs, published, task):
         try:
             entry = read(store)
         except QrlSuiteError as error:
@@ -48,9 +49,9 @@ def collect(
         good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
     found = []
     for copies in good.values():
-        shown = _shown(copies) if shipped else copies[-1:]
+        shown = _shown(copies) if published else copies[-1:]
         found += shown
-        for other in copies if shipped and len(shown) < len(copies) else ():
+        for other in copies if published and len(shown) < len(copies) else ():
             if other is not shown[0]:
                 size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
                 refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
@@ -61,7 +62,7 @@ def select(
     runs: Path,
     tasks: Collection[str] = (),
     names: Iterable[str | EntryCurves] = (),
-    shipped: bool = False,
+    published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
 ) -> tuple[list[EntryCurves], list[str]]:
@@ -94,12 +95,12 @@ def select(
         (copy.task_hash, copy.name): copy
         for name in names
         for copy in (
-            [name] if isinstance(name, EntryCurves) else _shown(_read_copies(runs, name, shipped, tasks))
+            [name] if isinstance(name, EntryCurves) else _shown(_read_copies(runs, name, published, tasks))
         )
     }
     found, left_out = list(named.values()), list[str]()
     if not named:
-        found, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, shipped)
+        found, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published)
         found = [entry for entry in found if not tasks or entry.task in tasks]
     there = len(found)
     kept = []
@@ -152,7 +153,7 @@ def equally_long(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], lis
     return kept, lines
 
 
-def find(runs: Path, name: str, shipped: bool = False, tasks: Collection[str] = ()) -> EntryCurves:
+def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] = ()) -> EntryCurves:
     """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is.
 
     Parameters
@@ -167,14 +168,14 @@ def find(runs: Path, name: str, shipped: bool = False, tasks: Collection[str] = 
     UnknownNameError
         If none or several match; the message says what to type.
     """
-    return max(_read_copies(runs, name, shipped, tasks), key=_weight)
+    return max(_read_copies(runs, name, published, tasks), key=_weight)
 
 
-def _read_copies(runs: Path, name: str, shipped: bool, tasks: Collection[str]) -> list[EntryCurves]:
+def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = [e for e in lookup.stored(_folders(runs, shipped)) if not tasks or e.task in tasks]
+        everything = [e for e in lookup.stored(_folders(runs, published)) if not tasks or e.task in tasks]
         unique = list({entry.key: entry for entry in everything}.values())
         key = lookup.choose(unique, name, _place(runs, tasks)).key
         folders = [entry.store for entry in everything if entry.key == key]
@@ -208,15 +209,15 @@ def _weight(entry: EntryCurves) -> tuple[int, int, int]:
     return min(epochs, enough), len(entry.seeds), epochs
 
 
-def _folders(runs: Path, shipped: bool, task: str | None = None) -> list[EntryStore]:
-    """Return the entries' folders: those in the results folder, and with `shipped` the published ones."""
-    if not runs.is_dir() and not shipped:
+def _folders(runs: Path, published: bool, task: str | None = None) -> list[EntryStore]:
+    """Return the entries' folders: those in the results folder, and with `published` the published ones."""
+    if not runs.is_dir() and not published:
         raise StoreError(
             f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another, and `qrlsuite "
             "leaderboard --published` shows what comes with the suite"
         )
     stores = entries(runs, task) if runs.is_dir() else []
-    return stores + (entries(published.SHIPPED, task) if shipped else [])
+    return stores + (entries(published_entries.PUBLISHED, task) if published else [])
 
 
 def read(store: EntryStore) -> EntryCurves | None:
@@ -227,8 +228,8 @@ def read(store: EntryStore) -> EntryCurves | None:
     StoreError
         If a file is damaged, or a published entry is not what it says.
     """
-    if published.is_published(store.path):
-        return published.read(store.path).entry_curves()
+    if published_entries.is_published(store.path):
+        return published_entries.read(store.path).entry_curves()
     return read_entry(store)
 
 

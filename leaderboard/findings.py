@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from qrlsuite.leaderboard.calibration import PARTS, Finding
+from qrlsuite.leaderboard.calibration import PARTS, CalibrationResult
 
 HEAD = ["entry", "seeds", "rule", "cell, worst", "any cell", "a winner"]
 
 
-def tables(found: Sequence[Finding], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
+def tables(found: Sequence[CalibrationResult], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
     """Return what was found as tables: a sentence, and rows of which the first is the head."""
     parts = {name: [each for each in found if each.part == name] for name in PARTS}
     result = []
@@ -49,7 +49,7 @@ def tables(found: Sequence[Finding], cells: int, board: int) -> list[tuple[str, 
     return result
 
 
-def summary(found: Sequence[Finding], rule: str, board: int) -> str:
+def summary(found: Sequence[CalibrationResult], rule: str, board: int) -> str:
     """Return in one sentence what was found about a rule."""
     own = [each for each in found if each.rule == rule]
     equal = [each for each in own if each.part == "pairs" and each.n_runs[0] == each.n_runs[1]]
@@ -78,19 +78,19 @@ def _range(rates: Sequence[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _seeds(finding: Finding) -> str:
+def _seeds(finding: CalibrationResult) -> str:
     return f"{finding.n_runs[0]},{finding.n_runs[1]}"
 
 
-def _slower(finding: Finding) -> str:
+def _slower(finding: CalibrationResult) -> str:
     return f"{(finding.factor or 1) - 1:.0%}"
 
 
-def _winner(finding: Finding) -> str:
+def _winner(finding: CalibrationResult) -> str:
     return f"{100 * finding.winner:.1f} ± {finding.error:.1%}"
 
 
-def _cells(finding: Finding) -> tuple[str, str]:
+def _cells(finding: CalibrationResult) -> tuple[str, str]:
     mean, worst, anywhere = (
         f"{value or 0:{digits}%}"
         for value, digits in ((finding.cell_mean, ".2"), (finding.cell_worst, ".1"), (finding.any_cell, ".1"))

@@ -33,7 +33,7 @@ from qrlsuite.registry import load as registered
 from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
-SHIPPED = Path(__file__).parent / "entries"
+PUBLISHED = Path(__file__).parent / "entries"
 """The entries that come with the suite."""
 
 CURVES = "curves.parquet"
@@ -43,7 +43,7 @@ MAX_BYTES = 20_000_000
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedEntry:
     """A published entry, checked.
 
     Attributes
@@ -127,7 +127,7 @@ def is_published(folder: Path) -> bool:
     return (folder / CURVES).exists()
 
 
-def read(folder: Path) -> Published:
+def read(folder: Path) -> PublishedEntry:
     """Read a published entry and check all that can be checked without training.
 
     Raises
@@ -152,7 +152,7 @@ def read(folder: Path) -> Published:
         raise StoreError(f"{folder}: not a published entry: {type(error).__name__}: {text}") from None
 
 
-def _read(folder: Path) -> Published:
+def _read(folder: Path) -> PublishedEntry:
     for name in ("entry.json", CURVES, SEEDS):
         if not (folder / name).is_file():
             raise StoreError(f"{folder}: {name} is missing; write the entry again with `qrlsuite export`")
@@ -202,7 +202,7 @@ def _read(folder: Path) -> Published:
         folder,
         f"{SEEDS} has rows of different lengths",
     )
-    return Published(folder, record, task_file, seeds, curves, hours, executions, origins, beginning)
+    return PublishedEntry(folder, record, task_file, seeds, curves, hours, executions, origins, beginning)
 
 
 def _require(holds: bool, folder: Path, problem: str) -> None:

@@ -79,10 +79,10 @@ def check(study: Study) -> None:
             )
         kind = pictures.KINDS[picture.kind]
         options.build(specs.resolve(kind.options), picture.settings, f"{where}.settings")
-        if kind.of == "nothing" and picture.entries:
+        if kind.data is None and picture.entries:
             raise OptionError(f"{where}.entries: picture '{picture.kind}' shows no entries")
-        if (picture.evaluation is not None) != (kind.of == "episodes"):
-            rule = "needs" if kind.of == "episodes" else "takes no"
+        if (picture.evaluation is not None) != (kind.data == "episodes"):
+            rule = "needs" if kind.data == "episodes" else "takes no"
             raise OptionError(f"{where}.evaluation: picture '{picture.kind}' {rule} evaluation")
 
 
@@ -147,7 +147,7 @@ def draw(
             tuple((e.task, e.label, e.curves.shape[1]) for e in present if _steps(e) < longest),
         )
         kind = pictures.KINDS[picture.kind]
-        if kind.of == "nothing":
+        if kind.data is None:
             figure = pictures.draw(picture.kind, **picture.settings)
             drawn.append(Drawn(picture.name, picture.kind, (), figure=figure))
         elif not entries:
@@ -189,7 +189,7 @@ def _attempt(
 ) -> Drawn:
     """Draw one picture; what is there may not suffice for it."""
     try:
-        if pictures.KINDS[picture.kind].of == "episodes":
+        if pictures.KINDS[picture.kind].data == "episodes":
             figure = _episodes(picture, entries, report)
         else:
             figure = pictures.draw(picture.kind, entries, **picture.settings)

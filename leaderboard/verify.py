@@ -13,7 +13,7 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard.fingerprint import fingerprint
-from qrlsuite.leaderboard.published import Published
+from qrlsuite.leaderboard.published import PublishedEntry
 from qrlsuite.results import provenance
 from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import learning_curve
@@ -27,7 +27,7 @@ Check = Literal["files", "equal", "plausible"]
 
 
 @dataclass(frozen=True)
-class Verdict:
+class VerificationResult:
     """What came of checking one entry.
 
     Attributes
@@ -82,7 +82,7 @@ def verify(
     rerun: int = 0,
     generator: np.random.Generator | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
-) -> Verdict:
+) -> VerificationResult:
     """Check one published entry.
 
     With `rerun`, that many seeds are chosen at random and trained again from nothing, on the CPU. On the type of
@@ -103,17 +103,17 @@ def verify(
         entry = published.read(folder)
         made_by = from_record(entry.record, str(folder / "entry.json")) if rerun else None
     except QrlSuiteError as error:
-        return Verdict(folder, name, False, "files", (), str(error))
+        return VerificationResult(folder, name, False, "files", (), str(error))
     count, length = entry.curves.shape
     sound = f"files sound: {count} seeds of {length} epochs, hashes and label computed again"
     if made_by is None:
-        return Verdict(folder, name, True, "files", (), sound)
+        return VerificationResult(folder, name, True, "files", (), sound)
     chooser = generator or np.random.default_rng()
     places = sorted(int(i) for i in chooser.choice(count, size=min(rerun, count), replace=False))
     seeds = tuple(entry.seeds[place] for place in places)
     problem = _beginning(entry, made_by, places)
     if problem:
-        return Verdict(folder, name, False, "plausible", seeds, problem)
+        return VerificationResult(folder, name, False, "plausible", seeds, problem)
     again = _train(made_by, seeds, length, report)
     differs = _elsewhere(entry, made_by, places)
     if differs is None:
@@ -121,7 +121,7 @@ def verify(
     return _plausible(entry, name, places, seeds, again, differs)
 
 
-def _beginning(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:
+def _beginning(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
     """Say what differs before training, None where everything agrees."""
     seeds = [entry.seeds[place] for place in places]
     here, stated = fingerprint(made_by, seeds), entry.fingerprint
@@ -158,7 +158,7 @@ def _train(
     return np.stack(curves, axis=1)
 
 
-def _elsewhere(entry: Published, made_by: Entry, places: Sequence[int]) -> str | None:
+def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
     """Say in what this machine differs from the one that made the seeds; None where bits must be equal.
 
     Versions of plugins, and the device, are missing from what earlier versions of the suite recorded: they are then not
@@ -182,37 +182,41 @@ def _elsewhere(entry: Published, made_by: Entry, places: Sequence[int]) -> str |
 
 
 def _equal(
-    entry: Published, name: str, places: Sequence[int], seeds: tuple[int, ...], again: np.ndarray[Any, Any]
-) -> Verdict:
+    entry: PublishedEntry,
+    name: str,
+    places: Sequence[int],
+    seeds: tuple[int, ...],
+    again: np.ndarray[Any, Any],
+) -> VerificationResult:
     stated = entry.curves[list(places)]
     if np.array_equal(again, stated):
         message = (
             f"seeds {_list(seeds)} trained again: curves equal, bit for bit (same versions and processor)"
         )
-        return Verdict(entry.folder, name, True, "equal", seeds, message)
+        return VerificationResult(entry.folder, name, True, "equal", seeds, message)
     row, epoch = np.argwhere(again != stated)[0]
     message = (
         f"seed {seeds[row]} trained again differs from epoch {epoch + 1} on ({again[row, epoch]:.6f}, published "
         f"{stated[row, epoch]:.6f}), with the same versions on the same processor"
     )
-    return Verdict(entry.folder, name, False, "equal", seeds, message)
+    return VerificationResult(entry.folder, name, False, "equal", seeds, message)
 
 
 def _plausible(
-    entry: Published,
+    entry: PublishedEntry,
     name: str,
     places: Sequence[int],
     seeds: tuple[int, ...],
     again: np.ndarray[Any, Any],
     differs: str,
-) -> Verdict:
+) -> VerificationResult:
 
     from scipy.stats import mannwhitneyu  # a second, which checking files does without
 
     others = np.delete(entry.curves[:, -1], list(places))
     begun = f"seeds {_list(seeds)} begin alike to {AGREEMENT:g}"
     if not len(others):
-        return Verdict(
+        return VerificationResult(
             entry.folder, name, True, "plausible", seeds, f"{begun} ({differs}); no others to rank them with"
         )
     p = float(mannwhitneyu(again[:, -1], others, alternative="two-sided").pvalue)
@@ -221,7 +225,7 @@ def _plausible(
     message = (
         f"{begun}; their final scores are {verdict} among the others (rank test, p = {p:.2g}); {differs}"
     )
-    return Verdict(entry.folder, name, p > P_VALUE, "plausible", seeds, message)
+    return VerificationResult(entry.folder, name, p > P_VALUE, "plausible", seeds, message)
 
 
 def _list(seeds: Sequence[int]) -> str:

@@ -27,7 +27,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     A batched matrix product is bitwise independent of a slice's position in the stack for most shapes, not for
     all (measured with torch 2.13 on one thread: the exceptions are layers narrower than 16 on both sides, a
     single output, and the input gradient of a narrow input layer). Those are summed in a fixed order instead,
-    input feature by input feature. A test goes through the layer shapes of every shipped model.
+    input feature by input feature. A test goes through the layer shapes of every built-in model.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Pictures for papers and talks, with matplotlib: color-blind safe, no LaTeX, png, pdf or svg.
 
-One file per picture, each with an `Options` dataclass (its settings) and
+One file per picture, each with a dataclass of its settings (`BarsOptions` in `bars.py`) and
 `draw(entries, **settings) -> matplotlib.figure.Figure`. This module names them without importing matplotlib.
 Pictures of an environment (a map, sample trajectories) come with the environment, see
 `qrlsuite.specs.EnvironmentSpec`.
@@ -31,19 +31,20 @@ class Picture:
     summary:
         One line for `qrlsuite plot --help`.
     module:
-        The module with its `Options` and `draw`.
-    of:
-        What `draw` takes first: entries, nothing, or episode values by policy.
+        The module with its dataclass of settings and its function `draw`.
+    data:
+        What `draw` takes first: entries, or episode values by policy; None where it takes the settings alone.
     """
 
     summary: str
     module: str
-    of: Literal["entries", "episodes", "nothing"] = "entries"
+    data: Literal["entries", "episodes"] | None = "entries"
 
     @property
     def options(self) -> str:
         """Reference to the dataclass of its settings."""
-        return f"{self.module}:Options"
+        stem = self.module.rpartition(".")[2].title().replace("_", "")
+        return f"{self.module}:{stem}Options"
 
 
 FORMATS = ("png", "pdf", "svg")
@@ -56,10 +57,10 @@ KINDS: dict[str, Picture] = {
     "tiers": Picture("who outperforms whom, tier by tier", f"{_HERE}.tiers"),
     "few-runs": Picture("how 5 seeds mislead: two entries, or one against itself", f"{_HERE}.few_runs"),
     "histogram": Picture(
-        "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", of="episodes"
+        "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", data="episodes"
     ),
     "estimator": Picture(
-        "how likely P_hat falls below delta, given P and 100 runs", f"{_HERE}.estimator", of="nothing"
+        "how likely P_hat falls below delta, given P and 100 runs", f"{_HERE}.estimator", data=None
     ),
 }
 """Pictures by name."""

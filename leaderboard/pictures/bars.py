@@ -21,7 +21,7 @@ WIDEST = 12.0
 
 
 @dataclass(frozen=True)
-class Options:
+class BarsOptions:
     """Settings of the bars."""
 
     epsilons: Annotated[
@@ -49,7 +49,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If the entries belong to different tasks, or a setting does not fit them.
     """
-    chosen: Options = options.build(Options, settings, "picture 'bars'")
+    chosen: BarsOptions = options.build(BarsOptions, settings, "picture 'bars'")
     cells.one_task(entries, "bars")
     relative = entries[0].task_file.ranking.epsilons is not None
     epsilons = chosen.epsilons or ([0.2, 0.15, 0.1] if relative else None)

@@ -79,11 +79,11 @@ def compose(
         raise OptionError(
             f"--set environment.{next(iter(environment))}: picture '{kind}' shows what was trained"
         )
-    of = pictures.KINDS[kind].of
-    if of == "episodes":
+    data = pictures.KINDS[kind].data
+    if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
     given = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
-    if of == "nothing":
+    if data is None:
         if any(given.values()):
             name = next(name for name, value in given.items() if value)
             raise OptionError(f"picture '{kind}' shows no results: leave {name} out")

@@ -20,7 +20,7 @@ MANY = 5
 
 
 @dataclass(frozen=True)
-class Options:
+class CurvesOptions:
     """Settings of the learning curves."""
 
     runs: Annotated[
@@ -36,7 +36,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If the entries belong to different tasks.
     """
-    chosen: Options = options.build(Options, settings, "picture 'curves'")
+    chosen: CurvesOptions = options.build(CurvesOptions, settings, "picture 'curves'")
     cells.one_task(entries, "curves")
     many = len(entries) > MANY
     beside = 0.7 + 0.07 * max(len(style.label(entry)) for entry in entries)

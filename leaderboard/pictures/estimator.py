@@ -22,7 +22,7 @@ from qrlsuite.statistics import Grid
 
 
 @dataclass(frozen=True)
-class Options:
+class EstimatorOptions:
     """Settings of the estimator's step."""
 
     runs: Annotated[int, Field(ge=1, le=100_000, description="number of runs N")] = 100
@@ -35,7 +35,7 @@ def draw(entries: Sequence[EntryCurves] = (), **settings: Any) -> Figure:
     """Draw P(P_hat < delta) against P; no entries are needed, and any are ignored."""
     from scipy.stats import binom, norm
 
-    chosen: Options = options.build(Options, settings, "picture 'estimator'")
+    chosen: EstimatorOptions = options.build(EstimatorOptions, settings, "picture 'estimator'")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     truth = np.linspace(0, 1, 1001)

@@ -27,7 +27,7 @@ from qrlsuite.statistics.estimator import complexity
 
 
 @dataclass(frozen=True)
-class Options:
+class FewRunsOptions:
     """Settings of the picture of few runs."""
 
     few: Annotated[int, Field(ge=1, le=1000, description="seeds of the small sample")] = 5
@@ -64,7 +64,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If there are not one or two entries of one task, or one has too few seeds.
     """
-    chosen: Options = options.build(Options, settings, "picture 'few-runs'")
+    chosen: FewRunsOptions = options.build(FewRunsOptions, settings, "picture 'few-runs'")
     cells.one_task(entries, "few-runs")
     if len(entries) > 2:
         raise OptionError(

@@ -20,7 +20,7 @@ REFERENCES = {"optimal": ("#E69F00", ""), "random": ("#8C6D46", "xxxx"), "neares
 
 
 @dataclass(frozen=True)
-class Options:
+class HistogramOptions:
     """Settings of the histogram."""
 
     bins: Annotated[int, Field(ge=2, le=1000, description="bins over the common range")] = 50
@@ -43,7 +43,7 @@ def draw(episodes: Mapping[str, ArrayLike], **settings: Any) -> Figure:
     OptionError
         If there is no policy, or one without episodes or with a value that is not finite.
     """
-    chosen: Options = options.build(Options, settings, "picture 'histogram'")
+    chosen: HistogramOptions = options.build(HistogramOptions, settings, "picture 'histogram'")
     values = {name: _checked(name, given) for name, given in episodes.items()}
     if not values:
         raise OptionError("picture 'histogram' needs at least one policy")

@@ -22,7 +22,7 @@ from qrlsuite.results.text import steps_text
 
 
 @dataclass(frozen=True)
-class Options:
+class ScalingOptions:
     """Settings of the scaling picture."""
 
     by: Annotated[
@@ -71,7 +71,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If no two entries differ in size only, or a setting does not fit them.
     """
-    chosen: Options = options.build(Options, settings, "picture 'scaling'")
+    chosen: ScalingOptions = options.build(ScalingOptions, settings, "picture 'scaling'")
     if not entries:
         raise OptionError("picture 'scaling' needs at least two entries of different size")
     panels = _panels(entries, [chosen.by] if isinstance(chosen.by, str) else chosen.by)

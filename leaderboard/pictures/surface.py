@@ -18,7 +18,7 @@ from qrlsuite.statistics import Grid
 
 
 @dataclass(frozen=True)
-class Options:
+class SurfaceOptions:
     """Settings of the surface."""
 
     style: Annotated[
@@ -49,7 +49,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If the entries belong to different tasks, or a setting does not fit them.
     """
-    chosen: Options = options.build(Options, settings, "picture 'surface'")
+    chosen: SurfaceOptions = options.build(SurfaceOptions, settings, "picture 'surface'")
     cells.one_task(entries, "surface")
     horizon = cells.choose_horizon(entries, chosen.horizon)
     grid = cells.choose_grid(entries[0], chosen.epsilons, chosen.deltas)
@@ -65,7 +65,7 @@ def _maps(
     grid: Grid,
     title: str,
     horizon: int,
-    chosen: Options,
+    chosen: SurfaceOptions,
 ) -> Figure:
     """Draw heat maps side by side, a number in each cell; hatched where the interval ends at the cap."""
     from matplotlib.patches import Rectangle
@@ -126,7 +126,7 @@ def _box(
     grid: Grid,
     title: str,
     horizon: int,
-    chosen: Options,
+    chosen: SurfaceOptions,
 ) -> Figure:
     """Draw all surfaces in one box, as the paper does; every surface has its color and markers."""
     from matplotlib.lines import Line2D

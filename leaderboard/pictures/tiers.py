@@ -29,7 +29,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Options:
+class TiersOptions:
     """Settings of the tiers."""
 
     horizon: Annotated[
@@ -46,7 +46,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     OptionError
         If the entries belong to different tasks, or a setting does not fit them.
     """
-    chosen: Options = options.build(Options, settings, "picture 'tiers'")
+    chosen: TiersOptions = options.build(TiersOptions, settings, "picture 'tiers'")
     cells.one_task(entries, "tiers")
     horizon = cells.choose_horizon(entries, chosen.horizon)
     grid = ranking_of(entries).grid

@@ -15,7 +15,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
         AlgorithmSpec(
             name="ddqn",
             summary="Double deep Q-learning with replay buffer and target network",
-            options="qrlsuite.plugins.algorithms.ddqn:Options",
+            options="qrlsuite.plugins.algorithms.ddqn:DDQNOptions",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
         )
     )
@@ -23,7 +23,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
         AlgorithmSpec(
             name="ppo",
             summary="Proximal policy optimization with generalized advantages, separate actor and critic",
-            options="qrlsuite.plugins.algorithms.ppo:Options",
+            options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
         )
     )
@@ -31,7 +31,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
         AlgorithmSpec(
             name="reinforce",
             summary="REINFORCE, the vanilla policy gradient, with or without a baseline",
-            options="qrlsuite.plugins.algorithms.reinforce:Options",
+            options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
         )
     )

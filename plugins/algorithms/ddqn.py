@@ -37,7 +37,7 @@ from qrlsuite.seeding import Streams
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class DDQNOptions:
     """Options of double deep Q-learning; the defaults are the released settings."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.95
@@ -60,7 +60,7 @@ class DDQN:
         self,
         envs: LaneEnv,
         build_model: BuildModel,
-        options: Options,
+        options: DDQNOptions,
         streams: Sequence[Streams],
         device: torch.device,
     ) -> None:

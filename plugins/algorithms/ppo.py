@@ -49,7 +49,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class PPOOptions:
     """Options of proximal policy optimization; the defaults are the released settings of classical models."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.95
@@ -130,7 +130,7 @@ class PPO:
         self,
         envs: LaneEnv,
         build_model: BuildModel,
-        options: Options,
+        options: PPOOptions,
         streams: Sequence[Streams],
         device: torch.device,
     ) -> None:

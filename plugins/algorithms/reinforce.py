@@ -52,7 +52,7 @@ BLOCK = 128
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class REINFORCEOptions:
     """Options of REINFORCE."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
@@ -89,7 +89,7 @@ class Reinforce:
         self,
         envs: LaneEnv,
         build_model: BuildModel,
-        options: Options,
+        options: REINFORCEOptions,
         streams: Sequence[Streams],
         device: torch.device,
     ) -> None:

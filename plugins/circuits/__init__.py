@@ -29,7 +29,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
         CircuitBackendSpec(
             name="native",
             summary="The suite's own batched simulator with adjoint gradients; exact, no options",
-            options=f"{_HERE}.native:Options",
+            options=f"{_HERE}.native:NativeOptions",
             factory=f"{_HERE}.native:NativeBackend",
         )
     )

@@ -28,7 +28,7 @@ from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit, Operation
 from qrlsuite.circuit.shifts import shifted_angles, vector_jacobian
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.plugins.circuits.options import PennyLaneOptions as Options
+from qrlsuite.plugins.circuits.options import PennyLaneOptions
 
 BROADCASTING = "default.qubit"
 """The device that simulates the broadcast axis in one pass, and through which torch can differentiate.
@@ -74,7 +74,7 @@ class PennyLaneBackend:
         differentiate as asked.
     """
 
-    def __init__(self, circuit: Circuit, options: Options) -> None:
+    def __init__(self, circuit: Circuit, options: PennyLaneOptions) -> None:
         circuit.require_simulable("pennylane")
         self.circuit = circuit
         self.options = options
@@ -273,7 +273,7 @@ def _apply(operation: Operation, angles: list[Any]) -> None:
         qml.ctrl(getattr(qml, gate), control=control)(*angles, wires=wires)
 
 
-def _diff_method(options: Options) -> str:
+def _diff_method(options: PennyLaneOptions) -> str:
     """Choose how to differentiate, or say why it cannot be done."""
     broadcasting = options.device == BROADCASTING
     if options.diff_method == "auto":
@@ -299,7 +299,7 @@ def _diff_method(options: Options) -> str:
     return options.diff_method
 
 
-def _device(options: Options, qubits: int, seed: int | None) -> Any:
+def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
     """Open a device by name."""
     seeded = {} if seed is None else {"seed": seed}
     try:

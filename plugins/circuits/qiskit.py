@@ -40,7 +40,7 @@ from torch import Tensor
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.plugins.circuits.options import QiskitOptions as Options
+from qrlsuite.plugins.circuits.options import QiskitOptions
 
 DENSITY_QUBITS = 12
 """Qubits up to which noise is simulated exactly, as a density matrix; beyond, shots are needed."""
@@ -135,7 +135,7 @@ class QiskitBackend:
         If options contradict each other, a noise model is unknown, or an optional package is missing.
     """
 
-    def __init__(self, circuit: Circuit, options: Options) -> None:
+    def __init__(self, circuit: Circuit, options: QiskitOptions) -> None:
         circuit.require_simulable("qiskit")
         self.options = options
         self.shots: int | None = options.shots
@@ -247,7 +247,7 @@ class _Float64Connector(torch.autograd.Function):
         return torch.einsum("bo,bor->br", grads[0], torch.from_numpy(jacobian)), None
 
 
-def _gradient(options: Options) -> str:
+def _gradient(options: QiskitOptions) -> str:
     """Choose the fastest way to differentiate, or say why the one asked for cannot be done.
 
     Measured at 4 qubits, exact: reverse 2.1 s, lin-comb 7.7 s, parameter-shift 12.8 s for 5 inputs.
@@ -266,11 +266,11 @@ def _gradient(options: Options) -> str:
     return "parameter-shift" if options.gradient == "auto" else options.gradient
 
 
-def _is_fake(options: Options) -> bool:
+def _is_fake(options: QiskitOptions) -> bool:
     return options.noise_model not in (None, "depolarizing")
 
 
-def _simulator(options: Options, qubits: int) -> Any:
+def _simulator(options: QiskitOptions, qubits: int) -> Any:
     """Return an Aer simulator with the noise that the options ask for."""
     aer = _package("qiskit_aer", "estimator = 'aer'", "'qrlsuite[aer]'")
     _package("psutil", "estimator = 'aer'", "'qrlsuite[aer]'")
@@ -293,7 +293,7 @@ def _simulator(options: Options, qubits: int) -> Any:
     return aer.AerSimulator.from_backend(fake, **exact)
 
 
-def _needs_shots(options: Options, qubits: int, what: str) -> None:
+def _needs_shots(options: QiskitOptions, qubits: int, what: str) -> None:
     """Refuse density matrices that do not fit into memory."""
     if options.shots is None and qubits > DENSITY_QUBITS:
         raise OptionError(

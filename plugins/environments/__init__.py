@@ -18,7 +18,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         EnvironmentSpec(
             name="beam6g",
             summary="BeamManagement6G: choose the antenna that serves a moving user best",
-            options=f"{_BEAM6G}.options:Options",
+            options=f"{_BEAM6G}.options:BeamOptions",
             gymnasium_id="qrlsuite/BeamManagement6G-v1",
             entry_point=f"{_BEAM6G}.env:BeamManagement6G",
             vector=f"{_BEAM6G}.vector:make_vector",
@@ -46,7 +46,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         EnvironmentSpec(
             name="cartpole",
             summary="CartPole-v1: balance a pole on a cart; 500 steps at most",
-            options=f"{_HERE}.cartpole:Options",
+            options=f"{_HERE}.cartpole:CartPoleOptions",
             gymnasium_id="qrlsuite/CartPole-v1",
             entry_point=f"{_HERE}.cartpole:CartPole",
             vector=f"{_HERE}.cartpole:make_vector",
@@ -56,7 +56,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
         EnvironmentSpec(
             name="gym",
             summary="any environment of Gymnasium with discrete actions, by its id",
-            options=f"{_HERE}.gym:Options",
+            options=f"{_HERE}.gym:GymOptions",
             gymnasium_id="CartPole-v1",
             vector=f"{_HERE}.gym:make_vector",
         )

@@ -40,7 +40,7 @@ START = 0.05
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class CartPoleOptions:
     """Options of CartPole."""
 
     steps: Annotated[
@@ -63,7 +63,7 @@ class Options:
         return bounds
 
 
-def _normalization(options: Options) -> Normalization:
+def _normalization(options: CartPoleOptions) -> Normalization:
     """Return the map from raw observations (..., 4) to those of `options`."""
     high = np.array([2 * X_LIMIT, np.inf, 2 * THETA_LIMIT, np.inf], dtype=np.float32)
     low = high_given = None
@@ -190,7 +190,7 @@ class CartPoleLanes(LaneEnv):
         Position (m), velocity (m/s), angle (rad) and angular velocity (rad/s) of every lane, (4, L) float64.
     """
 
-    def __init__(self, options: Options, num_envs: int) -> None:
+    def __init__(self, options: CartPoleOptions, num_envs: int) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.options = options
@@ -362,7 +362,7 @@ def advance(state: NDArray[np.float64], actions: NDArray[np.integer[Any]]) -> ND
     return after
 
 
-def parse(values: Mapping[str, Any]) -> Options:
+def parse(values: Mapping[str, Any]) -> CartPoleOptions:
     """Return the options that `values` describe.
 
     Raises
@@ -370,11 +370,11 @@ def parse(values: Mapping[str, Any]) -> Options:
     qrlsuite.errors.OptionError
         If a key is unknown or a value cannot be used; the message lists every problem.
     """
-    options: Options = option_words.build(Options, values, "environment 'cartpole'")
+    options: CartPoleOptions = option_words.build(CartPoleOptions, values, "environment 'cartpole'")
     return options
 
 
-def make_vector(options: Options, num_envs: int) -> LaneEnv:
+def make_vector(options: CartPoleOptions, num_envs: int) -> LaneEnv:
     """Return the vector environment of `options` with `num_envs` lanes."""
     return CartPoleLanes(options, num_envs)
 

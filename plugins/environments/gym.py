@@ -23,7 +23,7 @@ _OWN = {
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class GymOptions:
     """Options of `gym`."""
 
     id: Annotated[
@@ -61,7 +61,7 @@ class Options:
         return arguments
 
 
-def make_vector(options: Options, num_envs: int) -> LaneEnv:
+def make_vector(options: GymOptions, num_envs: int) -> LaneEnv:
     """Return `num_envs` lanes of the environment `options.id`."""
     arguments = dict(options.arguments)
     if options.max_episode_steps is not None:

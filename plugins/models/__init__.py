@@ -22,15 +22,17 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             name="mlp",
             summary="Multilayer perceptron; options: width, depth, activation, init",
             family="classical",
-            options="qrlsuite.plugins.models.mlp:Options",
+            options="qrlsuite.plugins.models.mlp:MLPOptions",
             build="qrlsuite.plugins.models.mlp:build",
             population="qrlsuite.plugins.models.mlp:population",
         )
     )
     for backend, summary in CIRCUITS.items():
-        options = {"native": "NativeOptions", "pennylane": "PennyLaneOptions", "qiskit": "QiskitOptions"}[
-            backend
-        ]
+        options = {
+            "native": "VQCNativeOptions",
+            "pennylane": "VQCPennyLaneOptions",
+            "qiskit": "VQCQiskitOptions",
+        }[backend]
         register(
             ModelSpec(
                 name=f"vqc-{backend}",

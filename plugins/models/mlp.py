@@ -27,7 +27,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class MLPOptions:
     """Options of the multilayer perceptron."""
 
     width: Annotated[int, Field(ge=1, le=4096, description="units of each hidden layer")] = 64
@@ -48,7 +48,7 @@ class MLP(nn.Module):
     (depth - 1) w^2 + (depth + 6) w + 3 scalars at width w.
     """
 
-    def __init__(self, sizes: Sequence[int], options: Options, generator: torch.Generator) -> None:
+    def __init__(self, sizes: Sequence[int], options: MLPOptions, generator: torch.Generator) -> None:
         super().__init__()
         self.layers = len(sizes) - 1
         self.activation = options.activation
@@ -99,11 +99,11 @@ def _forward(x: Tensor, state: dict[str, Tensor], layers: int, activation: str) 
     return x
 
 
-def build(obs_dim: int, out_dim: int, options: Options, generator: torch.Generator) -> MLP:
+def build(obs_dim: int, out_dim: int, options: MLPOptions, generator: torch.Generator) -> MLP:
     """Build one agent's perceptron with its initial parameters drawn from `generator`."""
     return MLP([obs_dim, *[options.width] * options.depth, out_dim], options, generator)
 
 
-def population(modules: Sequence[MLP], options: Options) -> MLPPopulation:
+def population(modules: Sequence[MLP], options: MLPOptions) -> MLPPopulation:
     """Stack built perceptrons."""
     return MLPPopulation(modules)

@@ -26,8 +26,7 @@ from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.options import field_names, without_later
-from qrlsuite.plugins.circuits.options import PennyLaneOptions as PennyLaneBackendOptions
-from qrlsuite.plugins.circuits.options import QiskitOptions as QiskitBackendOptions
+from qrlsuite.plugins.circuits.options import PennyLaneOptions, QiskitOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
@@ -89,21 +88,21 @@ class VQCOptions:
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class PennyLaneOptions(PennyLaneBackendOptions, VQCOptions):
+class VQCPennyLaneOptions(PennyLaneOptions, VQCOptions):
     """Options of `vqc-pennylane`."""
 
     backend: ClassVar[str] = "pennylane"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class QiskitOptions(QiskitBackendOptions, VQCOptions):
+class VQCQiskitOptions(QiskitOptions, VQCOptions):
     """Options of `vqc-qiskit`."""
 
     backend: ClassVar[str] = "qiskit"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class NativeOptions(VQCOptions):
+class VQCNativeOptions(VQCOptions):
     """Options of `vqc-native`."""
 
     backend: ClassVar[str] = "native"

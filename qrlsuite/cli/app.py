@@ -16,7 +16,7 @@ from qrlsuite.specs import resolve
 
 
 @dataclass(frozen=True)
-class Command:
+class LazyCommand:
     """A built-in command.
 
     Attributes
@@ -39,40 +39,46 @@ _ROOM = "qrlsuite.cli.commands"
 BUILT_IN = {
     command.name: command
     for command in (
-        Command("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
-        Command("status", "Show what is running, waiting and stopped.", f"{_ROOM}.status:status"),
-        Command("runs", "List the results folder: entries, seeds, size.", f"{_ROOM}.runs:runs"),
-        Command("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
-        Command("compare", "Compare two entries cell by cell, and in words.", f"{_ROOM}.compare:compare"),
-        Command("calibrate", "Measure how often the significance rules err.", f"{_ROOM}.calibrate:calibrate"),
-        Command(
+        LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
+        LazyCommand("status", "Show what is running, waiting and stopped.", f"{_ROOM}.status:status"),
+        LazyCommand("runs", "List the results folder: entries, seeds, size.", f"{_ROOM}.runs:runs"),
+        LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
+        LazyCommand("compare", "Compare two entries cell by cell, and in words.", f"{_ROOM}.compare:compare"),
+        LazyCommand(
+            "calibrate", "Measure how often the significance rules err.", f"{_ROOM}.calibrate:calibrate"
+        ),
+        LazyCommand(
             "plot",
             "Draw a picture of results or of an environment.",
             f"{_ROOM}.plot:plot",
-            f"{_ROOM}.plot:Command",
+            f"{_ROOM}.plot:PlotCommand",
         ),
-        Command("evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"),
-        Command("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
-        Command(
+        LazyCommand(
+            "evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"
+        ),
+        LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
+        LazyCommand(
             "export",
             "Write entries to publish on a leaderboard.",
             f"{_ROOM}.export:export",
             "qrlsuite.cli.across:SeveralTasksCommand",
         ),
-        Command("import", "Import released result files as one entry.", f"{_ROOM}.import_:import_results"),
-        Command("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
-        Command("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
-        Command("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
-        Command("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
-        Command("study", "Run a paper's experiments by name.", f"{_ROOM}.study:app"),
-        Command("decide", "Compare entries with as many seeds as it takes.", f"{_ROOM}.decide:app"),
-        Command("power", "Say how many seeds find a difference.", f"{_ROOM}.power:power"),
-        Command("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
+        LazyCommand(
+            "import", "Import released result files as one entry.", f"{_ROOM}.import_:import_results"
+        ),
+        LazyCommand("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
+        LazyCommand("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
+        LazyCommand("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
+        LazyCommand("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
+        LazyCommand("study", "Run a paper's experiments by name.", f"{_ROOM}.study:app"),
+        LazyCommand("decide", "Compare entries with as many seeds as it takes.", f"{_ROOM}.decide:app"),
+        LazyCommand("power", "Say how many seeds find a difference.", f"{_ROOM}.power:power"),
+        LazyCommand("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
     )
 }
 
 
-def load(command: Command) -> Any:
+def load(command: LazyCommand) -> Any:
     """Import a built-in command and return it as Typer builds it."""
     target = resolve(command.reference)
     holder = typer.Typer(rich_markup_mode=None)

@@ -15,7 +15,7 @@ from typing import Any, Protocol, cast
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.results.seeds import Group, format_seeds
+from qrlsuite.results.seeds import SeedGroup, format_seeds
 from qrlsuite.results.store import EntryStore
 
 Snapshot = dict[str, dict[str, Any]]
@@ -29,14 +29,14 @@ class Work:
     """What an engine is given: groups of one entry's seeds, to be trained to `epochs`, `workers` at a time."""
 
     store: EntryStore
-    groups: Sequence[Group]
+    groups: Sequence[SeedGroup]
     epochs: int
     workers: int
     device: str = "cpu"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class EngineOutcome:
     """How the groups ended.
 
     Attributes
@@ -63,7 +63,7 @@ class Engine(Protocol):
     def queued(self, store: EntryStore) -> set[int]:
         """Return the seeds of an entry that were handed to this engine before and still wait for their turn."""
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         """Train the groups, calling `show` with their progress now and then; or hand them over and return.
 
         Raises
@@ -75,7 +75,7 @@ class Engine(Protocol):
         """
 
 
-def worker_command(work: Work, group: Group) -> list[str]:
+def worker_command(work: Work, group: SeedGroup) -> list[str]:
     """Return the command line that trains a group."""
     # -P: never import from the folder one stands in, which may be a source tree without its plugins
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.worker", str(work.store.path.absolute())]
@@ -148,7 +148,7 @@ class Queues:
         return seeds
 
 
-def raise_failures(outcome: Outcome) -> None:
+def raise_failures(outcome: EngineOutcome) -> None:
     """Turn failed groups into one error.
 
     Raises

@@ -23,7 +23,7 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             name="slurm",
             summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite status`",
             factory="qrlsuite.engine.slurm:SlurmEngine",
-            options="qrlsuite.engine.slurm:Options",
+            options="qrlsuite.engine.slurm:SlurmOptions",
             extras={"submitit": "pip install 'qrlsuite[slurm]'"},
             submits=True,
         )

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 from qrlsuite import registry
 from qrlsuite.engine.execution import Plan
 from qrlsuite.engine.terminal import command
-from qrlsuite.results.seeds import Group
+from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.text import counted, duration
 
 PLAIN_SECONDS = 20.0
@@ -82,7 +82,7 @@ class CostEstimate:
     An epoch is never taken to be shorter than what the current one has taken so far.
     """
 
-    def __init__(self, groups: Sequence[Group], epochs: int, workers: int) -> None:
+    def __init__(self, groups: Sequence[SeedGroup], epochs: int, workers: int) -> None:
         self.groups = {group.id: group for group in groups}
         self.epochs = epochs
         self.workers = min(workers, max(1, len(groups)))

@@ -17,14 +17,14 @@ import numpy as np
 
 from qrlsuite import registry, specs
 from qrlsuite.engine import api
-from qrlsuite.engine.api import Engine, Outcome
+from qrlsuite.engine.api import Engine, EngineOutcome
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.claims import living
 from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import Group, plan_groups
+from qrlsuite.results.seeds import SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import duration_range
 from qrlsuite.training import device as devices
@@ -52,7 +52,7 @@ class Execution:
     submits: bool = False
     name: str = "local"
 
-    def run(self, work: Plan, show: api.Show) -> Outcome:
+    def run(self, work: Plan, show: api.Show) -> EngineOutcome:
         """Let the engine train the groups of a plan."""
         return self.engine.run(
             api.Work(work.store, work.groups, work.epochs, self.workers, self.device), show
@@ -85,7 +85,7 @@ class Plan:
     seeds: Sequence[int]
     epochs: int
     busy: frozenset[int] = frozenset()
-    groups: Sequence[Group] = field(default_factory=list)
+    groups: Sequence[SeedGroup] = field(default_factory=list)
 
     @property
     def missing(self) -> list[int]:
@@ -186,7 +186,7 @@ def train(
     display: RunDisplay,
     minutes: float | None = None,
     confirmed: bool = True,
-) -> Outcome:
+) -> EngineOutcome:
     """Train what is planned, showing progress; returns how it ended.
 
     Parameters
@@ -221,12 +221,12 @@ def train(
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in living(work.store)})
     display.begin(execution.submits, holders)
     if not work.groups:
-        return Outcome()
+        return EngineOutcome()
     try:
         outcome = execution.run(work, show)
     except _TimeIsUp:
         display.out_of_time(minutes or 0.0)
-        return Outcome()
+        return EngineOutcome()
     except KeyboardInterrupt:
         display.interrupted()
         raise
@@ -304,7 +304,7 @@ def _remove(folder: Path) -> None:
         folder.parent.parent.rmdir()
 
 
-def _warnings(store: EntryStore, group: Group) -> list[str]:
+def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:
     """Return what a group's worker left for the user to know."""
     left = ProgressFile(store, group.id).read().get("warnings")
     return [str(message) for message in left] if isinstance(left, list) else []

@@ -14,9 +14,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import IO
 
-from qrlsuite.engine.api import Outcome, Show, Work, worker_command
+from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
 from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import Group
+from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 
 ATTEMPTS = 3
@@ -28,7 +28,7 @@ IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
 
 @dataclass
 class _Job:
-    group: Group
+    group: SeedGroup
     progress: ProgressFile
     deaths: int = 0
     epoch_at_death: int = -1
@@ -57,7 +57,7 @@ class LocalEngine:
         """Return nothing: what waits for a local process waits in that process."""
         return set()
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         """Train groups in worker processes until all have finished or failed.
 
         Raises
@@ -67,7 +67,7 @@ class LocalEngine:
         """
         jobs = [_Job(group, ProgressFile(work.store, group.id)) for group in work.groups]
         waiting = deque(jobs)
-        outcome = Outcome()
+        outcome = EngineOutcome()
         for job in jobs:
             job.progress.clear()
         try:
@@ -129,7 +129,7 @@ def _ignore_warnings() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _ended(job: _Job, code: int, outcome: Outcome) -> bool:
+def _ended(job: _Job, code: int, outcome: EngineOutcome) -> bool:
     """Judge an ended worker; returns whether to try again, else enters what became of it in the outcome."""
     text = ""
     if job.output is not None:

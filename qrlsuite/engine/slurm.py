@@ -22,11 +22,11 @@ from typing import Annotated, Any
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import survey
-from qrlsuite.results.seeds import Group
+from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
 
 TASKS = 10
@@ -64,7 +64,7 @@ def minutes(text: Any) -> int:
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class Options:
+class SlurmOptions:
     """Options of the engine `slurm`; where one is absent, the cluster's own default is taken."""
 
     partition: Annotated[str | None, pydantic.Field(description="as for sbatch")] = None
@@ -107,7 +107,7 @@ class ArrayTask:
 
         signal.signal(signal.SIGTERM, _canceled)
         self._engine = LocalEngine()
-        group = Group(self.seeds, 0)
+        group = SeedGroup(self.seeds, 0)
         work = Work(EntryStore(Path(self.folder)), [group], self.epochs, 1, self.device)
         outcome = self._engine.run(work, lambda snapshot: None)
         raise_failures(outcome)
@@ -133,7 +133,7 @@ def _canceled(number: int, frame: FrameType | None) -> None:
 class SlurmEngine:
     """Submits job arrays."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: SlurmOptions) -> None:
         self.options = options
         self._asked = 0.0
         self._answer: set[str] | None = None
@@ -158,7 +158,7 @@ class SlurmEngine:
         waiting = self._answer
         return {seed for task in tasks if task["job"] in waiting for seed in task["seeds"]}
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         """Submit the groups as one job array and return.
 
         Raises
@@ -206,7 +206,7 @@ class SlurmEngine:
         _remember(work.store, ids, work.groups, work.epochs)
         array = ids[0].partition("_")[0]
         plural = "s" * (len(ids) > 1)
-        return Outcome(
+        return EngineOutcome(
             submitted=f"submitted {len(ids)} task{plural} as SLURM job {array}; `qrlsuite status` shows how far they "
             f"are, `scancel {array}` stops them with everything saved, the same command submits what is missing then"
         )
@@ -227,7 +227,7 @@ def submitted(store: EntryStore) -> list[dict[str, Any]]:
     return tasks
 
 
-def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[Group], epochs: int) -> None:
+def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[SeedGroup], epochs: int) -> None:
     """Add tasks to `submitted.json`, and forget those that SLURM no longer knows."""
     try:
         waiting = _waiting()

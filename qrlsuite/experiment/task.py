@@ -26,18 +26,18 @@ from qrlsuite.statistics.grid import Grid
 FORMAT_VERSION = 1
 
 
-class _Section(BaseModel):
+class _TaskTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class EnvironmentSection(_Section):
+class EnvironmentSection(_TaskTable):
     """Which environment, with which options."""
 
     name: Annotated[str, Field(description="a registered environment")]
     options: Annotated[dict[str, Any], Field(description="its options; absent ones take their defaults")] = {}
 
 
-class ProtocolSection(_Section):
+class ProtocolSection(_TaskTable):
     """How much each seed interacts, and how it is validated."""
 
     seeds: Annotated[int, Field(ge=1, description="independent runs of a complete entry")] = 100
@@ -67,7 +67,7 @@ class ProtocolSection(_Section):
         return self.interactions // self.environments
 
 
-class ScoreSection(_Section):
+class ScoreSection(_TaskTable):
     """How an episode's score in [0, 1] comes about."""
 
     source: Annotated[
@@ -87,7 +87,7 @@ class ScoreSection(_Section):
         return self
 
 
-class Cell(_Section):
+class Cell(_TaskTable):
     """One cell of a ranking grid: a threshold, relative (`epsilon`) or absolute, and a probability."""
 
     epsilon: Annotated[float | None, Field(ge=0, lt=1)] = None
@@ -95,7 +95,7 @@ class Cell(_Section):
     delta: Annotated[float, Field(gt=0, le=1)]
 
 
-class RankingSection(_Section):
+class RankingSection(_TaskTable):
     """On which cells entries are compared."""
 
     epsilons: Annotated[
@@ -154,7 +154,7 @@ class RankingSection(_Section):
 Family = Literal["all", "classical", "quantum"]
 
 
-class TaskFile(_Section):
+class TaskFile(_TaskTable):
     """A whole task file."""
 
     format_version: Literal[1]

@@ -20,7 +20,7 @@ LONGEST_RANGE = 36
 
 
 @dataclass(frozen=True)
-class Group:
+class SeedGroup:
     """Seeds that are at the same epoch and are trained together."""
 
     seeds: tuple[int, ...]
@@ -97,7 +97,7 @@ def format_seeds(seeds: Sequence[int]) -> str:
     return f"{text}:{int(text) + 1}" if text.isdecimal() else text  # a lone number would count from 0
 
 
-def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: int) -> list[Group]:
+def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: int) -> list[SeedGroup]:
     """Divide the unfinished seeds into groups: as many as workers, seeds at different epochs apart."""
     finished = store.finished(seeds, epochs)
     newest = checkpoint.latest(store)
@@ -111,5 +111,5 @@ def plan_groups(store: EntryStore, seeds: Sequence[int], epochs: int, workers: i
         pieces = math.ceil(len(members) / size)
         for piece in range(pieces):  # as even as can be
             low, high = piece * len(members) // pieces, (piece + 1) * len(members) // pieces
-            groups.append(Group(tuple(members[low:high]), epoch))
+            groups.append(SeedGroup(tuple(members[low:high]), epoch))
     return groups

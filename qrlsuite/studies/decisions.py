@@ -46,11 +46,11 @@ FIRST_SEED = 10_000
 """Where blocks of seeds begin unless told otherwise: no protocol asks for as many."""
 
 
-class _Section(BaseModel):
+class _PlanTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class PlannedEntry(_Section):
+class PlannedEntry(_PlanTable):
     """An entry of a plan; the keys mean what they mean in a study's entries."""
 
     model: Annotated[str, Field(min_length=1)]
@@ -62,7 +62,7 @@ class PlannedEntry(_Section):
     hash: Annotated[str, Field(description="of the entry that these options make: it cannot become another")]
 
 
-class PlanFile(_Section):
+class PlanFile(_PlanTable):
     """A whole plan file."""
 
     format_version: Literal[1]

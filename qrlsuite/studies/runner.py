@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry
-from qrlsuite.engine.api import Outcome
+from qrlsuite.engine.api import EngineOutcome
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution, Plan, plan, train
 from qrlsuite.engine.terminal import Shown
@@ -26,7 +26,7 @@ from qrlsuite.studies.study import Member, Study
 
 
 @dataclass(frozen=True)
-class Item:
+class PendingEntry:
     """An entry of a study: what is missing of it, and what that costs.
 
     Attributes
@@ -84,7 +84,7 @@ class Overview(Shown):
     """A study's entries: what is there of each, and how long the rest will take with some workers."""
 
     study: Study
-    items: Sequence[Item]
+    items: Sequence[PendingEntry]
     workers: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class Overview(Shown):
         return table
 
 
-def _total(items: Sequence[Item]) -> tuple[float, float]:
+def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:
     """Return the least and the most core-seconds left of the items whose cost is known."""
     ranges = [item.range or (0.0, 0.0) for item in items]
     return sum(low for low, _ in ranges), sum(high for _, high in ranges)
@@ -197,7 +197,7 @@ def survey(
     speeds: Speeds,
     seeds: Sequence[int] | None,
     epochs: int | None,
-) -> list[Item]:
+) -> list[PendingEntry]:
     """Look at every entry of a study, in its order, each once; writes nothing.
 
     Parameters
@@ -218,17 +218,17 @@ def survey(
     for key, entry in unique.items():
         work = plan(runs, entry, execution, seeds, epochs)
         estimate = speeds.estimate(entry, work.together)
-        items.append(Item(work, tuple(dict.fromkeys(groups[key])), estimate))
+        items.append(PendingEntry(work, tuple(dict.fromkeys(groups[key])), estimate))
     return items
 
 
-def cheapest_first(items: Sequence[Item]) -> list[Item]:
+def cheapest_first(items: Sequence[PendingEntry]) -> list[PendingEntry]:
     """Return the items that lack something: the least core-seconds first, then those of unknown cost."""
     lacking = [item for item in items if item.plan.groups]
     return sorted(lacking, key=lambda item: (item.seconds is None, item.seconds or 0.0))
 
 
-def fitting(item: Item, seconds: float, workers: int) -> list[int]:
+def fitting(item: PendingEntry, seconds: float, workers: int) -> list[int]:
     """Return the missing seeds that can be trained within a time: those that have least to go first.
 
     Where nothing of this very entry was measured yet, half of the time is planned for, at most: the next look will
@@ -254,8 +254,8 @@ def fitting(item: Item, seconds: float, workers: int) -> list[int]:
     return sorted(chosen)
 
 
-def dry_run(items: Sequence[Item], budget: float | None, workers: int) -> list[dict[str, Any]]:
-    """Return what would be trained, in this order: `Item.as_dict` with the number of seeds, `would_train`.
+def dry_run(items: Sequence[PendingEntry], budget: float | None, workers: int) -> list[dict[str, Any]]:
+    """Return what would be trained, in this order: `PendingEntry.as_dict` with the number of seeds, `would_train`.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def dry_run(items: Sequence[Item], budget: float | None, workers: int) -> list[d
     return steps
 
 
-def check_budget(items: Sequence[Item], budget: float, workers: int) -> None:
+def check_budget(items: Sequence[PendingEntry], budget: float, workers: int) -> None:
     """Refuse a budget into which not even one seed of the cheapest entry fits.
 
     Raises
@@ -312,7 +312,7 @@ class Session:
     clock: Callable[[], float] = time.monotonic
     _planned: float = 0.0
 
-    def run(self, items: Sequence[Item]) -> list[Item]:
+    def run(self, items: Sequence[PendingEntry]) -> list[PendingEntry]:
         """Train what is missing, cheapest first; returns the items that did not fit into the budget.
 
         Raises
@@ -338,7 +338,7 @@ class Session:
                 item = self._batch(item, chosen, f"{number} of {len(order)}")
         return left_over
 
-    def _batch(self, item: Item, chosen: list[int], title: str) -> Item:
+    def _batch(self, item: PendingEntry, chosen: list[int], title: str) -> PendingEntry:
         """Train some seeds of an item; returns what is left of it."""
         work = item.plan
         there = sorted(set(work.seeds) - set(work.missing) - set(work.busy))
@@ -348,7 +348,7 @@ class Session:
         outcome = train(part, self.execution, display)
         return self._after(item, part, outcome)
 
-    def _after(self, item: Item, part: Plan, outcome: Outcome) -> Item:
+    def _after(self, item: PendingEntry, part: Plan, outcome: EngineOutcome) -> PendingEntry:
         work = item.plan
         store = part.store
         if outcome.submitted is not None:
@@ -365,4 +365,4 @@ class Session:
             stuck = set(part.missing) - done  # another process has them
             wanted = [seed for seed in work.seeds if seed not in stuck]
             rest = plan(self.runs, work.entry, self.execution, wanted, work.epochs)
-        return Item(rest, item.groups, self.speeds.estimate(work.entry, rest.together))
+        return PendingEntry(rest, item.groups, self.speeds.estimate(work.entry, rest.together))

@@ -28,11 +28,11 @@ LARGEST = 1000
 """Entries that a study may have."""
 
 
-class _Section(BaseModel):
+class _StudyTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class MatchSection(_Section):
+class MatchSection(_StudyTable):
     """An option that is computed: the value whose parameter count is nearest to that of another group's entry."""
 
     option: Annotated[
@@ -41,7 +41,7 @@ class MatchSection(_Section):
     group: Annotated[str, Field(description="the group of entries whose parameter counts are matched")]
 
 
-class EntriesSection(_Section):
+class EntriesSection(_StudyTable):
     """A group of entries: every combination of its tasks, models and grid."""
 
     name: Annotated[Name, Field(description="by which pictures and other groups refer to it")]
@@ -59,14 +59,14 @@ class EntriesSection(_Section):
     match: MatchSection | None = None
 
 
-class EvaluationSection(_Section):
+class EvaluationSection(_StudyTable):
     """For a picture of episodes: how many of each entry's runs play how many episodes."""
 
     best: Annotated[int, Field(ge=1)] = 10
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
 
 
-class PictureSection(_Section):
+class PictureSection(_StudyTable):
     """A picture of the study's entries."""
 
     name: Annotated[Name, Field(description="part of the file's name")] = "picture"
@@ -76,7 +76,7 @@ class PictureSection(_Section):
     evaluation: EvaluationSection | None = None
 
 
-class StudyFile(_Section):
+class StudyFile(_StudyTable):
     """A whole study file."""
 
     format_version: Literal[1]

@@ -13,7 +13,7 @@ from qrlsuite.training import trackers
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class CheckTarget:
     """One thing to check: its kind in the plural, and its name, or for a hook-only tracker its module's."""
 
     kind: str
@@ -25,7 +25,7 @@ class Item:
         return f"{registry.SINGULAR[self.kind].replace('_', ' ')} {self.name}"
 
 
-def select(word: str) -> list[Item]:
+def select(word: str) -> list[CheckTarget]:
     """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, or the module of a tracker.
 
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
@@ -53,14 +53,14 @@ def select(word: str) -> list[Item]:
     if kinds:
         return _of_kind(kinds[0], word)
     if _is_module(word) and (word in _watching() or "." in word):
-        return [Item("trackers", word)]
+        return [CheckTarget("trackers", word)]
     if distribution is not None:
         return of_distribution(distribution)
     names = {name for kind in registry.KINDS for name in known.entries[kind]} | _distributions()
     raise UnknownNameError(f"nothing called '{word}' is registered{nearest(word, names)}")
 
 
-def of_distribution(distribution: str) -> list[Item]:
+def of_distribution(distribution: str) -> list[CheckTarget]:
     """Return everything that a distribution registers, and its plugins that watch runs.
 
     Raises
@@ -73,9 +73,13 @@ def of_distribution(distribution: str) -> list[Item]:
     if problems:
         raise QrlSuiteError("; ".join(problems))
     found = [
-        Item(kind, entry.spec.name) for kind, entry in known if distribution in _owners(kind, entry.spec.name)
+        CheckTarget(kind, entry.spec.name)
+        for kind, entry in known
+        if distribution in _owners(kind, entry.spec.name)
     ]
-    found += [Item("trackers", module) for module, owner in _watching().items() if owner == distribution]
+    found += [
+        CheckTarget("trackers", module) for module, owner in _watching().items() if owner == distribution
+    ]
     if not found:
         raise QrlSuiteError(
             f"'{distribution}' registers nothing by name and watches no run; commands have no rules. Nothing to check: "
@@ -84,7 +88,7 @@ def of_distribution(distribution: str) -> list[Item]:
     return found
 
 
-def _of_kind(kind: str, name: str) -> list[Item]:
+def _of_kind(kind: str, name: str) -> list[CheckTarget]:
     """Return what `KIND:NAME` stands for."""
     if kind == "distribution":
         distribution = _distribution(name)
@@ -98,7 +102,7 @@ def _of_kind(kind: str, name: str) -> list[Item]:
         known.get(wanted, name)
     elif name not in known.entries[wanted] and not _is_module(name):
         raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[wanted])}")
-    return [Item(wanted, name)]
+    return [CheckTarget(wanted, name)]
 
 
 def _owners(kind: str, name: str) -> list[str]:

@@ -167,7 +167,7 @@ def build(observations, actions, options, generator):
 
 @hookimpl
 def register_models(register):
-    options = "qrlsuite.plugins.models.mlp:Options"
+    options = "qrlsuite.plugins.models.mlp:MLPOptions"
     register(ModelSpec("breaks", "Cannot be built", "classical", options, "broken_model:build"))
 """
 

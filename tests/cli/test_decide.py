@@ -18,7 +18,7 @@ from typer.testing import CliRunner, Result
 from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
-from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.specs import EngineSpec
@@ -63,7 +63,7 @@ class Scripted:
     def queued(self, store: EntryStore) -> set[int]:
         return set()
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         for group in work.groups:
             if len(self.trained) == self.interrupt_at:
                 raise KeyboardInterrupt
@@ -71,14 +71,14 @@ class Scripted:
             for seed in group.seeds:
                 put(work.store, seed, work.epochs, STARTS[width](seed))
             self.trained.append((width, group.seeds[0], len(group.seeds)))
-        return Outcome()
+        return EngineOutcome()
 
 
 class Queue(Scripted):
     """An engine that hands work over and leaves."""
 
-    def run(self, work: Work, show: Show) -> Outcome:
-        return Outcome(submitted=f"{sum(len(group.seeds) for group in work.groups)} seeds submitted")
+    def run(self, work: Work, show: Show) -> EngineOutcome:
+        return EngineOutcome(submitted=f"{sum(len(group.seeds) for group in work.groups)} seeds submitted")
 
 
 @pytest.fixture(autouse=True)

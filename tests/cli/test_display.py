@@ -15,10 +15,10 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.tables import COLUMNS
 from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import Group
+from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 
-PAIR = [Group((0, 1, 2), 0), Group((3, 4), 0)]
+PAIR = [SeedGroup((0, 1, 2), 0), SeedGroup((3, 4), 0)]
 
 
 @pytest.fixture

@@ -25,10 +25,10 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
     """Three entries in place of a results folder."""
     found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
 
-    def read(runs: Path, name: str, shipped: bool, tasks: Sequence[str]) -> list[EntryCurves]:
+    def read(runs: Path, name: str, published: bool, tasks: Sequence[str]) -> list[EntryCurves]:
         return [next(entry for entry in found if name in entry.label)]
 
-    monkeypatch.setattr(collect, "collect", lambda runs, task=None, shipped=False: (found, []))
+    monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False: (found, []))
     monkeypatch.setattr(collect, "_read_copies", read)
     return found
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
-from qrlsuite.engine.api import Outcome, Show, Work
+from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
@@ -25,7 +25,7 @@ from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec
-from qrlsuite.studies.runner import Item, cheapest_first, check_budget, fitting, survey
+from qrlsuite.studies.runner import PendingEntry, cheapest_first, check_budget, fitting, survey
 from qrlsuite.studies.study import parse
 from tests.conftest import HANGS, TINY, Hold, results
 
@@ -72,11 +72,11 @@ class Here:
     def queued(self, store: EntryStore) -> set[int]:
         return set()
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         for group in work.groups:
             train_group(work.store.path, group.seeds, work.epochs)
             self.trained.append((work.store.record()["label"], group.seeds))
-        return Outcome()
+        return EngineOutcome()
 
 
 class Queue(Here):
@@ -87,10 +87,10 @@ class Queue(Here):
     def queued(self, store: EntryStore) -> set[int]:
         return self.waiting.get(store.path.name, set())
 
-    def run(self, work: Work, show: Show) -> Outcome:
+    def run(self, work: Work, show: Show) -> EngineOutcome:
         seeds = {seed for group in work.groups for seed in group.seeds}
         self.waiting.setdefault(work.store.path.name, set()).update(seeds)
-        return Outcome(submitted=f"{len(seeds)} seeds submitted")
+        return EngineOutcome(submitted=f"{len(seeds)} seeds submitted")
 
 
 @pytest.fixture(autouse=True)
@@ -296,7 +296,7 @@ def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp
     assert "left out, at epoch 1: ddqn mlp width=4" in drawn.stdout
 
 
-def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[Item]:
+def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[PendingEntry]:
     study = parse(Path(widths).read_text(), "widths.toml")
     return survey(study.members(), tmp_path / "runs", Execution(Here(), 2), speeds, range(4), 10)
 
@@ -322,13 +322,13 @@ def test_what_fits_into_a_budget(widths: str, tmp_path: Path) -> None:
     assert fitting(item, 10, 2) == [0, 1], "half of it would hold nothing"
     assert fitting(item, 28, 2) == [0, 1], "half of it is planned for"
     assert fitting(item, 40, 2) == [0, 1, 2, 3]
-    measured = Item(item.plan, item.groups, speed.Estimate(1.0, "measured"))
+    measured = PendingEntry(item.plan, item.groups, speed.Estimate(1.0, "measured"))
     assert fitting(measured, 10, 2) == [0, 1]
     assert fitting(measured, 15, 2) == [0, 1, 2], (
         "as many core-seconds as two workers have, if no seed is too long"
     )
     assert fitting(measured, 20, 2) == [0, 1, 2, 3]
-    unknown = Item(item.plan, item.groups, speed.Estimate(None, "unknown"))
+    unknown = PendingEntry(item.plan, item.groups, speed.Estimate(None, "unknown"))
     assert fitting(unknown, 1, 2) == [0, 1], "one seed per worker, to learn what it costs"
 
 

@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import from_record, resolve
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.published import SHIPPED
+from qrlsuite.leaderboard.published import PUBLISHED
 from qrlsuite.results.store import EntryStore, json_line
 from tests.golden.make import EPOCHS, GOLDEN, SEEDS, machine
 
@@ -51,7 +51,7 @@ def test_published_entries_keep_their_hashes(version: Path) -> None:
         entry = from_record(record, record["name"])  # raises where the hash is another one
         kept = ("name", "hash", "label", "task_hash", "identity")
         assert {name: entry.record()[name] for name in kept} == {name: record[name] for name in kept}
-        there = EntryStore(SHIPPED / record["task_name"] / record["name"]).record()
+        there = EntryStore(PUBLISHED / record["task_name"] / record["name"]).record()
         assert {name: there[name] for name in kept} == {name: record[name] for name in kept}
 
 

@@ -37,18 +37,18 @@ class Layer:
 
 
 @dataclass(frozen=True, config=FROZEN)
-class LaterModel(mlp.Options):
+class LaterModel(mlp.MLPOptions):
     dropout: Annotated[float, Field(description="dropped"), Since("0.2.0")] = 0
     layers: Annotated[tuple[Layer, ...], Field(description="layers"), Since("0.2.0")] = (Layer(),)
 
 
 @dataclass(frozen=True, config=FROZEN)
-class LaterAlgorithm(ddqn.Options):
+class LaterAlgorithm(ddqn.DDQNOptions):
     warm_up: Annotated[int, Field(description="steps before learning"), Since("0.2.0")] = 0
 
 
 @dataclass(frozen=True, config=FROZEN)
-class LaterEnvironment(beam6g.Options):
+class LaterEnvironment(beam6g.BeamOptions):
     wind: Annotated[list[float], Field(description="m/s"), Since("0.2.0")] = dataclasses.field(
         default_factory=list
     )
@@ -133,7 +133,7 @@ def test_options_of_an_ansatz_are_covered_where_they_are_used(
 ) -> None:
     before = resolve(tiny_task, "vqc-native")
     upgrade()
-    changed = vqc.NativeOptions(ansatz_options={"twirl": True})
+    changed = vqc.VQCNativeOptions(ansatz_options={"twirl": True})
     assert options.identity(changed)["ansatz_options"] == {"twirl": True}
     assert "twirl" not in str(before.identity)
 

@@ -114,7 +114,7 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
         if kind == "studies" and isinstance(registered.spec, StudySpec) and registered.spec.speeds
     }
     known = Speeds(references=[replace(row, calibration=None) for row in speed.load(path)])
-    found = [*published.SHIPPED.glob("*/*/entry.json")]
+    found = [*published.PUBLISHED.glob("*/*/entry.json")]
     assert len(found) >= 11
     for file in found:
         record = json.loads(file.read_text())

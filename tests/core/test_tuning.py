@@ -16,7 +16,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError, U
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.published import SHIPPED
+from qrlsuite.leaderboard.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space
@@ -172,7 +172,7 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", sorted((SHIPPED / "cartpole").glob("*/entry.json")), ids=lambda p: p.parent.name
+    "path", sorted((PUBLISHED / "cartpole").glob("*/entry.json")), ids=lambda p: p.parent.name
 )
 def test_published_entries_carry_the_tuning_of_the_preset_they_use(path: Path) -> None:
     record = EntryStore(path.parent).record()
@@ -186,7 +186,7 @@ def test_published_entries_carry_the_tuning_of_the_preset_they_use(path: Path) -
 
 
 def test_a_record_of_tuning_in_an_entry_is_checked_and_marked(tmp_path: Path) -> None:
-    shutil.copy(SHIPPED / "beam6g" / "ddqn-mlp-333341ef" / "entry.json", tmp_path)
+    shutil.copy(PUBLISHED / "beam6g" / "ddqn-mlp-333341ef" / "entry.json", tmp_path)
     store, record = EntryStore(tmp_path), json.loads((tmp_path / "entry.json").read_text())
     assert store.record()["tuning"] == record["tuning"], "nulls are what is not known"
 

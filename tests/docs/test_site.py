@@ -70,7 +70,7 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
             ["qrlsuite.algorithm.Algorithm", "qrlsuite.environment.LaneEnv", "qrlsuite.population.stack"],
         ),
         ("algorithms", ["qrlsuite.plugins.algorithms.ddqn.DDQN"]),
-        ("models", ["qrlsuite.plugins.models.mlp.Options"]),
+        ("models", ["qrlsuite.plugins.models.mlp.MLPOptions"]),
         ("environments", ["qrlsuite.plugins.environments.beam6g.env.BeamManagement6G"]),
     ],
 )

@@ -16,12 +16,12 @@ from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.engine import api, local, worker
 from qrlsuite.engine.local import LocalEngine
-from qrlsuite.engine.slurm import Options, SlurmEngine, minutes
+from qrlsuite.engine.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.options import build as build_options
 from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import acquire
-from qrlsuite.results.seeds import Group
+from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
 from tests.conftest import results
 
@@ -68,16 +68,16 @@ def test_time_limits_are_read_as_slurm_reads_them(text: object, expected: int) -
 @pytest.mark.parametrize("text", ["", "soon", "1:2:3:4", "-5", "0", "0:30", "1h"])
 def test_times_that_are_none(text: str) -> None:
     with pytest.raises(OptionError, match=r"engine 'slurm': time = .*: (write minutes|a task needs)"):
-        build_options(Options, {"time": text}, "engine 'slurm'")
+        build_options(SlurmOptions, {"time": text}, "engine 'slurm'")
 
 
 def test_slurm_that_is_not_there(train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
     store = EntryStore(train("runs", [0], 1))
     monkeypatch.setenv("PATH", "")
-    engine = SlurmEngine(Options())
+    engine = SlurmEngine(SlurmOptions())
     with pytest.raises(QrlSuiteError, match="there is no SLURM on this machine"):
-        engine.run(api.Work(store, [Group((1,), 0)], 2, 1), lambda snapshot: None)
+        engine.run(api.Work(store, [SeedGroup((1,), 0)], 2, 1), lambda snapshot: None)
     assert engine.queued(store) == set(), "without a submission nobody is asked"
     write_json(
         store.path / "slurm" / "submitted.json", {"tasks": [{"job": "1_0", "seeds": [3], "epochs": 2}]}
@@ -97,7 +97,7 @@ def test_what_is_queued_is_left_to_the_queue(
     write_json(store.path / "slurm" / "submitted.json", {"tasks": tasks})
     answer = subprocess.CompletedProcess([], 0, stdout="7_1\n8_0\n6\n", stderr="")
     monkeypatch.setattr(subprocess, "run", lambda *arguments, **options: answer)
-    assert SlurmEngine(Options()).queued(store) == {3, 4}
+    assert SlurmEngine(SlurmOptions()).queued(store) == {3, 4}
 
 
 def test_a_worker_started_twice_does_no_harm(train: Callable[..., Path]) -> None:
@@ -230,7 +230,7 @@ def test_squeue_is_asked_once_for_many_entries(
         return subprocess.CompletedProcess([], 0, stdout="7_0\n", stderr="")
 
     monkeypatch.setattr(subprocess, "run", squeue)
-    engine = SlurmEngine(Options())
+    engine = SlurmEngine(SlurmOptions())
     assert [engine.queued(store) for _ in range(50)] == [{1}] * 50
     assert len(asked) == 1
 
@@ -238,11 +238,11 @@ def test_squeue_is_asked_once_for_many_entries(
 def test_groups_that_failed_alike_are_named_together() -> None:
     failed = {"b": "no such device", "a": "no such device", "c": "another reason"}
     with pytest.raises(QrlSuiteError) as caught:
-        api.raise_failures(api.Outcome(failed=failed))
+        api.raise_failures(api.EngineOutcome(failed=failed))
     assert str(caught.value) == (
         "3 group(s) failed, finished epochs are kept: groups a, b: no such device; group c: another reason"
     )
-    api.raise_failures(api.Outcome())
+    api.raise_failures(api.EngineOutcome())
 
 
 def test_cores_are_counted_where_the_system_does_not_say_which_may_be_used(

@@ -21,7 +21,7 @@ from qrlsuite.plugins.environments.cartpole import (
     TAU,
     TOTAL_MASS,
     CartPoleLanes,
-    Options,
+    CartPoleOptions,
     advance,
     make_vector,
     parse,
@@ -127,7 +127,7 @@ def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
     observations, _ = env.reset()
     second = np.random.default_rng(1)
     np.testing.assert_array_equal(env.state[:, 3:].T, second.uniform(-0.05, 0.05, (3, 4)))
-    alone = CartPoleLanes(Options(), 3)
+    alone = CartPoleLanes(CartPoleOptions(), 3)
     alone.seed_lanes([np.random.default_rng(1)])
     np.testing.assert_array_equal(alone.reset()[0], observations[3:])
     env.state[2, [3, 5]] = 1.0  # two of the second stream's lanes fall; they are reset in their order
@@ -212,7 +212,7 @@ def test_resuming_is_exact_and_states_are_sliced_and_joined() -> None:
     state = stopped.state_dict()
     halves = []
     for part in (slice(0, 2), slice(2, 4)):
-        half = CartPoleLanes(Options(steps=17), 2)
+        half = CartPoleLanes(CartPoleOptions(steps=17), 2)
         half.seed_lanes(stopped.streams[part])
         half.load_state_dict({name: values[part].copy() for name, values in state.items()})
         halves.append((half, part))
@@ -306,7 +306,7 @@ def test_importing_twice_and_the_factory() -> None:
     from qrlsuite.plugins.environments import cartpole
 
     cartpole.register()
-    assert make_vector(Options(), 5).num_envs == 5
+    assert make_vector(CartPoleOptions(), 5).num_envs == 5
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_misuse() -> None:
     with pytest.raises(ResetNeeded, match=r"reset\(\) before state_dict"):
         env.state_dict()
     with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
-        CartPoleLanes(Options(), 0)
+        CartPoleLanes(CartPoleOptions(), 0)
     with pytest.raises(ValueError, match="3 streams cannot serve 2 lanes"):
         env.seed_lanes([np.random.default_rng(g) for g in range(3)])
     with pytest.raises(OptionError, match=r"takes the option 'state', not \['low'\]"):

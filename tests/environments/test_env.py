@@ -13,7 +13,7 @@ from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from qrlsuite.errors import OptionError
-from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, physics, register, render
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, BeamOptions, physics, register, render
 from tests.conftest import golden
 from tests.environments.test_physics import antennas
 
@@ -237,7 +237,7 @@ def test_rendering_without_a_mode_warns_and_without_reset_raises():
 
 def test_ground_truth_is_the_best_antenna_at_each_place():
     # Two antennas in a mirror at x = 3: the map is its own mirror image with the antennas exchanged.
-    options = Options(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
+    options = BeamOptions(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
     antenna, beam, intensity = render.ground_truth(options, 40)
     assert (antenna == 1 - antenna[:, ::-1]).mean() > 0.95  # where both are equal, the first is taken
     np.testing.assert_allclose(intensity, intensity[:, ::-1], rtol=1e-6)
@@ -253,7 +253,7 @@ def test_ground_truth_is_the_best_antenna_at_each_place():
 
 def test_the_map_of_the_best_antenna_names_its_regions_and_draws_every_antenna():
     # The field falls apart at x = 3: left the first antenna, right the second, each around its own place.
-    options = Options(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
+    options = BeamOptions(antennas=(((1.0, 3.0), (0.0, 1.0)), ((5.0, 3.0), (0.0, 1.0))))
     figure = render.ground_truth_figure(options, 60)
     field, scale = figure.axes
     assert field.get_title(loc="left").startswith("Best antenna")

@@ -382,7 +382,7 @@ def test_misuse() -> None:
 )
 def test_options_that_cannot_be(values: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        build(gym.Options, values, "environment 'gym'")
+        build(gym.GymOptions, values, "environment 'gym'")
 
 
 def test_the_factory_takes_every_option() -> None:
@@ -394,7 +394,7 @@ def test_the_factory_takes_every_option() -> None:
         "low": [-3, -3],
         "high": [3, 3],
     }
-    env = gym.make_vector(build(gym.Options, given, "gym"), 2)
+    env = gym.make_vector(build(gym.GymOptions, given, "gym"), 2)
     assert isinstance(env, GymLanes)
     assert env.capacity == 9
     assert env.envs[1].unwrapped.goal_velocity == 0.01  # type: ignore[attr-defined]

@@ -12,7 +12,7 @@ import pytest
 from qrlsuite.errors import OptionError
 from qrlsuite.options import describe, plain
 from qrlsuite.plugins.environments.beam6g import ID
-from qrlsuite.plugins.environments.beam6g.options import MAIN, Options, parse
+from qrlsuite.plugins.environments.beam6g.options import MAIN, BeamOptions, parse
 
 HERE = ((1.0, 1.0), (1.0, 0.0))
 
@@ -74,9 +74,9 @@ def test_unit_orientations_keep_their_bits():
 
 
 def test_defaults_are_the_standard_instance():
-    assert Options() == Options(antennas=MAIN, degree=3, steps=200, physics="released", stack=1)
+    assert BeamOptions() == BeamOptions(antennas=MAIN, degree=3, steps=200, physics="released", stack=1)
     assert MAIN == (((1.5, 1.0), (1.0, 0.0)), ((1.5, 5.0), (-1.0, 0.0)), ((4.5, 3.0), (0.0, 1.0)))
 
 
 def test_every_option_is_described():
-    assert all(row["description"] for row in describe(Options))
+    assert all(row["description"] for row in describe(BeamOptions))

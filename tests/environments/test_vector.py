@@ -10,8 +10,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from qrlsuite import registry, specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, Options, make_vector
-from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables
+from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, BeamOptions, make_vector
+from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables
 
 STEPS = 12
 
@@ -21,7 +21,7 @@ def streams(count, seed=0):
 
 
 def lanes(count, groups=None, seed=0, **options):
-    env = make_vector(Options(**{"steps": STEPS, **options}), count)
+    env = make_vector(BeamOptions(**{"steps": STEPS, **options}), count)
     env.seed_lanes(streams(groups or count, seed))
     return env
 
@@ -46,7 +46,7 @@ def walk(env, actions):
 def test_lanes_equal_single_environments_bit_by_bit(options):
     count = 7
     options = {"steps": STEPS, **options}
-    points = Simulator(Options(**options)).draw(streams(count), [1] * count)
+    points = EpisodeGenerator(BeamOptions(**options)).draw(streams(count), [1] * count)
     env = lanes(count, **options)
     observations, _ = env.reset(options={"support_points": points})
     singles = [BeamManagement6G(**options) for _ in range(count)]
@@ -78,7 +78,7 @@ def test_a_lane_draws_what_a_single_environment_draws():
 @pytest.mark.parametrize("degree", [3, 6])
 @pytest.mark.parametrize(("size", "offset"), [(1, 0), (1, 83), (2, 5), (17, 31), (100, 13)])
 def test_tables_do_not_depend_on_the_batch(degree, size, offset):
-    simulator = Simulator(Options(steps=STEPS, degree=degree))
+    simulator = EpisodeGenerator(BeamOptions(steps=STEPS, degree=degree))
     support = simulator.draw(streams(1), [150])
 
     def tables(part):
@@ -99,7 +99,7 @@ def test_groups_of_lanes_do_not_depend_on_other_groups(size, first):
     everyone.reset()
     whole = walk(everyone, actions)
     part = slice(2 * first, 2 * (first + size))
-    some = make_vector(Options(steps=STEPS), 2 * size)
+    some = make_vector(BeamOptions(steps=STEPS), 2 * size)
     some.seed_lanes(streams(20)[first : first + size])
     some.reset()
     assert walk(some, actions[:, part]) == [row[part] for row in whole]
@@ -143,7 +143,7 @@ def test_states_can_be_sliced_and_joined_at_different_steps():
     late.reset()
     walk(early, actions[:3, :2])
     walk(late, actions[:8, :3])
-    joined = make_vector(Options(steps=STEPS), 4)
+    joined = make_vector(BeamOptions(steps=STEPS), 4)
     joined.seed_lanes([*early.streams, *late.streams[1:]])
     states = early.state_dict(), late.state_dict()
     joined.load_state_dict(
@@ -155,7 +155,7 @@ def test_states_can_be_sliced_and_joined_at_different_steps():
     for stream, saved in zip(joined.streams, random):
         stream.bit_generator.state = saved
     apart = walk(early, actions[:, :2])
-    rest = make_vector(Options(steps=STEPS), 2)
+    rest = make_vector(BeamOptions(steps=STEPS), 2)
     rest.seed_lanes(late.streams[1:])
     rest.load_state_dict({name: array[1:] for name, array in states[1].items()})
     apart = [a + b for a, b in zip(apart, walk(rest, actions[:, 2:]))]
@@ -226,7 +226,7 @@ def test_autoreset_in_the_same_step():
 
 def test_seeds():
     def first(**kwargs):
-        return make_vector(Options(), 3).reset(**kwargs)[0].tolist()
+        return make_vector(BeamOptions(), 3).reset(**kwargs)[0].tolist()
 
     assert first(seed=1) == first(seed=1)
     assert first(seed=1) != first(seed=2)
@@ -272,7 +272,7 @@ def test_reset_comes_first():
 
 def test_bad_numbers_of_lanes_and_points():
     with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
-        make_vector(Options(), 0)
+        make_vector(BeamOptions(), 0)
     with pytest.raises(OptionError, match=r"must have the shape \(2, 3, 2\), not \(3, 2\)"):
         lanes(2).reset(options={"support_points": np.ones((3, 2))})
 
@@ -284,7 +284,7 @@ def test_gymnasium_make_vec():
 
 def test_registered_spec_leads_here():
     spec = registry.environment("beam6g")
-    assert specs.resolve(spec.options) is Options
+    assert specs.resolve(spec.options) is BeamOptions
     assert specs.resolve(spec.vector) is make_vector
     assert specs.resolve(spec.entry_point) is BeamManagement6G
     assert spec.gymnasium_id == ID

@@ -27,7 +27,7 @@ from qrlsuite import registry
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.published import SHIPPED
+from qrlsuite.leaderboard.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance
 from qrlsuite.results.progress import Progress
@@ -84,7 +84,7 @@ def hashes() -> dict[str, Any]:
         for words in itertools.product(("beam6g", "cartpole"), ("ddqn", "ppo", "reinforce"), models)
     }
     published = []
-    for path in sorted(SHIPPED.glob("*/*/entry.json")):
+    for path in sorted(PUBLISHED.glob("*/*/entry.json")):
         record = EntryStore(path.parent).record()
         published.append(
             {name: value for name, value in record.items() if name not in ("published", "tuning")}

@@ -148,7 +148,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 
 
 def test_published_entries_train_one_network() -> None:
-    found, refused = collect.collect(published.SHIPPED)
+    found, refused = collect.collect(published.PUBLISHED)
     assert refused == []
     assert [entry.label for entry in found if entry.first_network_alone] == []
 

@@ -94,7 +94,7 @@ def test_kinds_have_a_line_settings_and_a_drawing_function() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [name for name, picture in pictures.KINDS.items() if picture.of == "entries"]
+    "kind", [name for name, picture in pictures.KINDS.items() if picture.data == "entries"]
 )
 @pytest.mark.parametrize("format_", ["png", "svg"])
 def test_any_name_can_be_drawn_and_seeds_are_stated(kind: str, format_: str) -> None:

@@ -405,18 +405,18 @@ def test_nothing_complete_is_nothing_to_export(tmp_path: Path) -> None:
 def test_own_runs_of_a_published_entry_are_shown_once(
     folder: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(published, "SHIPPED", tmp_path / "entries")
+    monkeypatch.setattr(published, "PUBLISHED", tmp_path / "entries")
     train("mine", range(2), EPOCHS)
-    entries, refused = collect.collect(tmp_path / "mine", shipped=True)
+    entries, refused = collect.collect(tmp_path / "mine", published=True)
     assert [len(entry.seeds) for entry in entries] == [8]
     assert "2 seeds of 3 epochs; shown once" in refused[0]
     train("short", range(9), 1)
-    entries, refused = collect.collect(tmp_path / "short", shipped=True)
+    entries, refused = collect.collect(tmp_path / "short", published=True)
     assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [
         ((9, 1), False),
         ((8, 3), True),
     ], "an own entry that is shorter stands beside the published one"
-    assert len(collect.collect(tmp_path / "nothing", shipped=True)[0]) == 1
+    assert len(collect.collect(tmp_path / "nothing", published=True)[0]) == 1
 
 
 def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(

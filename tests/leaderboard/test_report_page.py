@@ -33,7 +33,7 @@ def column(tab: Any, key: str, table: str = "#board-0-table") -> list[str]:
     return values
 
 
-def test_a_shipped_sized_board_loads_offline_and_is_small(opened: Open) -> None:
+def test_a_board_of_published_size_loads_offline_and_is_small(opened: Open) -> None:
     text = render(boards.of(boards.graded(8, seeds=100)))
     assert len(text.encode()) < 1_500_000
     tab = opened(text)

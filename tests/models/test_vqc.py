@@ -7,9 +7,9 @@ from qrlsuite import options, population, registry
 from qrlsuite.circuit import ansatz, create_backend
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
-from qrlsuite.plugins.models.vqc import NativeOptions, PennyLaneOptions, QiskitOptions, VQCOptions
+from qrlsuite.plugins.models.vqc import VQCNativeOptions, VQCOptions, VQCPennyLaneOptions, VQCQiskitOptions
 
-CLASSES = {"pennylane": PennyLaneOptions, "native": NativeOptions, "qiskit": QiskitOptions}
+CLASSES = {"pennylane": VQCPennyLaneOptions, "native": VQCNativeOptions, "qiskit": VQCQiskitOptions}
 BACKENDS = [name for name in CLASSES if name in registry.load().names("circuit_backends")]
 FAST = [name for name in BACKENDS if name != "qiskit"]
 
@@ -255,7 +255,11 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
         assert set(options.field_names(CLASSES[name])) == own | set(
             options.field_names(resolve(backend_options))
         )
-    assert (PennyLaneOptions().qubits, PennyLaneOptions().layers, PennyLaneOptions().ansatz) == (10, 4, "iqp")
+    assert (VQCPennyLaneOptions().qubits, VQCPennyLaneOptions().layers, VQCPennyLaneOptions().ansatz) == (
+        10,
+        4,
+        "iqp",
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 import qrlsuite.statistics
 from qrlsuite import registry
-from qrlsuite.leaderboard.published import SHIPPED, read
+from qrlsuite.leaderboard.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
@@ -80,7 +80,7 @@ def test_decisions_on_the_page_are_those_of_the_code() -> None:
 
 
 def test_the_published_board_on_the_page_is_that_of_the_code() -> None:
-    entries = [read(folder).entry_curves() for folder in sorted((SHIPPED / "beam6g").iterdir())]
+    entries = [read(folder).entry_curves() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
     curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries]
     board = times_board(curves, SURFACE)
     tiers = {entry.name: entry.tier for entry in outperformance(curves, SURFACE).ranking.entries}

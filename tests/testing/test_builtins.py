@@ -8,7 +8,7 @@ import pytest
 
 from qrlsuite import registry
 from qrlsuite.testing import check
-from qrlsuite.testing.selection import Item, of_distribution
+from qrlsuite.testing.selection import CheckTarget, of_distribution
 
 EVERYTHING = of_distribution("qrlsuite")
 NEEDS = {("tasks", "lunarlander"): "Box2D"}
@@ -52,7 +52,7 @@ WHERE_OFFERED = {
 
 
 @pytest.mark.parametrize("item", EVERYTHING, ids=lambda item: f"{item.kind}-{item.name}")
-def test_it_conforms(item: Item) -> None:
+def test_it_conforms(item: CheckTarget) -> None:
     """A rule that is silently skipped would never be broken: so every one is named."""
     package = NEEDS.get((item.kind, item.name))
     if package is not None and importlib.util.find_spec(package) is None:

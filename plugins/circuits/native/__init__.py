@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from qrlsuite.plugins.circuits.native.backend import NativeBackend, Options
+from qrlsuite.plugins.circuits.native.backend import NativeBackend, NativeOptions
 
-__all__ = ["NativeBackend", "Options"]
+__all__ = ["NativeBackend", "NativeOptions"]

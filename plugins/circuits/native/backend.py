@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class NativeOptions:
     """The native simulator has no options: it is exact, and works in the precision of its inputs."""
 
 
@@ -42,7 +42,7 @@ class NativeBackend:
 
     shots: int | None = None
 
-    def __init__(self, circuit: Circuit, options: Options | None = None) -> None:
+    def __init__(self, circuit: Circuit, options: NativeOptions | None = None) -> None:
         circuit.require_simulable()
         self.circuit = copy.deepcopy(circuit)
         self.shapes = {name: p.shape for name, p in circuit.parameters.items()}

@@ -29,7 +29,7 @@ COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
 def expectations(program: Program, inputs: Tensor, flat: Tensor) -> Tensor:
     """Return expectation values (S, B, O) of inputs (S, B, I) and flat parameters (S, P), differentiably."""
     angles = _angles(program, inputs, flat)
-    result: Tensor = _Expectations.apply(  # type: ignore[no-untyped-call]
+    result: Tensor = _DenseExpectations.apply(  # type: ignore[no-untyped-call]
         angles.reshape(inputs.shape[0] * inputs.shape[1], -1 if angles.shape[2] else 0), program
     )
     return result.reshape(*inputs.shape[:2], len(program.observables))
@@ -54,7 +54,7 @@ def _pick(flat: Tensor, index: Tensor) -> Tensor:
     return flat[:, index.clamp(min=0)][:, None]
 
 
-class _Expectations(torch.autograd.Function):
+class _DenseExpectations(torch.autograd.Function):
     """Expectation values (L, O) of angles (L, A), with adjoint gradients."""
 
     @staticmethod

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from qrlsuite.plugins.environments.beam6g.env import ID, BeamManagement6G, register
-from qrlsuite.plugins.environments.beam6g.options import Options
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions
 from qrlsuite.plugins.environments.beam6g.vector import BeamLanes, make_vector
 
-__all__ = ["ID", "BeamLanes", "BeamManagement6G", "Options", "make_vector", "register"]
+__all__ = ["ID", "BeamLanes", "BeamManagement6G", "BeamOptions", "make_vector", "register"]
 
 register()

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.beam6g import trajectory
-from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables, reset_options
+from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables, reset_options
 from qrlsuite.plugins.environments.beam6g.options import MAIN, parse
 from qrlsuite.plugins.environments.beam6g.physics import Antenna, Name
-from qrlsuite.plugins.environments.beam6g.render import Moment, Picture, Window, as_text
+from qrlsuite.plugins.environments.beam6g.render import FrameRenderer, Moment, Window, as_text
 from qrlsuite.plugins.environments.beam6g.trajectory import Rejection
 from qrlsuite.plugins.environments.beam6g.vector import spaces
 
@@ -137,7 +137,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
             )
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces(self.options)
-        self._simulator = Simulator(self.options)
+        self._simulator = EpisodeGenerator(self.options)
         self._tables = Tables.empty(1, len(self.options.antennas), self.options.steps)
         self._support: NDArray[np.float64] | None = None
         self._step = 0
@@ -145,7 +145,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
         self._received = 0.0
         self._frames: list[NDArray[np.float32]] = []
         self._window: Window | None = None
-        self._picture: Picture | None = None
+        self._picture: FrameRenderer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -233,7 +233,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
         if self.render_mode == "ansi":
             return as_text(self.options, moment)
         if self._picture is None:
-            self._picture = Picture(self.options)
+            self._picture = FrameRenderer(self.options)
         image = self._picture.draw(moment)
         if self.render_mode == "rgb_array":
             return image

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.beam6g import physics, trajectory
-from qrlsuite.plugins.environments.beam6g.options import Options
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions
 from qrlsuite.plugins.environments.beam6g.physics import BEAMS, FIELD, BeamArray, FloatArray
 
 _BLOCK = 128
@@ -45,10 +45,10 @@ class Tables:
         return cls(np.empty(shape), np.empty(shape, dtype=np.int8), np.empty(lanes))
 
 
-class Simulator:
+class EpisodeGenerator:
     """Draws support points and tabulates episodes for given options."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: BeamOptions) -> None:
         self.options = options
         self.physics = physics.physics(options.physics)
 

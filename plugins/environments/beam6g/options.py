@@ -22,7 +22,7 @@ MAIN: tuple[Antenna, ...] = (
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
+class BeamOptions:
     """Options of BeamManagement6G."""
 
     antennas: Annotated[
@@ -87,7 +87,7 @@ def _checked(index: int, antenna: Antenna) -> Antenna:
     return ((x, y), (d_x, d_y))
 
 
-def parse(values: Mapping[str, Any]) -> Options:
+def parse(values: Mapping[str, Any]) -> BeamOptions:
     """Return the options that `values` describe.
 
     Raises
@@ -95,5 +95,5 @@ def parse(values: Mapping[str, Any]) -> Options:
     qrlsuite.errors.OptionError
         If a key is unknown or a value cannot be used; the message lists every problem.
     """
-    options: Options = build(Options, values, "environment 'beam6g'")
+    options: BeamOptions = build(BeamOptions, values, "environment 'beam6g'")
     return options

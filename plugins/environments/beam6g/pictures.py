@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite.plugins.environments.beam6g import physics, render, trajectory
-from qrlsuite.plugins.environments.beam6g.options import Options
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions
 
 INK = "#202428"
 
@@ -46,7 +46,7 @@ class FieldOptions:
     resolution: Annotated[int, Field(ge=10, le=2000, description="places along each side")] = 400
 
 
-def trajectories(worlds: Mapping[str, Options], options: TrajectoryOptions) -> Figure:
+def trajectories(worlds: Mapping[str, BeamOptions], options: TrajectoryOptions) -> Figure:
     """Draw random trajectories: one panel per environment, or per degree (the paper's figure of degrees).
 
     Dots are the support points of one of the paths, which is drawn thicker, and lie at even times, not at
@@ -77,7 +77,7 @@ def trajectories(worlds: Mapping[str, Options], options: TrajectoryOptions) -> F
     return figure
 
 
-def field(worlds: Mapping[str, Options], options: FieldOptions) -> Figure:
+def field(worlds: Mapping[str, BeamOptions], options: FieldOptions) -> Figure:
     """Draw the field of one or several environments (the paper's figures of the ground truth and of placements)."""
     if options.show == "best" and len(worlds) == 1:
         return render.ground_truth_figure(next(iter(worlds.values())), options.resolution)
@@ -98,7 +98,7 @@ def field(worlds: Mapping[str, Options], options: FieldOptions) -> Figure:
     return figure
 
 
-def _beams(axes: Axes, world: Options, options: FieldOptions) -> None:
+def _beams(axes: Axes, world: BeamOptions, options: FieldOptions) -> None:
     """Draw the intensity where every antenna sends one beam, and the antennas with the axes of their arrays."""
     places = (np.arange(options.resolution) + 0.5) * (physics.FIELD / options.resolution)
     x, y = np.meshgrid(places, places)

@@ -16,7 +16,7 @@ from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from qrlsuite.plugins.environments.beam6g import physics
-from qrlsuite.plugins.environments.beam6g.options import Options
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, Antenna, FloatArray
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class GroundTruth(NamedTuple):
     """The intensity of both, in [0, 1]: what an agent that knew the user's position would receive."""
 
 
-def ground_truth(options: Options, resolution: int = 300) -> GroundTruth:
+def ground_truth(options: BeamOptions, resolution: int = 300) -> GroundTruth:
     """Return the best antenna, its best beam and their intensity on a grid of `resolution` x `resolution` places."""
     places = (np.arange(resolution) + 0.5) * (FIELD / resolution)
     x, y = np.meshgrid(places, places)
@@ -89,7 +89,7 @@ def ground_truth(options: Options, resolution: int = 300) -> GroundTruth:
     )
 
 
-def ground_truth_figure(options: Options, resolution: int = 500) -> Figure:
+def ground_truth_figure(options: BeamOptions, resolution: int = 500) -> Figure:
     """Draw the map of the best antenna, as the paper's figure of the ground truth does (appendix on the environment).
 
     Each place has the color of its best antenna, deeper where the intensity of that antenna's best beam is higher:
@@ -126,7 +126,7 @@ def ground_truth_figure(options: Options, resolution: int = 500) -> Figure:
     return figure
 
 
-class Picture:
+class FrameRenderer:
     """Draws moments of episodes in one field; the background is drawn once.
 
     Parameters
@@ -135,7 +135,7 @@ class Picture:
         Options of the environment.
     """
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: BeamOptions) -> None:
         self.options = options
         self.figure, self.axes = _figure(6.0)
         draw_field(self.axes, options, ground_truth(options, 240))
@@ -165,7 +165,7 @@ class Picture:
         return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
-def as_text(options: Options, moment: Moment, columns: int = 49, rows: int = 17) -> str:
+def as_text(options: BeamOptions, moment: Moment, columns: int = 49, rows: int = 17) -> str:
     """Return a moment as text: a line of numbers and the field.
 
     Antennas are digits, `*` the path walked, `.` the path to walk, `@` the user.
@@ -275,7 +275,7 @@ def _shaded(color: NDArray[np.float64], intensity: FloatArray) -> FloatArray:
     return shaded
 
 
-def draw_field(axes: Axes, options: Options, truth: GroundTruth) -> None:
+def draw_field(axes: Axes, options: BeamOptions, truth: GroundTruth) -> None:
     """Draw the ground truth and the antennas, each with the axis of its array as a bar."""
     from matplotlib.colors import to_rgb
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import StoreError
-from qrlsuite.plugins.environments.beam6g.episodes import Simulator, Tables, reset_options
-from qrlsuite.plugins.environments.beam6g.options import Options, parse
+from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables, reset_options
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions, parse
 
 
 class BeamLanes(LaneEnv):
@@ -32,14 +32,14 @@ class BeamLanes(LaneEnv):
         Number of lanes L, at least 1.
     """
 
-    def __init__(self, options: Options, num_envs: int) -> None:
+    def __init__(self, options: BeamOptions, num_envs: int) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.options = options
         observation, action = spaces(options)
         batched_spaces(self, observation, action, num_envs)
         self.streams = []
-        self._simulator = Simulator(options)
+        self._simulator = EpisodeGenerator(options)
         self._lane = np.arange(num_envs)
         self._support: NDArray[np.float64] | None = None
         self._step = np.zeros(num_envs, dtype=np.int64)
@@ -233,17 +233,17 @@ class BeamLanes(LaneEnv):
         return infos
 
 
-def spaces(options: Options) -> tuple[gymnasium.Space[NDArray[np.float32]], gymnasium.Space[np.int64]]:
+def spaces(options: BeamOptions) -> tuple[gymnasium.Space[NDArray[np.float32]], gymnasium.Space[np.int64]]:
     """Return the observation and the action space of one lane."""
     observation: Any = gymnasium.spaces.Box(0.0, 1.0, (3 * options.stack,), np.float32)
     return observation, gymnasium.spaces.Discrete(len(options.antennas))
 
 
-def make_vector(options: Options, num_envs: int) -> LaneEnv:
+def make_vector(options: BeamOptions, num_envs: int) -> LaneEnv:
     """Return the vector environment of `options` with `num_envs` lanes."""
     return BeamLanes(options, num_envs)
 
 
 def make_vec(num_envs: int = 1, **kwargs: Any) -> LaneEnv:
-    """Return the vector environment for `gymnasium.make_vec`; `kwargs` are fields of `Options`."""
+    """Return the vector environment for `gymnasium.make_vec`; `kwargs` are fields of `BeamOptions`."""
     return BeamLanes(parse(kwargs), num_envs)

@@ -16,7 +16,7 @@ from rich.text import Text
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration, findings, rules
-from qrlsuite.leaderboard.calibration import Finding, Job
+from qrlsuite.leaderboard.calibration import CalibrationResult, Job
 from qrlsuite.leaderboard.tables import table
 from qrlsuite.results.text import duration
 
@@ -115,7 +115,7 @@ def _pair(word: str) -> tuple[int, int]:
     return pair
 
 
-def _compute(jobs: Sequence[Job], quiet: bool) -> list[Finding]:
+def _compute(jobs: Sequence[Job], quiet: bool) -> list[CalibrationResult]:
     """Run all jobs behind one progress bar, having said how long that will take."""
     console = Console(stderr=True, quiet=quiet, highlight=False)
     seconds = calibration.estimate(jobs)

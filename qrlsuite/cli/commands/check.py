@@ -15,9 +15,8 @@ from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
 from qrlsuite.options import parse_setting
 from qrlsuite.testing import Finding, selection
-from qrlsuite.testing.findings import Finding as Found
 from qrlsuite.testing.findings import watching
-from qrlsuite.testing.selection import Item
+from qrlsuite.testing.selection import CheckTarget
 
 
 def check(
@@ -56,15 +55,15 @@ def check(
         raise typer.Exit(1)
 
 
-def _findings(item: Item, settings: dict[str, Any]) -> list[Finding]:
+def _findings(item: CheckTarget, settings: dict[str, Any]) -> list[Finding]:
 
     try:
         return testing.check(item.kind, item.name, settings)
     except (Exception, SystemExit) as error:  # code that fails outside of any rule: the rest is still checked
-        return [Found("check", False, registry.words(error))]
+        return [Finding("check", False, registry.words(error))]
 
 
-def _plain(item: Item, finding: Finding) -> dict[str, Any]:
+def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
 
     return {
         "kind": registry.SINGULAR[item.kind],
@@ -75,13 +74,13 @@ def _plain(item: Item, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _show(items: list[Item], settings: dict[str, Any]) -> list[tuple[Item, list[Finding]]]:
+def _show(items: list[CheckTarget], settings: dict[str, Any]) -> list[tuple[CheckTarget, list[Finding]]]:
     """Check things one after another, with what is going on in the last line of a terminal."""
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     found = []
     with console.status("") as status:
 
-        def announce(item: Item) -> Callable[[str], None]:
+        def announce(item: CheckTarget) -> Callable[[str], None]:
             return lambda rule: status.update(Text(printable(f"{item.title}: {rule}")))
 
         for item in items:

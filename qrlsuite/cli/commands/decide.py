@@ -24,7 +24,7 @@ from qrlsuite.cli.training import (
     execution_of,
 )
 from qrlsuite.engine import execution
-from qrlsuite.engine.api import Outcome
+from qrlsuite.engine.api import EngineOutcome
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.terminal import command, table_console
@@ -188,11 +188,11 @@ def run(
 
 def _train(
     study: DecisionStudy, entry: Entry, seeds: Sequence[int], where: Execution, quiet: bool
-) -> Outcome:
+) -> EngineOutcome:
     """Train what is missing of an entry's seeds."""
     work = execution.plan(study.folder, entry, where, seeds, study.file.epochs)
     if not work.groups and not work.busy:
-        return Outcome()
+        return EngineOutcome()
     return execution.train(work, where, RunDisplay(work, where.workers, quiet=quiet))
 
 

@@ -24,7 +24,7 @@ from qrlsuite.options import parse_setting
 from qrlsuite.results.store import write_atomically
 
 
-class Command(TyperCommand):
+class PlotCommand(TyperCommand):
     """The command with the list of pictures at the end of its help."""
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:

@@ -33,7 +33,7 @@ LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
 
 
-class Sampler(StrEnum):
+class SamplerName(StrEnum):
     """In which order settings are tried; `qrlsuite.tuning.samplers.NAMES` says what each does."""
 
     grid = "grid"
@@ -82,9 +82,9 @@ def tune(
         typer.Option("--set", metavar="NAME=VALUE", help="A value that all trials share; not varied then."),
     ] = None,
     sampler: Annotated[
-        Sampler,
+        SamplerName,
         typer.Option("--sampler", help="All combinations, one option at a time, at random, or Optuna's TPE."),
-    ] = Sampler.grid,
+    ] = SamplerName.grid,
     trials: Annotated[
         int | None,
         typer.Option("--trials", min=1, max=100_000, help="For random and tpe: how many settings."),

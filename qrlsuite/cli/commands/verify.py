@@ -43,7 +43,7 @@ def verify(
 
     Example: qrlsuite leaderboard verify leaderboard/entries --rerun 2
     """
-    folders = [folder for path in paths or [published.SHIPPED] for folder in checks.find(path)]
+    folders = [folder for path in paths or [published.PUBLISHED] for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice
     verdicts = []
     with Progress(
