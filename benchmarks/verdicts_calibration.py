@@ -27,17 +27,15 @@ from qrlsuite.statistics import (
     LearningCurves,
     PermutationRule,
     SmoothedRuns,
+    TimesRule,
     bootstrap_interval,
-    false_winners,
     mean_time,
     outperformance,
-    power,
     sample_complexity,
     slower,
     times_board,
-    times_rates,
 )
-from qrlsuite.statistics.calibration import draw_times, judge_times, play
+from qrlsuite.statistics.calibration import draw_times, judge, judge_times, play, simulated_pairs
 
 EPSILONS, DELTAS = [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 GRID = Grid.relative(EPSILONS, DELTAS)
@@ -46,6 +44,8 @@ Q6, Q8, Q10 = (f"ddqn vqc-native qubits={qubits}" for qubits in (6, 8, 10))
 POPULATIONS = (W64, W16, Q10)
 SIZES = (20, 50, 100)
 HORIZON = 200_000
+RULES = (DifferenceRule(n_resamples=1000), IntervalRule(), PermutationRule(), TimesRule())
+"""With 1000 resamples instead of 10,000, which intervals share: rates are averages over pairs."""
 
 
 def published() -> dict[str, LearningCurves]:
@@ -68,15 +68,6 @@ def head(title: str, *columns: str) -> None:
     print(f"\n{title}\n")
     line(*columns)
     print("|" + "---|" * len(columns), flush=True)
-
-
-def print_times(pairs: int) -> None:
-    head(f"Rule times, equals, {pairs} pairs", "entry", "runs", "any difference")
-    for name in POPULATIONS:
-        generator = np.random.default_rng(0)
-        for n_runs in SIZES:
-            ours, theirs = (draw_times(MODELS[name], n_runs, pairs, GRID, generator) for _ in range(2))
-            line(name, n_runs, judge_times(ours, theirs).found)
 
 
 def print_unequal(pairs: int) -> None:
@@ -140,15 +131,6 @@ def rivals(entries: dict[str, LearningCurves]) -> list[tuple[str, SmoothedRuns, 
     ]
 
 
-def print_power(pairs: int) -> None:
-    count = pairs // 5
-    head(f"Rule times, {count} pairs", "pair", "runs", "first needs fewer", "trade-off", "wrong direction")
-    for name, first, second in rivals(ENTRIES)[:5]:
-        for n_runs in SIZES:
-            found = times_rates(first, second, n_runs, n_runs, GRID, n_pairs=count, seed=4)
-            line(name, n_runs, found.first, found.trade_off, found.second)
-
-
 def print_seeds(pairs: int) -> None:
     count = pairs // 10
     plan = DecisionPlan(("a", "b"))
@@ -161,20 +143,26 @@ def print_seeds(pairs: int) -> None:
         line(name, *(found[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")
 
 
-def print_rules(pairs: int) -> None:
-    count = max(10, pairs // 50)
-    head(f"Rules by cells, equals, {count} pairs", "entry", "runs", "rule", "any cell", "a winner")
+def print_equals(pairs: int) -> None:
+    columns = ("entry", "runs", "rule", "a difference", "a winner")
+    head(f"All rules, equals, the same {pairs} pairs for each rule", *columns)
     for name in POPULATIONS:
         for n_runs in SIZES:
-            for rule in (IntervalRule(), DifferenceRule(), PermutationRule()):
-                rates = false_winners(MODELS[name], n_runs, n_runs, GRID, rule, count, seed=6)
-                line(name, n_runs, rule.name, rates.any_cell, rates.winner)
-    head(f"Rules by cells, {count} pairs", "pair", "runs", "rule", "first wins", "second wins")
-    for pair, first, second in [rivals(ENTRIES)[0], *rivals(ENTRIES)[3:5]]:
+            drawn = simulated_pairs(MODELS[name], MODELS[name], n_runs, n_runs, pairs, seed=6)
+            for rates in judge(drawn, GRID, RULES):
+                line(name, n_runs, rates.rule, rates.any_cell, rates.winner)
+
+
+def print_power(pairs: int) -> None:
+    count = pairs // 10
+    columns = ("pair", "runs", "rule", "first wins", "second wins", "trade-off")
+    head(f"All rules, the same {count} pairs for each rule", *columns)
+    for pair, first, second in rivals(ENTRIES)[:5]:
         for n_runs in SIZES:
-            for rule in (IntervalRule(), PermutationRule()):
-                rates = power(first, second, n_runs, n_runs, GRID, rule, count, seed=7)
-                line(pair, n_runs, rule.name, rates.first_wins, rates.second_wins)
+            drawn = simulated_pairs(first, second, n_runs, n_runs, count, seed=7)
+            for rates in judge(drawn, GRID, RULES):
+                found = rates.first_wins, rates.second_wins, rates.any_cell - rates.winner
+                line(pair, n_runs, rates.rule, *found)
 
 
 def print_boards(pairs: int) -> None:
@@ -251,7 +239,6 @@ def print_coverage(pairs: int) -> None:
 
 
 PARTS: dict[str, Callable[[int], None]] = {
-    "times": print_times,
     "unequal": print_unequal,
     "equality": print_equality,
     "power": print_power,
@@ -260,7 +247,7 @@ PARTS: dict[str, Callable[[int], None]] = {
     "boards": print_boards,
     "coverage": print_coverage,
     "five": print_five,
-    "rules": print_rules,
+    "equals": print_equals,
 }
 
 

@@ -36,7 +36,6 @@ from qrlsuite.statistics.calibration import (
     power,
     slower,
     split_halves,
-    times_rates,
 )
 from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
@@ -132,6 +131,5 @@ __all__ = [
     "split_halves",
     "times_below",
     "times_board",
-    "times_rates",
     "unsettled",
 ]

@@ -3,8 +3,8 @@
 A resample of runs is a vector of weights, one per run. How many of the drawn runs have reached a threshold
 at an epoch is then the product (thresholds x epochs, runs) @ (runs, resamples) of a 0/1 matrix with the
 weights: all resamples at once, in float32, which holds such counts exactly up to 2^24, so the result does
-not depend on the BLAS or its threads. Counts of up to 255 runs then fit a byte, where a comparison with the
-required counts handles 32 or 64 at a time.
+not depend on the BLAS or its threads. Counts of up to 255 runs fit a byte: three of them are multiplied as one
+float32, and a comparison with the required counts handles 32 or 64 at a time.
 
 Source: paper, section "Sample Complexity" of the experiments (cluster resampling, Cameron et al. 2008).
 """
@@ -12,7 +12,7 @@ Source: paper, section "Sample Complexity" of the experiments (cluster resamplin
 from __future__ import annotations
 
 import functools
-import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.curves import Curve, checked, reached
 from qrlsuite.statistics.estimator import epochs_below
-from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, exact, whole
+from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, exact, whole
 
 Weights = NDArray[np.float32]
 EpochDraws = NDArray[np.int32]
@@ -28,6 +28,8 @@ EpochDraws = NDArray[np.int32]
 BLOCK = 2048  # resamples at a time: a block of counts stays in the cache
 BYTE = 255  # the most that a byte can count
 _TILE = 2**18  # rows x columns x depth up to which OpenBLAS multiplies float32 matrices on one thread
+_HEIGHT = 32  # rows of a tile
+_ROWS = 1536  # rows (thresholds x epochs) at a time
 
 
 def bootstrap_interval(
@@ -174,47 +176,128 @@ def weighted_epochs(curves: Curve, grid: Grid, weights: Weights, n_runs: int) ->
     n_runs:
         Runs per resample: a delta means the smallest c with c / n_runs >= delta.
     """
-    n_thresholds, n_deltas = grid.shape
-    resamples = weights.shape[1]
+    counted = Indicators(reached(curves, grid))
     required = grid.required_counts(n_runs)
-    counts_type = np.uint8 if n_runs <= BYTE else np.uint32
-    indicators = reached(curves, grid)
-    totals = np.count_nonzero(indicators, axis=2)
-    result = np.empty((n_thresholds, n_deltas, resamples), dtype=np.int32)
-    for row in range(n_thresholds):
-        # where no run or every run is there, so it is in every resample
-        result[row] = np.count_nonzero(totals[row] == 0)
-        mixed = (totals[row] > 0) & (totals[row] < curves.shape[0])
-        if not mixed.any():
-            continue
-        matrix = indicators[row][mixed].astype(np.float32)
-        for start in range(0, resamples, BLOCK):
-            block = slice(start, start + BLOCK)
-            counts = small_product(matrix, weights[:, block]).astype(counts_type)
-            for column, needed in enumerate(required.astype(counts_type)):
-                add_epochs(counts < needed, result[row, column, block])
+    result = np.empty((*grid.shape, weights.shape[1]), dtype=np.int32)
+    for start in range(0, weights.shape[1], BLOCK):
+        block = slice(start, start + BLOCK)
+        (result[..., block],) = counted.epochs_below(required, weights[:, block], n_runs)
     return result
+
+
+class Indicators:
+    """Which of N runs have reached E thresholds at T epochs, ready to be counted under many weights.
+
+    Parameters
+    ----------
+    indicators:
+        Shape (E, T, N). The order of the epochs does not matter here.
+    """
+
+    def __init__(self, indicators: BoolArray) -> None:
+        self.n_thresholds, _, n_runs = indicators.shape
+        totals = np.count_nonzero(indicators, axis=2)
+        self.never = np.count_nonzero(totals == 0, axis=1)
+        # where no run or every run is there, so it is under all weights
+        mixed = [np.flatnonzero((row > 0) & (row < n_runs)) for row in totals]
+        # by their totals: a count is then near a level in few neighboring rows
+        mixed = [rows[np.argsort(each[rows], kind="stable")] for rows, each in zip(mixed, totals)]
+        self._rows: NDArray[np.float32] = np.concatenate(
+            [each[rows] for each, rows in zip(indicators, mixed)]
+        ).astype(np.float32)
+        self._totals = np.concatenate([each[rows] for each, rows in zip(totals, mixed)])
+        self._ends = np.cumsum([len(rows) for rows in mixed]).tolist()
+
+    def epochs_below(
+        self, levels: IntArray, weights: Weights, most: int, complement: bool = False
+    ) -> NDArray[np.int32]:
+        """Return the number of epochs with fewer weighted runs than each level, shape (1, E, L, R).
+
+        Parameters
+        ----------
+        levels:
+            L whole numbers >= 1.
+        weights:
+            Shape (N, R), whole numbers.
+        most:
+            No column of the weights sums to more.
+        complement:
+            Count also under the weights 1 - w: the result then has shape (2, E, L, R).
+        """
+        result = np.empty((1 + complement, self.n_thresholds, len(levels), weights.shape[1]), dtype=np.int32)
+        result[:] = self.never[:, None, None]
+        for top in range(0, len(self._rows), _ROWS):
+            part = slice(top, top + _ROWS)
+            counts = whole_product(self._rows[part], weights, most)
+            sides = [counts]
+            if complement:
+                sides.append(self._totals[part, None].astype(counts.dtype) - counts)
+            for side, total in zip(sides, result):
+                begin = 0
+                for threshold, end in enumerate(self._ends):
+                    rows = side[max(begin - top, 0) : max(end - top, 0)]
+                    _add_below(rows, levels, total[threshold])
+                    begin = end
+        return result
+
+
+def _add_below(counts: NDArray[Any], levels: IntArray, total: NDArray[np.int32]) -> None:
+    """Add to `total` (L, R) how many of the rows of counts (T, R), in about rising order, are below each level."""
+    # in the rows before `first` every column is below the level, in those from `last` on none is
+    largest, smallest = counts.max(axis=1), counts.min(axis=1)
+    first = np.searchsorted(np.maximum.accumulate(largest), levels)
+    last = np.searchsorted(np.minimum.accumulate(smallest[::-1])[::-1], levels)
+    for level, begin, end, row in zip(levels.tolist(), first.tolist(), last.tolist(), total):
+        row += begin
+        for start in range(begin, end, BYTE):
+            marks = counts[start : min(start + BYTE, end)] < counts.dtype.type(level)
+            row += np.add.reduce(marks.view(np.uint8), axis=0, dtype=np.uint8)
+
+
+def whole_product(indicators: NDArray[np.float32], weights: Weights, most: int) -> NDArray[Any]:
+    """Return `indicators @ weights`, (rows, R), of zeros and ones with whole numbers, in the smallest type.
+
+    Parameters
+    ----------
+    indicators:
+        Shape (rows, N), zeros and ones.
+    weights:
+        Shape (N, R), whole numbers >= 0.
+    most:
+        No column of the weights sums to more. Up to 255, three rows are multiplied as one: float32 is exact up
+        to 2^24, so that it holds three counts of eight bits.
+    """
+    if most > BYTE:
+        return small_product(indicators, weights).astype(np.uint32)
+    rows, thirds = len(indicators), -(-len(indicators) // 3)
+    three = np.zeros((3, thirds, indicators.shape[1]), dtype=np.float32)
+    three.reshape(3 * thirds, -1)[:rows] = indicators
+    together = small_product(three[0] + np.float32(2**8) * three[1] + np.float32(2**16) * three[2], weights)
+    bits = together.astype(np.int32)
+    counts = np.empty((3, *bits.shape), dtype=np.uint8)
+    for place in range(3):
+        np.right_shift(bits, 8 * place, out=counts[place], casting="unsafe")
+    return counts.reshape(3 * thirds, -1)[:rows]
 
 
 def small_product(matrix: NDArray[np.float32], weights: Weights) -> NDArray[np.float32]:
     """Return `matrix @ weights` in tiles too small for OpenBLAS to start a second thread.
 
-    The whole product takes two tenths of a millisecond. Threads would halve that on an idle machine, and
-    stall for tens of milliseconds on a busy one, such as one with a worker process per core.
+    Threads would halve the time on an idle machine, and stall for tens of milliseconds on a busy one, such as
+    one with a worker process per core.
     """
-    rows, columns, depth = matrix.shape[0], weights.shape[1], matrix.shape[1]
-    height = max(8, math.isqrt(_TILE // depth))
-    width = max(8, _TILE // (depth * min(rows, height)))
+    (rows, depth), columns = matrix.shape, weights.shape[1]
+    height = min(max(rows, 1), _HEIGHT)
+    width = min(max(8, _TILE // (depth * height)), columns)
+    full = columns // width * width
+    tiles = weights[:, :full].reshape(depth, -1, width).transpose(1, 0, 2)
+    if rows > _HEIGHT:
+        tiles = np.ascontiguousarray(tiles)  # each tile in one piece of memory: half the time for many rows
     product = np.empty((rows, columns), dtype=np.float32)
-    for left in range(0, columns, width):
-        for top in range(0, rows, height):
-            tile = product[top : top + height, left : left + width]
-            np.matmul(matrix[top : top + height], weights[:, left : left + width], out=tile)
+    for top in range(0, rows, height):
+        part = matrix[top : top + height]
+        out = product[top : top + height, :full].reshape(len(part), -1, width).transpose(1, 0, 2)
+        np.matmul(part, tiles, out=out)
+        if full < columns:
+            np.matmul(part, weights[:, full:], out=product[top : top + height, full:])
     return product
-
-
-def add_epochs(below: NDArray[np.bool_], total: EpochDraws) -> None:
-    """Add the number of true epochs of a (T, R) block to `total` (R,), in bytes for speed."""
-    marks = below.view(np.uint8)
-    for start in range(0, marks.shape[0], BYTE):
-        total += np.add.reduce(marks[start : start + BYTE], axis=0, dtype=np.uint8)

@@ -5,8 +5,8 @@ A significance rule's promise is only worth what a simulation of it shows. Two w
 - `split_halves`: cut one entry's runs at random into two halves and compare them. Real curves, but only at
   N/2 runs, and the splits of one entry share its runs: quote the spread over entries, never over splits.
 - `false_winners` and `board_false_winners`: draw independent runs from a smoothed model of an entry's curves
-  (`SmoothedRuns`), at any numbers of runs. `power` draws from two models. `times_rates` does both for rule
-  `times`, many pairs at a time, and `decision_rates` plays whole decision plans.
+  (`SmoothedRuns`), at any numbers of runs. `power` draws from two models. `judge` is behind all of these, and
+  judges the same pairs by several rules. `decision_rates` plays whole decision plans.
 
 Rates are reported per cell, per grid (any cell of a pair; and: a pair with an overall winner) and per board
 (any pair among M entries).
@@ -175,7 +175,7 @@ def split_halves(
             sides = [entry.values[order[:half]], entry.values[order[half : 2 * half]]]
             yield [LearningCurves(side, entry.steps_per_epoch, entry.name) for side in sides]
 
-    return _rates(pairs(), (half, half), grid, rule, resampling, tick)
+    return judge(pairs(), grid, [rule or IntervalRule()], resampling, tick)[0]
 
 
 def false_winners(
@@ -220,17 +220,28 @@ def power(
     OptionError
         If an argument is out of its range or the models have different horizons.
     """
+    pairs = simulated_pairs(first, second, n_first, n_second, n_pairs, seed)
+    return judge(pairs, grid, [rule or IntervalRule()], resampling, tick)[0]
+
+
+def simulated_pairs(
+    first: SmoothedRuns, second: SmoothedRuns, n_first: int, n_second: int, n_pairs: int, seed: int = 0
+) -> Iterator[Sequence[LearningCurves]]:
+    """Return independent pairs of entries, drawn one by one when they are asked for.
+
+    Raises
+    ------
+    OptionError
+        If an argument is out of its range or the models have different horizons.
+    """
     if first.entry.horizon != second.entry.horizon:
         raise OptionError(
             f"'{first.entry.name}' ends at {first.entry.horizon} steps, '{second.entry.name}' at "
             f"{second.entry.horizon}: cut them to one horizon"
         )
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
-    pairs = (
-        [first.draw(n_first, generator), second.draw(n_second, generator)]
-        for _ in range(whole(n_pairs, "n_pairs", at_least=1))
-    )
-    return _rates(pairs, (n_first, n_second), grid, rule, resampling, tick)
+    count = whole(n_pairs, "n_pairs", at_least=1)
+    return ([first.draw(n_first, generator), second.draw(n_second, generator)] for _ in range(count))
 
 
 def board_false_winners(
@@ -332,30 +343,6 @@ class TimesRates:
         return self.first + self.second + self.trade_off
 
 
-def times_rates(
-    first: SmoothedRuns,
-    second: SmoothedRuns,
-    n_first: int,
-    n_second: int,
-    grid: Grid,
-    alpha: float = 0.05,
-    n_pairs: int = 200,
-    seed: int = 0,
-) -> TimesRates:
-    """Judge simulated pairs by rule `times`, from one model (error) or two (power).
-
-    Raises
-    ------
-    OptionError
-        If an argument is out of its range.
-    """
-    generator = np.random.default_rng(whole(seed, "seed", at_least=0))
-    count = whole(n_pairs, "n_pairs", at_least=1)
-    ours = draw_times(first, n_first, count, grid, generator)
-    theirs = draw_times(second, n_second, count, grid, generator)
-    return judge_times(ours, theirs, alpha)
-
-
 def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesRates:
     """Return what rule `times` finds in P pairs of times, (P, N_A, E) and (P, N_B, E)."""
     test = MaxT(list(zip(ours, theirs)))
@@ -438,37 +425,53 @@ def play(plan: DecisionPlan, drawn: Sequence[IntArray]) -> DecisionRates:
     )
 
 
-def _rates(
+def judge(
     pairs: Iterable[Sequence[LearningCurves]],
-    n_runs: tuple[int, int],
     grid: Grid,
-    rule: SignificanceRule | None,
-    resampling: Resampling | None,
-    tick: Callable[[], object] | None,
-) -> Rates:
-    chosen = rule or IntervalRule()
-    judged = []
+    rules: Sequence[SignificanceRule],
+    resampling: Resampling | None = None,
+    tick: Callable[[], object] | None = None,
+) -> tuple[Rates, ...]:
+    """Judge the same pairs by several rules; the pairs are used up one by one.
+
+    Parameters
+    ----------
+    pairs:
+        One pair or more, all of the same numbers of runs.
+    grid, resampling:
+        As in `qrlsuite.statistics.compare.compare`.
+    rules:
+        The rules.
+    tick:
+        Called after every pair.
+
+    Raises
+    ------
+    OptionError
+        If a rule answers something else than signs of the grid's shape.
+    """
+    n_runs = (0, 0)
+    judged: list[list[IntArray]] = [[] for _ in rules]
     for pair in pairs:
-        judged.append(_signs(pair, grid, chosen, resampling))
+        n_runs = pair[0].n_runs, pair[1].n_runs
+        first, second = (Evidence(entry, grid, min(n_runs), resampling) for entry in pair)
+        for rule, found in zip(rules, judged):
+            found.append(check_signs(rule(first, second), grid.shape, rule))
         if tick is not None:
             tick()
-    signs = np.stack(judged)
+    return tuple(_rates(rule, n_runs, np.stack(found)) for rule, found in zip(rules, judged))
+
+
+def _rates(rule: SignificanceRule, n_runs: tuple[int, int], signs: IntArray) -> Rates:
+    """Return the rates of a rule that gave the signs, (P, E, D)."""
     outcomes = [overall(int((each > 0).sum()), int((each < 0).sum())) for each in signs]
     return Rates(
-        rule=chosen.name,
+        rule=rule.name,
         n_runs=n_runs,
-        n_pairs=len(judged),
+        n_pairs=len(signs),
         fewer=(signs > 0).mean(axis=0),
         more=(signs < 0).mean(axis=0),
         any_cell=float((signs != 0).any(axis=(1, 2)).mean()),
-        first_wins=outcomes.count(Outcome.OUTPERFORMS) / len(judged),
-        second_wins=outcomes.count(Outcome.OUTPERFORMED) / len(judged),
+        first_wins=outcomes.count(Outcome.OUTPERFORMS) / len(signs),
+        second_wins=outcomes.count(Outcome.OUTPERFORMED) / len(signs),
     )
-
-
-def _signs(
-    pair: Sequence[LearningCurves], grid: Grid, rule: SignificanceRule, resampling: Resampling | None
-) -> IntArray:
-    n_runs = min(entry.n_runs for entry in pair)
-    first, second = (Evidence(entry, grid, n_runs, resampling) for entry in pair)
-    return check_signs(rule(first, second), grid.shape, rule)

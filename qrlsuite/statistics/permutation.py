@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.bootstrap import BLOCK, BYTE, Weights, add_epochs, small_product
+from qrlsuite.statistics.bootstrap import Indicators, Weights, small_product
 from qrlsuite.statistics.curves import Curve, reached
 from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray
 from qrlsuite.statistics.significance import Evidence, Signs
@@ -35,7 +35,7 @@ from qrlsuite.statistics.times import check_probability, times_below
 
 CHUNK = 10_000
 """Relabelings that are made at a time, and the least that decide."""
-_FIRST = 2_000  # relabelings of the cells that suffice where no cell is near the boundary
+_BLOCK = 2_000  # relabelings of the cells at a time: the first suffice where no cell is near the boundary
 _EXACT = 2**24  # float32 counts so far without error
 _TOGETHER = 64  # pairs whose relabelings are in memory at the same time
 _FINEST = 20_000  # epochs to which two entries of different steps per epoch are cut at most
@@ -391,12 +391,18 @@ class PermutationRule:
         return self._signs(pair, first.grid, resolution, first.resampling.seed)
 
     def _signs(self, pair: Sequence[Curve], grid: Grid, resolution: int, seed: int) -> Signs:
-        full = relabelings_for(self.alpha)
-        for count in (_FIRST, full):
-            t, drawn = _cell_ratios(pair, grid, resolution, seed, count)
-            largest = np.abs(drawn).max(axis=(0, 1))
-            p = (1 + np.count_nonzero(largest >= np.abs(t)[..., None], axis=2)) / (count + 1)
-            if (np.abs(p - self.alpha) > 3 * np.sqrt(self.alpha * (1 - self.alpha) / count)).all():
+        ratios = _CellRatios(pair, grid, resolution)
+        t, full = ratios.observed(), relabelings_for(self.alpha)
+        exceeded = np.zeros(grid.shape, dtype=np.int64)
+        for begin in range(0, full, _BLOCK):
+            chunk, offset = divmod(begin, CHUNK)
+            labels = relabelings(ratios.n_runs, ratios.n_runs, chunk, seed)[:, offset : offset + _BLOCK]
+            largest = np.sort(np.abs(ratios(labels)).max(axis=(0, 1)))
+            exceeded += len(largest) - np.searchsorted(largest, np.abs(t))
+            count = begin + _BLOCK
+            p = (1 + exceeded) / (count + 1)
+            doubt = 3 * np.sqrt(self.alpha * (1 - self.alpha) / count)
+            if begin == 0 and (np.abs(p - self.alpha) > doubt).all():
                 break
         signs: Signs = np.where((p <= self.alpha) & (t != 0), -np.sign(t), 0).astype(np.int8)
         return signs
@@ -419,40 +425,25 @@ def _side_by_side(first: Evidence, second: Evidence) -> tuple[list[Curve], int]:
     return pair, max(first.steps_per_epoch, second.steps_per_epoch) // common
 
 
-def _cell_ratios(
-    pair: Sequence[Curve], grid: Grid, resolution: int, seed: int, count: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return (S_hat of the first - second) / standard error, (E, D), and that of `count` relabelings, (E, D, R)."""
-    n_runs = len(pair[0])
-    levels, inverse, scale = _levels(grid, n_runs)
-    indicators = np.concatenate([reached(each, grid) for each in pair], axis=2)
-    own, totals = np.count_nonzero(indicators[..., :n_runs], axis=2), np.count_nonzero(indicators, axis=2)
-    observed = np.zeros((*grid.shape, 1), dtype=np.float32)
-    drawn = np.zeros((*grid.shape, count), dtype=np.float32)
-    kind: Any = np.uint8 if 2 * n_runs <= BYTE else np.uint32
-    for row in range(grid.shape[0]):
-        # where no run or every run is there, the labels make no difference
-        mixed = (totals[row] > 0) & (totals[row] < 2 * n_runs)
-        if not mixed.any():
-            continue
-        matrix, total = indicators[row][mixed].astype(np.float32), totals[row][mixed]
-        counted = own[row][mixed][:, None].astype(kind)
-        observed[row] = _ratios(counted, total, levels, inverse, scale, resolution)
-        for begin in range(0, count, BLOCK):
-            part = slice(begin, min(begin + BLOCK, count))
-            counts = small_product(matrix, _relabelings_between(n_runs, seed, part)).astype(kind)
-            drawn[row, :, part] = _ratios(counts, total, levels, inverse, scale, resolution)
-    return observed[..., 0], drawn
+class _CellRatios:
+    """(S_hat of the runs labeled "first" - S_hat of the others) / standard error, for many labelings of a pair."""
 
+    def __init__(self, pair: Sequence[Curve], grid: Grid, resolution: int) -> None:
+        self.n_runs, self.resolution = len(pair[0]), resolution
+        self.levels, self.inverse, self.scale = _levels(grid, self.n_runs)
+        self.both = Indicators(np.concatenate([reached(each, grid) for each in pair], axis=2))
 
-def _relabelings_between(n_runs: int, seed: int, part: slice) -> Weights:
-    """Return, shape (2 n_runs, r), relabelings part.start to part.stop of all chunks in a row."""
-    chunk, begin = divmod(part.start, CHUNK)
-    ready = relabelings(n_runs, n_runs, chunk, seed)[:, begin : begin + part.stop - part.start]
-    missing = part.stop - part.start - ready.shape[1]
-    if not missing:
-        return ready
-    return np.concatenate([ready, relabelings(n_runs, n_runs, chunk + 1, seed)[:, :missing]], axis=1)
+    def __call__(self, labels: Weights) -> NDArray[np.float32]:
+        """Return, shape (E, D, R), the ratio in every cell, for labels (2 n_runs, R): 1 means first."""
+        sides = self.both.epochs_below(self.levels, labels, self.n_runs, complement=True)
+        rows = [
+            _ratios(first, second, self.inverse, self.scale, self.resolution) for first, second in zip(*sides)
+        ]
+        return np.stack(rows)
+
+    def observed(self) -> NDArray[np.float32]:
+        """Return, shape (E, D), the ratio under the labels as they are."""
+        return self(np.repeat(np.array([[1], [0]], dtype=np.float32), self.n_runs, axis=0))[..., 0]
 
 
 def _levels(grid: Grid, n_runs: int) -> tuple[IntArray, IntArray, FloatArray]:
@@ -470,20 +461,13 @@ def _levels(grid: Grid, n_runs: int) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def _ratios(
-    counts: NDArray[Any],
-    total: IntArray,
-    levels: IntArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
     inverse: IntArray,
     scale: FloatArray,
     resolution: int,
 ) -> NDArray[np.float32]:
-    """Return the studentized differences, (D, R), for counts (T, R) of the first's runs that are there."""
-    first, second = (np.zeros((len(levels), counts.shape[1]), dtype=np.int32) for _ in range(2))
-    for index, level in enumerate(levels.tolist()):
-        add_epochs(counts < counts.dtype.type(level), first[index])
-        # the second is below where total - count < level
-        enough = np.maximum(total - level + 1, 0)[:, None].astype(counts.dtype)
-        add_epochs(counts >= enough, second[index])
+    """Return the studentized differences, (D, R), for the epochs of both entries below each level, (L, R)."""
     difference = (first[inverse[0]] - second[inverse[0]]).astype(np.float32)
     factor = scale.astype(np.float32)[:, None]
     variance = np.full(difference.shape, resolution**2 / 12, dtype=np.float32)

@@ -137,7 +137,9 @@ class Evidence:
             If it is not a positive integer.
         """
         if n_resamples not in self._draws:
-            drawn = self._draw(n_resamples)
+            drawn = (
+                self.epoch_draws if n_resamples == self.resampling.n_resamples else self._draw(n_resamples)
+            )
             # in whole epochs of a small type: a board of 500 entries keeps 10,000 draws of each
             small = drawn.astype(np.min_scalar_type(self.entry.values.shape[1]))
             mean, variance = drawn.mean(axis=2, dtype=np.float64), drawn.var(axis=2, dtype=np.float64)

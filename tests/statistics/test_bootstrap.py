@@ -14,7 +14,7 @@ from qrlsuite.statistics import (
     bootstrap_interval,
     sample_complexity,
 )
-from qrlsuite.statistics.bootstrap import weighted_epochs
+from qrlsuite.statistics.bootstrap import weighted_epochs, whole_product
 from qrlsuite.statistics.estimator import epochs_below
 from tests.statistics.conftest import DELTAS, EPSILONS
 
@@ -26,7 +26,9 @@ def smooth_curves(n_runs: int, n_epochs: int, seed: int = 0) -> np.ndarray:
 
 
 # beyond 255 runs a count, and beyond 255 epochs a sum, no longer fits a byte
-@pytest.mark.parametrize(("n_runs", "n_epochs"), [(1, 1), (7, 20), (100, 30), (300, 40), (20, 600)])
+@pytest.mark.parametrize(
+    ("n_runs", "n_epochs"), [(1, 1), (7, 20), (100, 30), (255, 10), (300, 40), (20, 600)]
+)
 def test_a_draw_is_the_estimate_of_the_runs_drawn(n_runs: int, n_epochs: int) -> None:
     curves = smooth_curves(n_runs, n_epochs)
     grid = Grid.relative([0.1, 0.3, 0.6, 0.95], [0.05, 0.5, 0.7, 1.0])
@@ -37,6 +39,17 @@ def test_a_draw_is_the_estimate_of_the_runs_drawn(n_runs: int, n_epochs: int) ->
         for resample in range(9):
             runs = np.repeat(curves, weights[:, resample], axis=0)
             assert (found[:, :, resample] == epochs_below(runs, grid)).all()
+
+
+@pytest.mark.parametrize("most", [255, 256])
+def test_three_rows_in_one_number_do_not_spill_over(most: int) -> None:
+    """Five rows, every count the largest that there can be: 255 fills a byte."""
+    weights = np.full((most, 2), 1, dtype=np.float32)
+    weights[0, 1], weights[1, 1] = 2, 0
+    indicators = np.ones((5, most), dtype=np.float32)
+    indicators[1], indicators[3, 0] = 0, 0
+    found = whole_product(indicators, weights, most)
+    assert found.tolist() == [[most] * 2, [0, 0], [most] * 2, [most - 1, most - 2], [most] * 2]
 
 
 def test_blocks_of_resamples_are_joined_in_order() -> None:

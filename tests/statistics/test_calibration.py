@@ -21,6 +21,7 @@ from qrlsuite.statistics import (
     power,
     split_halves,
 )
+from qrlsuite.statistics.calibration import judge, simulated_pairs
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE, entry
 
 FAST = Resampling(300)
@@ -74,6 +75,15 @@ def test_a_real_difference_is_found() -> None:
         assert rates.fewer.max() > 0.9
         assert rates.second_wins == 0
         assert not rates.more.any()
+
+
+def test_rules_judge_the_same_pairs() -> None:
+    model, rules = SmoothedRuns(entry(1)), [IntervalRule(), DifferenceRule(n_resamples=300)]
+    together = judge(simulated_pairs(model, model, 20, 20, 12), SURFACE, rules, FAST)
+    for rule, rates in zip(rules, together):
+        alone = false_winners(model, 20, 20, SURFACE, rule, n_pairs=12, resampling=FAST)
+        assert (rates.fewer == alone.fewer).all()
+        assert (rates.rule, rates.winner) == (rule.name, alone.winner)
 
 
 def test_halves_of_one_entry() -> None:

@@ -26,7 +26,7 @@ from qrlsuite.statistics import (
 from qrlsuite.statistics.estimator import complexity
 from qrlsuite.statistics.permutation import (
     CHUNK,
-    _cell_ratios,
+    _CellRatios,
     relabelings,
     relabelings_for,
     smallest,
@@ -169,8 +169,9 @@ def test_differences_of_cells_are_those_of_the_surface(copies: int) -> None:
     """Each relabeling by itself: S_hat at delta, and two standard errors of P_hat below and above."""
     first, second = (np.repeat(entry(index).values, copies, axis=0) for index in (0, 1))
     n_runs = len(first)
-    found, drawn = _cell_ratios([first, second], SURFACE, 1, 0, 200)
     pooled, labels = np.concatenate([first, second]), relabelings(n_runs, n_runs)
+    ratios = _CellRatios([first, second], SURFACE, 1)
+    found, drawn = ratios.observed(), ratios(labels[:, :200])
 
     def expected(chosen: np.ndarray) -> np.ndarray:
         counts = [round(delta * n_runs) for delta in DELTAS]

@@ -19,30 +19,28 @@ from qrlsuite.statistics import (
     TimesRule,
     decision_rates,
     planning,
-    power,
     runs_needed,
     runs_to_detect,
-    times_rates,
+    slower,
+    times_below,
 )
-from qrlsuite.statistics.calibration import draw_times, judge_times
+from qrlsuite.statistics.calibration import judge, judge_times, simulated_pairs
 from qrlsuite.statistics.sequential import Decision, PairDecision
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))
 
 
-def test_times_rates_are_the_rates_of_the_rule() -> None:
-    """Many at a time, or pair by pair as `power` does: the same test."""
-    other = SmoothedRuns(entry(1))
-    generator = np.random.default_rng(0)
-    ours, theirs = (draw_times(model, 20, 30, SURFACE, generator) for model in (PILOT, other))
-    together = judge_times(ours, theirs)
-    alone = [judge_times(ours[[k]], theirs[[k]]) for k in range(30)]
-    assert together.first == pytest.approx(np.mean([each.first for each in alone]))
-    rates = power(PILOT, PILOT, 20, 20, SURFACE, TimesRule(), n_pairs=40)
-    assert times_rates(PILOT, PILOT, 20, 20, SURFACE, n_pairs=40).found == pytest.approx(
-        rates.any_cell, abs=0.1
+def test_times_judged_together_are_judged_as_by_the_rule() -> None:
+    pairs = list(simulated_pairs(PILOT, SmoothedRuns(slower(entry(0), 1.2)), 20, 20, 30))
+    ours, theirs = (
+        np.stack([times_below(pair[side].values, SURFACE, 2000) for pair in pairs]) for side in (0, 1)
     )
+    together = judge_times(ours, theirs)
+    [alone] = judge(pairs, SURFACE, [TimesRule()])
+    assert 0 < together.first < 1
+    assert (together.first, together.second) == (alone.first_wins, alone.second_wins)
+    assert together.found == pytest.approx(alone.any_cell)
 
 
 def test_larger_differences_need_fewer_runs_and_more_power_needs_more() -> None:
