@@ -19,6 +19,7 @@ from packaging.specifiers import SpecifierSet
 
 import qrlsuite
 from qrlsuite import registry
+from qrlsuite.engine.local import usable_cores
 from qrlsuite.installation import packages
 from qrlsuite.registry import words
 from qrlsuite.results.provenance import collect, processor
@@ -107,7 +108,7 @@ def _python(found: Diagnosis) -> Facts:
 
 def _machine(found: Diagnosis) -> Facts:
 
-    usable, quota = len(os.sched_getaffinity(0)), _quota()
+    usable, quota = usable_cores(), _quota()
     if quota is not None and quota < usable:
         found.remarks.append(
             f"this container may use {quota:g} of {usable} cores: qrlsuite run --workers {max(1, int(quota))}"

@@ -15,6 +15,7 @@ import json
 import os
 import secrets
 import socket
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -78,7 +79,7 @@ class Claim:
 
 
 def _process_start(pid: int) -> str | None:
-    """Return something that tells a process from a later one with the same number; None if it is gone."""
+    """Return when a process started, which tells it from a later one with the same number; None if it is gone."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -89,7 +90,12 @@ def _process_start(pid: int) -> str | None:
         return None
     except PermissionError:
         pass
-    return "unknown"
+    try:  # macOS has no /proc
+        command = ["ps", "-o", "lstart=", "-p", str(pid)]
+        started = subprocess.run(command, capture_output=True, text=True, timeout=10, env={"LC_ALL": "C"})
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return started.stdout.strip() or "unknown"
 
 
 def _namespace() -> str:

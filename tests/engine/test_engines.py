@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,12 +21,13 @@ from qrlsuite.engine import api, local, worker
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.installation import diagnosis
 from qrlsuite.options import build as build_options
 from qrlsuite.results import checkpoint, survey
-from qrlsuite.results.claims import acquire
+from qrlsuite.results.claims import _process_start, acquire
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
-from tests.conftest import results
+from tests.conftest import HANGS, Hold, results
 
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
@@ -118,8 +122,6 @@ def test_a_worker_whose_parent_is_gone_does_not_begin(train: Callable[..., Path]
         "import os, sys; from qrlsuite.engine import worker\n"
         f"sys.exit(worker.main({arguments!r} + ['--follow-parent', str(os.getppid() + 1)]))"
     )
-    import sys
-
     done = subprocess.run([sys.executable, "-c", program], check=False)
     assert done.returncode == 130
     assert EntryStore(entry).finished([0], 2) == set()
@@ -251,3 +253,71 @@ def test_cores_are_counted_where_the_system_does_not_say_which_may_be_used(
     assert local.usable_cores() == len(os.sched_getaffinity(0))
     monkeypatch.delattr(os, "sched_getaffinity")
     assert local.usable_cores() == os.cpu_count()
+    assert diagnosis._machine(diagnosis.Diagnosis())["usable_cores"] == os.cpu_count()
+
+
+def test_a_process_is_told_from_a_later_one_where_there_is_no_proc(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(path: Path) -> str:
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(Path, "read_text", missing)
+    assert re.search(r"\d\d:\d\d:\d\d", _process_start(os.getpid()) or "")  # when this process began, by `ps`
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    assert _process_start(gone.pid) is None
+
+
+WITHOUT_LINUX = """
+import ctypes
+import os
+import pathlib
+
+del os.sched_getaffinity
+read, link = pathlib.Path.read_text, os.readlink
+
+
+def hidden(path):
+    if str(path).startswith("/proc"):
+        raise FileNotFoundError(path)
+
+
+def read_text(self, *given, **named):
+    hidden(self)
+    return read(self, *given, **named)
+
+
+def readlink(path, *given, **named):
+    hidden(path)
+    return link(path, *given, **named)
+
+
+class Library(ctypes.CDLL):
+    def __getattr__(self, name):
+        if name == "prctl":
+            raise AttributeError(name)
+        return super().__getattr__(name)
+
+
+pathlib.Path.read_text, os.readlink, ctypes.CDLL = read_text, readlink, Library
+"""
+"""For the start of every Python process: what Linux has and other systems, macOS among them, do not."""
+
+
+def test_a_killed_run_goes_on_where_the_system_lacks_what_linux_has(
+    hold: Hold, tiny_task: str, train: Callable[..., Path], tmp_path: Path
+) -> None:
+    (hold.site / "sitecustomize.py").write_text(WITHOUT_LINUX)
+    runs = tmp_path / "runs"
+    command = [sys.executable, "-m", "qrlsuite", "run", "--task", tiny_task, "--model", "mlp"]
+    command += ["--set", "width=16", "--seeds", "1", "--epochs", "3", "--runs", str(runs)]
+    first = subprocess.Popen(command, env=hold.environment, stdout=subprocess.DEVNULL)
+    hold.wait(first)
+    (entry,) = (runs / "tiny").iterdir()
+    first.kill()  # nothing tells the worker that its parent is gone: it looks, saves and gives the seed back
+    first.wait()
+    while list((entry / "claims").glob("*.json")):
+        time.sleep(0.05)
+    hold.release()
+    second = subprocess.run(command, env=hold.environment, capture_output=True, text=True, timeout=HANGS)
+    assert second.returncode == 0, second.stderr
+    assert results(entry, 0) == results(train("alone", [0]), 0)
