@@ -3,9 +3,9 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/verdicts_calibration.py [--pairs 10000] [PART ...]
 
 Fresh runs are drawn from smoothed models (`SmoothedRuns`) of the published entries of task beam6g, on the 49 cells of
-its surface grid. `--pairs` is the number of simulated pairs per line where pairs are judged many at a time (times,
-unequal, decisions, equality); a fifth of it for power, a tenth for five entries, a fiftieth for rules that judge cells
-pair by pair, a hundredth for boards and coverage. The tables of docs/statistics.md are its output.
+its surface grid. `--pairs` is the number of simulated pairs or plans per line (parts equals, unequal, decisions,
+equality); a tenth of it for power, seeds and plans of five entries, 1/25 for coverage, a hundredth for boards. Many
+tables of docs/statistics.md are its output. The same measures, on one's own entries: `qrlsuite calibrate`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from qrlsuite.statistics import (
     SmoothedRuns,
     TimesRule,
     bootstrap_interval,
+    decision_rates,
     mean_time,
     outperformance,
     sample_complexity,
@@ -92,9 +93,9 @@ def print_decisions(pairs: int) -> None:
     plan = DecisionPlan(("a", "b"))
     head(f"Decision plan, two equals, {pairs} studies", "entry", "differ", "equal within 10%", "mean runs")
     for name in (*POPULATIONS, W128, Q8):
-        generator = np.random.default_rng(1)
-        count = pairs if name in POPULATIONS else pairs // 10
-        rates = play(plan, [draw_times(MODELS[name], 100, count, GRID, generator) for _ in range(2)])
+        rates = decision_rates(
+            [MODELS[name]] * 2, plan, GRID, pairs if name in POPULATIONS else pairs // 10, seed=1
+        )
         line(name, rates.any_difference, rates.verdicts[0][Decided.EQUAL], f"{rates.mean_runs[0]:.0f}")
 
 
@@ -102,9 +103,7 @@ def print_five(pairs: int) -> None:
     plan = DecisionPlan(tuple("abcde"))
     head(f"Decision plan, five equals, {pairs // 10} studies", "entry", "any pair differs", "mean runs")
     for name in POPULATIONS:
-        generator = np.random.default_rng(2)
-        drawn = [draw_times(MODELS[name], 100, pairs // 10, GRID, generator) for _ in range(5)]
-        rates = play(plan, drawn)
+        rates = decision_rates([MODELS[name]] * 5, plan, GRID, pairs // 10, seed=2)
         line(name, rates.any_difference, f"{np.mean(rates.mean_runs):.0f}")
 
 
@@ -136,8 +135,7 @@ def print_seeds(pairs: int) -> None:
     plan = DecisionPlan(("a", "b"))
     head(f"Decision plan, {count} studies", "pair", "first", "second", "trade-off", "equal", "mean runs")
     for name, first, second in rivals(ENTRIES):
-        generator = np.random.default_rng(5)
-        rates = play(plan, [draw_times(model, 100, count, GRID, generator) for model in (first, second)])
+        rates = decision_rates([first, second], plan, GRID, count, seed=5)
         found = rates.verdicts[0]
         kinds = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF, Decided.EQUAL)
         line(name, *(found[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")

@@ -18,26 +18,32 @@ from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
 from qrlsuite.results import lookup
 from qrlsuite.statistics import (
+    Decided,
+    DecisionPlan,
     Grid,
     LearningCurves,
     Rates,
     SignificanceRule,
     SmoothedRuns,
+    TimesRule,
     board_false_winners,
+    decision_rates,
     false_winners,
     power,
     slower,
     split_halves,
 )
 
-Part = Literal["halves", "pairs", "boards", "power"]
-PARTS: tuple[Part, ...] = ("halves", "pairs", "boards", "power")
+Part = Literal["halves", "pairs", "boards", "power", "decisions"]
+PARTS: tuple[Part, ...] = ("halves", "pairs", "boards", "power", "decisions")
+RULES = ("intervals", "difference", "permutation", "times")
+"""The rules that are measured by default."""
 NUMBERS = ((100, 100), (20, 20), (30, 100))
 """Seeds of the two entries of a simulated pair."""
 FACTORS = (1.1, 1.25, 1.5)
 """How much longer the worse entry takes, for power."""
 BOARD = 5
-"""Entries of a simulated board."""
+"""Entries of a simulated board, and of the larger of two simulated decision plans."""
 HALF_LEAST = 2
 """Seeds that a half must have."""
 
@@ -49,20 +55,26 @@ class CalibrationResult:
     Attributes
     ----------
     part:
-        `halves`, `pairs`, `boards` or `power`.
+        One of `PARTS`.
     entry, rule:
         What was judged, by which rule.
     n_runs:
-        Seeds of the first and the second entry, or of each entry of a board.
+        Seeds of the first and the second entry, of each entry of a board, or of each entry at a plan's last look.
     draws:
-        Simulated pairs or boards.
+        Simulated pairs, boards or plans.
     winner:
-        Fraction with a winner; for power: in which the better entry was found to be better.
+        Between equals: fraction with a winner; in a plan, with a pair that differs. Else: fraction in which the
+        better entry was found to be better.
     cell_mean, cell_worst, any_cell:
         Fraction of pairs with a significant difference in a cell (mean and largest over the cells), in any cell;
-        None for boards.
+        None for boards and plans.
     factor:
-        For power: how much longer the worse entry takes.
+        For an entry known to be worse: how much longer it takes.
+    wrong:
+        With a factor: fraction in which the worse entry was found to be better.
+    entries, equal, mean_seeds:
+        Of decision plans: number of entries, fraction of pairs found equal within the margin, and seeds of each
+        entry of a pair when it was closed, on average.
     """
 
     part: Part
@@ -75,6 +87,10 @@ class CalibrationResult:
     cell_worst: float | None = None
     any_cell: float | None = None
     factor: float | None = None
+    wrong: float | None = None
+    entries: int | None = None
+    equal: float | None = None
+    mean_seeds: float | None = None
 
     @property
     def error(self) -> float:
@@ -97,6 +113,10 @@ class CalibrationResult:
             "cell_worst": self.cell_worst,
             "any_cell": self.any_cell,
             "factor": self.factor,
+            "wrong": self.wrong,
+            "entries": self.entries,
+            "equal": self.equal,
+            "mean_seeds": self.mean_seeds,
         }
 
 
@@ -224,9 +244,9 @@ def plan(
     rules:
         The rules that judge. A paired rule is not asked at unequal numbers of seeds.
     draws:
-        Splits and simulated pairs per line; a quarter of that for boards.
+        Splits, simulated pairs and plans per line; a quarter of that for boards and plans of `board` entries.
     parts:
-        Which parts.
+        Which parts. Decision plans are played if one of the rules is `times`, which is theirs.
     numbers:
         Seeds of the two entries of a pair.
     board:
@@ -258,21 +278,27 @@ def plan(
             for factor in FACTORS:
                 other = SmoothedRuns(slower(model.entry, factor), jitter, bounds)
                 jobs += [_power(model, other, factor, seeds, grid, rule, draws) for rule in rules]
+    if "decisions" in parts and any(rule.name == TimesRule().name for rule in rules):
+        for model in models:
+            jobs.append(_decisions([model] * 2, grid, draws))
+            if board > 2:
+                jobs.append(_decisions([model] * board, grid, max(1, draws // 4)))
+            for factor in FACTORS:
+                other = SmoothedRuns(slower(model.entry, factor), jitter, bounds)
+                jobs.append(_decisions([model, other], grid, draws, factor))
     return jobs
 
 
 def estimate(jobs: Sequence[Job]) -> float:
-    """Return the seconds that the jobs will take: a draw of one job of each part and rule is timed.
-
-    The first draw of each is done twice and not counted once, so that what is prepared once is not multiplied.
-    """
+    """Return the seconds that the jobs will take: three draws of one job of each part and rule are made, two timed."""
     seconds: dict[tuple[str, str], float] = {}
     for job in jobs:
         key = (job.part, job.rule)
         if key not in seconds:
-            ticks = [time.perf_counter()]
-            job.measure(3, lambda ticks=ticks: ticks.append(time.perf_counter()))  # type: ignore[misc]
-            seconds[key] = (ticks[-1] - ticks[1]) / 2
+            job.measure(1, None)  # what is prepared once is not multiplied
+            begin = time.perf_counter()
+            job.measure(2, None)
+            seconds[key] = (time.perf_counter() - begin) / 2
     return sum(job.draws * seconds[job.part, job.rule] for job in jobs)
 
 
@@ -291,6 +317,7 @@ def _of_pairs(
         cell_worst=float(cells.max()),
         any_cell=rates.any_cell,
         factor=factor,
+        wrong=None if factor is None else rates.second_wins,
     )
 
 
@@ -336,3 +363,29 @@ def _power(
         return _of_pairs("power", model.entry.name, rates, rates.first_wins, factor)
 
     return Job("power", model.entry.name, rule.name, draws, measure)
+
+
+def _decisions(models: Sequence[SmoothedRuns], grid: Grid, draws: int, factor: float | None = None) -> Job:
+    """Play the plan that `qrlsuite decide new` writes, between equals or against an entry that is slower."""
+    plan = DecisionPlan(tuple(f"{index}" for index in range(len(models))))
+    entry = models[0].entry.name
+
+    def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
+        rates = decision_rates(models, plan, grid, count, tick=tick)
+        found = rates.verdicts[0]
+        pairs = len(rates.verdicts)
+        return CalibrationResult(
+            "decisions",
+            entry,
+            TimesRule().name,
+            (plan.looks[-1], plan.looks[-1]),
+            count,
+            rates.any_difference if factor is None else found[Decided.FIRST],
+            factor=factor,
+            wrong=None if factor is None else found[Decided.SECOND],
+            entries=len(models),
+            equal=sum(each[Decided.EQUAL] for each in rates.verdicts) / pairs,
+            mean_seeds=sum(rates.mean_runs) / pairs,
+        )
+
+    return Job("decisions", entry, TimesRule().name, draws, measure)

@@ -40,13 +40,48 @@ def tables(found: Sequence[CalibrationResult], cells: int, board: int) -> list[t
         )
         result.append((sentence, [["entry", "seeds", "rule", "boards with a winner"], *rows]))
     if strong := parts["power"]:
-        rows = [[each.entry, str(each.n_runs[0]), _slower(each), each.rule, _winner(each)] for each in strong]
+        rows = [
+            [
+                each.entry,
+                str(each.n_runs[0]),
+                _slower(each),
+                each.rule,
+                _winner(each),
+                f"{each.wrong or 0:.1%}",
+            ]
+            for each in strong
+        ]
         sentence = (
             f"Simulated: one entry takes longer to get as far, {strong[0].draws} pairs each. How often the other is "
-            "found to outperform it (power):"
+            "found to outperform it (power), and how often it is found to outperform the other (wrong direction):"
         )
-        result.append((sentence, [["entry", "seeds", "slower by", "rule", "found"], *rows]))
+        head = ["entry", "seeds", "slower by", "rule", "found", "wrong"]
+        result.append((sentence, [head, *rows]))
+    if plans := parts["decisions"]:
+        result.append(_plans(plans))
     return result
+
+
+def _plans(plans: Sequence[CalibrationResult]) -> tuple[str, list[list[str]]]:
+    rows = [
+        [
+            each.entry,
+            f"{each.entries} equals" if each.factor is None else f"{_slower(each)} slower",
+            _winner(each),
+            "" if each.wrong is None else f"{each.wrong:.1%}",
+            f"{each.equal or 0:.1%}",
+            f"{each.mean_seeds or 0:.0f}",
+        ]
+        for each in plans
+    ]
+    few, many = min(each.draws for each in plans), max(each.draws for each in plans)
+    sentence = (
+        f"Simulated decision plans (qrlsuite decide) with the default looks, at most {plans[0].n_runs[0]} seeds, "
+        f"{many if few == many else f'{many} or {few}'} plans each. `differ`: between equals any pair does, which is "
+        "false; else the better entry is found. `equal`: pairs found equal within 10 percent. `seeds`: of each "
+        "entry of a pair, on average."
+    )
+    return sentence, [["entry", "against", "differ", "wrong", "equal", "seeds"], *rows]
 
 
 def summary(found: Sequence[CalibrationResult], rule: str, board: int) -> str:
@@ -66,9 +101,20 @@ def summary(found: Sequence[CalibrationResult], rule: str, board: int) -> str:
     boards = [each.winner for each in own if each.part == "boards"]
     if boards:
         parts.append(f"finds one somewhere on {_range(boards)} of boards of {board} equals")
-    for factor in sorted({each.factor for each in own if each.factor is not None})[:2]:
-        rates = [each.winner for each in own if each.factor == factor]
+    strong = [each for each in own if each.part == "power"]
+    for factor in sorted({each.factor for each in strong if each.factor is not None})[:2]:
+        rates = [each.winner for each in strong if each.factor == factor]
         parts.append(f"finds an entry that takes {factor - 1:.0%} longer to be worse in {_range(rates)}")
+    plans = [each for each in own if each.part == "decisions"]
+    if equals := [each.winner for each in plans if each.factor is None]:
+        parts.append(f"as a decision plan finds a false difference in {_range(equals)}")
+        worst = max(each.factor or 1 for each in plans)
+        seeds = [each.mean_seeds or 0 for each in plans if each.factor == worst]
+        low, high = f"{min(seeds):.0f}", f"{max(seeds):.0f}"
+        parts.append(
+            f"as a plan needs {low if low == high else f'{low} to {high}'} seeds on average, not "
+            f"{plans[0].n_runs[0]}, where an entry takes {worst - 1:.0%} longer"
+        )
     return f"'{rule}' " + "; ".join(parts) if parts else ""
 
 

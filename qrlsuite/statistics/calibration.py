@@ -389,8 +389,11 @@ def decision_rates(
     grid: Grid,
     n_studies: int = 200,
     seed: int = 0,
+    tick: Callable[[], object] | None = None,
 ) -> DecisionRates:
     """Play a decision plan many times, its entries drawn from as many models, in the plan's order.
+
+    All studies are played together; `tick` is called for each of them at the end.
 
     Raises
     ------
@@ -402,7 +405,10 @@ def decision_rates(
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
     count = whole(n_studies, "n_studies", at_least=1)
     drawn = [draw_times(model, plan.looks[-1], count, grid, generator) for model in models]
-    return play(plan, drawn)
+    rates = play(plan, drawn)
+    for _ in range(count if tick is not None else 0):
+        tick()
+    return rates
 
 
 def play(plan: DecisionPlan, drawn: Sequence[IntArray]) -> DecisionRates:

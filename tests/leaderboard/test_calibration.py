@@ -12,12 +12,15 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration
 from qrlsuite.leaderboard.findings import summary, tables
 from qrlsuite.statistics import (
+    DecisionPlan,
     DifferenceRule,
     Evidence,
     Grid,
     IntervalRule,
     LearningCurves,
     SmoothedRuns,
+    TimesRule,
+    decision_rates,
     false_winners,
     slower,
 )
@@ -40,7 +43,7 @@ def test_every_part_is_planned_for_every_entry_and_rule() -> None:
         [entry(0), entry(1)], GRID, [IntervalRule(), DifferenceRule(n_resamples=300)], draws=40
     )
     counts = {part: sum(job.part == part for job in jobs) for part in calibration.PARTS}
-    assert counts == {"halves": 4, "pairs": 12, "boards": 4, "power": 12}
+    assert counts == {"halves": 4, "pairs": 12, "boards": 4, "power": 12, "decisions": 0}
     assert {job.draws for job in jobs if job.part == "boards"} == {10}
 
 
@@ -52,8 +55,9 @@ def test_a_paired_rule_is_not_asked_at_unequal_numbers() -> None:
 def test_a_rule_that_always_errs_is_found_out() -> None:
     jobs = calibration.plan([entry(0)], GRID, [Always()], 4, numbers=[(20, 20)], board=3)
     found = [job.run() for job in jobs]
-    assert {each.part for each in found} == set(calibration.PARTS)
+    assert {each.part for each in found} == set(calibration.PARTS) - {"decisions"}
     assert all(each.winner == 1 for each in found)
+    assert {each.wrong for each in found if each.part == "power"} == {0}
     words = summary(found, "always", 3)
     assert "false winner between two equal entries of 20 seeds in 100.0% of cases" in words
     assert "somewhere on 100.0% of boards of 3 equals" in words
@@ -67,6 +71,36 @@ def test_rates_are_those_of_the_statistics_and_ticks_count_draws() -> None:
     assert (found.winner, found.any_cell, found.draws) == (rates.winner, rates.any_cell, 6)
     assert len(ticks) == 6
     assert json.loads(json.dumps(found.as_dict()))["seeds"] == [20, 20]
+
+
+def test_decision_plans_are_played_where_times_is_measured() -> None:
+    jobs = calibration.plan([entry(0)], GRID, [IntervalRule(), TimesRule()], 8, ["decisions"], board=3)
+    ticks: list[int] = []
+    found = [job.run(lambda: ticks.append(1)) for job in jobs]
+    assert [(each.entries, each.factor, each.draws) for each in found] == [
+        (2, None, 8),
+        (3, None, 2),
+        *((2, factor, 8) for factor in calibration.FACTORS),
+    ]
+    assert len(ticks) == 8 * 4 + 2
+    model = SmoothedRuns(entry(0))
+    rates = decision_rates([model, model], DecisionPlan(("a", "b")), GRID, 8)
+    assert (found[0].winner, found[0].mean_seeds) == (rates.any_difference, rates.mean_runs[0])
+    assert found[0].wrong is None
+    assert found[-1].winner > 0.8
+    assert found[-1].wrong == 0
+    assert found[-1].mean_seeds is not None
+    assert found[-1].mean_seeds < 100
+    [(sentence, rows)] = tables(found, GRID.size, 3)
+    assert "at most 100 seeds, 8 or 2 plans each" in sentence
+    assert [row[1] for row in rows[1:]] == [
+        "2 equals",
+        "3 equals",
+        "10% slower",
+        "25% slower",
+        "50% slower",
+    ]
+    assert "seeds on average, not 100, where an entry takes 50% longer" in summary(found, "times", 3)
 
 
 def test_tables_state_the_spread_over_entries_and_no_error_of_splits() -> None:

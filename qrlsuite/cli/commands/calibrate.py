@@ -28,6 +28,7 @@ class PartName(StrEnum):
     pairs = "pairs"
     boards = "boards"
     power = "power"
+    decisions = "decisions"
 
 
 def calibrate(
@@ -37,11 +38,14 @@ def calibrate(
     ] = None,
     rule: Annotated[
         list[str] | None,
-        typer.Option("--rule", metavar="NAME", help="The rules; by default intervals and difference."),
+        typer.Option("--rule", metavar="NAME", help="The rules; by default the four built-in ones."),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="Which task, where there are several.")] = None,
     draws: Annotated[
-        int, typer.Option("--draws", min=4, help="Simulated pairs per line; a quarter of it for boards.")
+        int,
+        typer.Option(
+            "--draws", min=4, help="Simulated pairs and plans per line; a quarter of it for boards."
+        ),
     ] = 200,
     part: Annotated[
         list[PartName] | None, typer.Option("--part", help="Only this part; may be repeated.")
@@ -59,17 +63,18 @@ def calibrate(
 ) -> None:
     """Measure how often each rule declares a winner where there is none, and how often it finds one that is there.
 
-    Four parts: `halves` compares random halves of an entry's real runs; `pairs` compares entries simulated from
+    Five parts: `halves` compares random halves of an entry's real runs; `pairs` compares entries simulated from
     one entry's curves, at the seeds that you name; `boards` ranks several simulated equals; `power` simulates an
-    entry that takes 10, 25 or 50 percent longer. The rates hold for these curves on this task, and are no
-    guarantee for others.
+    entry that takes 10, 25 or 50 percent longer; `decisions` plays the plans of `qrlsuite decide`, between equals
+    and against slower entries (with rule times). The rates hold for these curves on this task, and are no guarantee
+    for others.
 
     Example: qrlsuite calibrate --task beam6g --rule difference --draws 1000
     """
     chosen, left_out = calibration.choose(runs, entries or [], task, published)
     for line in left_out:
         typer.echo(f"left out: {line}", err=True)
-    judges = [rules.load(name) for name in dict.fromkeys(rule or ["intervals", "difference"])]
+    judges = [rules.load(name) for name in dict.fromkeys(rule or calibration.RULES)]
     setup = calibration.prepare(chosen)
     jobs = calibration.plan(
         setup.curves,
