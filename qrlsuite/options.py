@@ -80,9 +80,9 @@ def describe(cls: type[Any]) -> list[dict[str, Any]]:
 def _values(schema: Mapping[str, Any]) -> str:
     """Say in a few words which values a JSON schema admits."""
     if "enum" in schema:
-        return " | ".join(str(v) for v in schema["enum"])
+        return " | ".join(map(_typed, schema["enum"]))
     if "const" in schema:
-        return str(schema["const"])
+        return _typed(schema["const"])
     if "anyOf" in schema:
         return " or ".join(_values(s) for s in schema["anyOf"])
     kind = str(schema.get("type", "value"))
@@ -97,6 +97,11 @@ def _values(schema: Mapping[str, Any]) -> str:
         if key in schema
     ]
     return " ".join([kind, *bounds])
+
+
+def _typed(value: Any) -> str:
+    """Write a value as it is typed after `--set NAME=`."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def build(cls: type[Any], values: Mapping[str, Any], where: str) -> Any:

@@ -198,10 +198,13 @@ class CircuitBackendSpec(Spec):
         Reference to a pydantic dataclass.
     factory:
         Reference to `factory(circuit, options) -> backend`, see `qrlsuite.circuit.api.CircuitBackend`.
+    mean_field:
+        Whether it computes `Circuit.mean_field` too; where not, such a circuit is refused before it gets there.
     """
 
     options: str
     factory: str
+    mean_field: bool = False
 
 
 @dataclass(frozen=True, slots=True)

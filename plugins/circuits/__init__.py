@@ -14,9 +14,13 @@ _HERE = "qrlsuite.plugins.circuits"
 def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
     """Register `iqp`, `cx`, `cz` and `skolik`."""
     for name, summary, options in (
-        ("iqp", "Closed ring of controlled gates between layers of Hadamards; option: gate", "GateOptions"),
-        ("cx", "A gate on every qubit, then a ring of CNOTs; option: gate", "GateOptions"),
-        ("cz", "A gate on every qubit, then a ring of CZs; option: gate", "GateOptions"),
+        (
+            "iqp",
+            "Closed ring of controlled gates between layers of Hadamards; options: gate, entangled",
+            "GateOptions",
+        ),
+        ("cx", "A gate on every qubit, then a ring of CNOTs; options: gate, entangled", "GateOptions"),
+        ("cz", "A gate on every qubit, then a ring of CZs; options: gate, entangled", "GateOptions"),
         ("skolik", "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs", "NoOptions"),
     ):
         register(AnsatzSpec(name, summary, f"{_HERE}.ansatz:{options}", f"{_HERE}.ansatz:{name}"))
@@ -31,6 +35,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             summary="The suite's own batched simulator with adjoint gradients; exact, no options",
             options=f"{_HERE}.native:NativeOptions",
             factory=f"{_HERE}.native:NativeBackend",
+            mean_field=True,
         )
     )
     register(

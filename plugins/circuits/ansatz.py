@@ -7,6 +7,11 @@ the inputs are re-uploaded in every layer), and then, after every layer but the 
 Rings are closed: qubit q is followed by (q + 1) mod n. On two qubits the ring of `iqp`, `cx` and `cz` therefore
 consists of both (0, 1) and (1, 0), as the definition says; on one qubit there is no neighbor: `cx` and `cz` then
 have no entangling gate, and `iqp`, all of whose gates are controlled, is refused.
+
+Their option `entangled` takes the coupling of the qubits out, to see what it contributes: `separable` has no gate on
+two qubits (the gate of qubit q acts on q, and H on every qubit between layers, the same for all three structures:
+without the H, neighboring RZ of `rot` would merge); `mean-field` has the same gates, and drops all correlations after
+every gate on two qubits (`Circuit.mean_field`).
 """
 
 from __future__ import annotations
@@ -19,8 +24,10 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite.circuit.description import Circuit, Parameter
 from qrlsuite.errors import OptionError
+from qrlsuite.options import Since
 
 GateName = Literal["rot", "xyz", "u3"]
+Entangled = Literal[True, "separable", "mean-field"]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -33,6 +40,14 @@ class GateOptions:
             description="variational gate: rot = RZ RY RZ, xyz = RX then RY then RZ, u3 = U3(theta, phi, delta)"
         ),
     ] = "rot"
+    entangled: Annotated[
+        Entangled,
+        Field(
+            description="true: as defined; separable: no gate on two qubits; mean-field: the same gates, correlations "
+            "dropped after each (not a circuit: native backend alone)"
+        ),
+        Since("0.2.0"),
+    ] = True
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -48,29 +63,23 @@ def iqp(qubits: int, layers: int, options: GateOptions) -> Circuit:
     OptionError
         For fewer than two qubits.
     """
-    if qubits == 1:
+    if qubits == 1 and options.entangled != "separable":
         raise OptionError(
             "ansatz 'iqp' with 1 qubit: its gates are controlled by another qubit, so it needs 2 to 20; "
             "'cx' and 'cz' exist for 1 qubit"
         )
 
-    def static(circuit: Circuit) -> None:
-        for q in range(qubits):
-            circuit.append("H", q)
-
-    return _reuploading(qubits, layers, options.gate, static, controlled=True)
+    return _reuploading(qubits, layers, options, _hadamards, controlled=True)
 
 
 def cx(qubits: int, layers: int, options: GateOptions) -> Circuit:
     """Build gates on every qubit; static part: the ring CNOT(q, (q + 1) mod n) for q in order."""
-    return _reuploading(
-        qubits, layers, options.gate, lambda circuit: _ring(circuit, "CNOT"), controlled=False
-    )
+    return _reuploading(qubits, layers, options, lambda circuit: _ring(circuit, "CNOT"), controlled=False)
 
 
 def cz(qubits: int, layers: int, options: GateOptions) -> Circuit:
     """Build gates on every qubit; static part: the ring CZ(q, (q + 1) mod n) for q in order."""
-    return _reuploading(qubits, layers, options.gate, lambda circuit: _ring(circuit, "CZ"), controlled=False)
+    return _reuploading(qubits, layers, options, lambda circuit: _ring(circuit, "CZ"), controlled=False)
 
 
 def skolik(qubits: int, layers: int, options: NoOptions) -> Circuit:
@@ -97,17 +106,18 @@ def skolik(qubits: int, layers: int, options: NoOptions) -> Circuit:
 
 
 def _reuploading(
-    qubits: int, layers: int, gate: GateName, static: Callable[[Circuit], None], controlled: bool
+    qubits: int, layers: int, options: GateOptions, static: Callable[[Circuit], None], controlled: bool
 ) -> Circuit:
     """Build H on every qubit, then `layers` times the gates, with the static part between layers."""
-    circuit = Circuit(qubits)
+    if options.entangled == "separable":
+        static, controlled = _hadamards, False
+    circuit = Circuit(qubits, mean_field=options.entangled == "mean-field")
     scaling = circuit.parameter("scaling", (layers, qubits, 3))
     weights = circuit.parameter("weights", (layers, qubits, 3))
-    for q in range(qubits):
-        circuit.append("H", q)
+    _hadamards(circuit)
     for layer in range(layers):
         for q in range(qubits):
-            _variational(circuit, gate, layer, q, scaling, weights, controlled)
+            _variational(circuit, options.gate, layer, q, scaling, weights, controlled)
         if layer < layers - 1:
             static(circuit)
     return circuit
@@ -130,6 +140,12 @@ def _variational(
             circuit.append(name, target, angle, control=control)
     else:
         circuit.append({"rot": "Rot", "u3": "U3"}[gate], target, *angles, control=control)
+
+
+def _hadamards(circuit: Circuit) -> None:
+    """Append H on every qubit."""
+    for q in range(circuit.qubits):
+        circuit.append("H", q)
 
 
 def _ring(circuit: Circuit, gate: str) -> None:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
+from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.options import field_names, without_later
@@ -82,9 +83,11 @@ class VQCOptions:
         Raises
         ------
         UnknownNameError, OptionError
-            If there is no such ansatz, or it has no such size or option.
+            If there is no such ansatz, it has no such size or option, or the backend cannot compute it.
         """
-        build_circuit(self)
+        circuit = build_circuit(self)
+        if circuit.mean_field and not registry.circuit_backend(self.backend).mean_field:
+            raise OptionError(mean_field_refusal(self.backend))
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -123,14 +126,20 @@ class ExecutionCounter:
         differentiate otherwise; the number makes entries comparable.
     """
 
-    def __init__(self, shots: int | None, shift_evaluations: int) -> None:
+    def __init__(self, shots: int | None, shift_evaluations: int, mean_field: bool = False) -> None:
+        self.mean_field = mean_field
         self.shots = shots
         self.shift_evaluations = shift_evaluations
         self.forward = 0
         self.gradient = 0
 
     def as_dict(self) -> dict[str, int]:
-        """Return the counts: `forward`, `parameter_shift`, and with finite shots the `shots` of both together."""
+        """Return the counts: `forward`, `parameter_shift`, and with finite shots the `shots` of both together.
+
+        None of a mean-field approximation, which is no circuit and executes none.
+        """
+        if self.mean_field:
+            return {}
         counts = {"forward": self.forward, "parameter_shift": self.gradient}
         if self.shots is not None:
             counts["shots"] = self.shots * (self.forward + self.gradient)
@@ -147,7 +156,7 @@ class _Runner:
         self.options = options
         self.circuit = build_circuit(options)
         shots: int | None = getattr(options, "shots", None)
-        self.executions = ExecutionCounter(shots, shift_evaluations(self.circuit))
+        self.executions = ExecutionCounter(shots, shift_evaluations(self.circuit), self.circuit.mean_field)
         self._backend: CircuitBackend | None = None
 
     @property

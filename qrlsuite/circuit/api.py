@@ -19,12 +19,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from qrlsuite.circuit.description import MAX_QUBITS, Circuit
+from qrlsuite.circuit.description import MAX_QUBITS, Circuit, mean_field_refusal
 from qrlsuite.errors import OptionError, nearest
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike
+
+    from qrlsuite.specs import CircuitBackendSpec
 
 
 class CircuitBackend(Protocol):
@@ -111,13 +113,22 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
     OptionError
         For an option that it cannot have, a circuit that it cannot run, or a missing optional package.
     """
+    from qrlsuite import specs
+
+    spec, chosen = _backend(name, circuit, options)
+    backend: CircuitBackend = specs.resolve(spec.factory)(circuit, chosen)
+    return backend
+
+
+def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[CircuitBackendSpec, Any]:
+    """Return a backend that computes this kind of circuit, and its options."""
     from qrlsuite import options as option_values
     from qrlsuite import registry, specs
 
     spec = registry.circuit_backend(name)
-    chosen = option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
-    backend: CircuitBackend = specs.resolve(spec.factory)(circuit, chosen)
-    return backend
+    if circuit.mean_field and not spec.mean_field:
+        raise OptionError(mean_field_refusal(name))
+    return spec, option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
 
 
 class _Prepared(threading.local):
@@ -134,12 +145,11 @@ PREPARED = 8
 
 def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> CircuitBackend:
     """Return a backend for a circuit: one made before if backend, options and the circuit's content are the same."""
-    from qrlsuite import options as option_values
-    from qrlsuite import registry, specs
+    from qrlsuite import specs
 
-    spec = registry.circuit_backend(name)
-    chosen = option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
-    content = (circuit.qubits, circuit.inputs, *circuit.parameters.values(), *circuit, circuit.observables)
+    spec, chosen = _backend(name, circuit, options)
+    size = circuit.qubits, circuit.inputs, circuit.mean_field
+    content = (*size, *circuit.parameters.values(), *circuit, circuit.observables)
     key = (spec, repr(chosen), content)
     kept = _prepared.backends
     if key in kept:

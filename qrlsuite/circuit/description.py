@@ -8,6 +8,8 @@ where `scale` and `weight` are elements of named trainable parameters (either ma
 with an input present counts as 1). Reading order is application order. Qubit 0 is the most significant bit of
 a basis state's index, as in PennyLane. The measured observables are Pauli Z on chosen qubits (default: every).
 
+With `mean_field` the same description stands for a classical approximation, see `Circuit`.
+
 An ansatz is a function that writes such a circuit::
 
     def ry_ring(qubits, layers, options):
@@ -168,19 +170,31 @@ class Operation:
 class Circuit:
     """A parametrised circuit on `qubits` qubits with `inputs` input features (default: one per qubit).
 
+    Parameters
+    ----------
+    qubits:
+        Number of qubits.
+    inputs:
+        Number of input features; by default one per qubit.
+    mean_field:
+        Drop all correlations after every gate on two qubits: only the reduced state of each qubit (its Bloch
+        vector) is kept. The result is no circuit, but a classical function of the same gates and parameters, whose
+        cost is linear in the number of gates. Only some backends compute it (`CircuitBackendSpec.mean_field`).
+
     Raises
     ------
     OptionError
         If the number of qubits or inputs is not positive.
     """
 
-    def __init__(self, qubits: int, inputs: int | None = None) -> None:
+    def __init__(self, qubits: int, inputs: int | None = None, mean_field: bool = False) -> None:
         if not isinstance(qubits, int) or qubits < 1:
             raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
         self.qubits = qubits
         self.inputs = qubits if inputs is None else inputs
         if not isinstance(self.inputs, int) or self.inputs < 1:
             raise OptionError(f"inputs = {inputs!r}: a circuit has at least one input")
+        self.mean_field = mean_field
         self.parameters: dict[str, Parameter] = {}
         self._operations: list[Operation] = []
         self._observables: tuple[int, ...] = tuple(range(qubits))
@@ -298,8 +312,13 @@ class Circuit:
         Raises
         ------
         OptionError
-            If gates connect more than `MAX_QUBITS` qubits, or the backend would keep a state of more.
+            If gates connect more than `MAX_QUBITS` qubits, or the backend would keep a state of more, or if this is
+            the mean-field approximation of a circuit, and the backend computes circuits.
         """
+        if self.mean_field:
+            if backend is not None:
+                raise OptionError(mean_field_refusal(backend))
+            return
         largest = max(map(len, self.components()))
         if largest > MAX_QUBITS:
             raise OptionError(
@@ -324,4 +343,13 @@ class Circuit:
         return sum(p.size for p in self.parameters.values())
 
     def __repr__(self) -> str:
-        return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count})"
+        kind = ", mean_field=True" if self.mean_field else ""
+        return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count}{kind})"
+
+
+def mean_field_refusal(backend: str) -> str:
+    """Say why a backend that runs circuits cannot compute a mean-field approximation."""
+    return (
+        f"backend '{backend}' runs circuits, and the mean-field approximation of a circuit is none; backend 'native' "
+        "computes it (model vqc-native)"
+    )

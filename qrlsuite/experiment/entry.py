@@ -15,7 +15,7 @@ from typing import Any
 import pydantic
 
 from qrlsuite import options, registry, specs
-from qrlsuite.errors import StoreError
+from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment import preset as presets
 from qrlsuite.experiment.task import Task, TaskFile, digest, load
 from qrlsuite.options import Setting
@@ -200,6 +200,8 @@ def option_sides(
     ------
     UnknownNameError
         If no ansatz has the name that was chosen.
+    OptionError
+        If an option was set that another ansatz has, and nothing here.
     """
     own = specs.resolve(model.options)
     sides = {
@@ -217,7 +219,28 @@ def option_sides(
         theirs = specs.resolve(registry.ansatz(chosen).options)
         left = [name for name in options.field_names(theirs) if name not in getattr(own, "passes_on", ())]
         sides["ansatz"] = make_dataclass(theirs.__name__, left)
+        _require_not_of_another_ansatz(settings, sides, chosen)
     return sides
+
+
+def _require_not_of_another_ansatz(
+    settings: Sequence[Setting], sides: Mapping[str, type[Any]], chosen: str
+) -> None:
+    """Refuse an option that no side has but some other ansatz: the list of known names would not say so."""
+    there = {name for side in sides.values() for name in options.field_names(side)}
+    for setting in settings:
+        if setting.side is not None or setting.name in there:
+            continue
+        others = [
+            f"'{name}'"
+            for name in registry.load().names("ansatzes")
+            if setting.name in options.field_names(specs.resolve(registry.ansatz(name).options))
+        ]
+        if others:
+            raise OptionError(
+                f"{setting.written}: no option of that name: ansatz '{chosen}' has none, {', '.join(others)} "
+                f"{'has' if len(others) == 1 else 'have'} it"
+            )
 
 
 def _hand_to_ansatz(

@@ -54,6 +54,12 @@ def check(subject: Subject) -> list[Finding]:
                 "alone, in pairs, shuffled: the same bits in values and gradients",
                 lambda: _independence(run, circuit, None),
             )
+        if spec.mean_field:
+            rules.run(
+                "mean field",
+                "values, gradients and seeds of mean-field circuits too",
+                lambda: _mean_field(factory, given),
+            )
         if run.shots is not None or "shots" in specs.resolve(spec.options).__dataclass_fields__:
             rules.run(
                 "shots",
@@ -198,6 +204,19 @@ def _values(factory: Any, given: Any) -> None:
             False,
             f"values of {circuit.qubits} qubits differ from dense matrices by {difference:.2g}; {cause}",
         )
+
+
+def _mean_field(factory: Any, given: Any) -> None:
+    circuit = every_gate(mean_field=True)
+    difference = _distance(factory, circuit, given)
+    require(
+        difference < 1e-6,
+        f"the spec says mean_field=True, and values of a mean-field circuit differ from density matrices by "
+        f"{difference:.2g}: after every gate on two qubits only the reduced state of each may be kept",
+    )
+    run = factory(circuit, given)
+    _gradients(run, circuit)
+    _independence(run, circuit, None)
 
 
 def _wrong_gates(factory: Any, given: Any) -> list[str]:

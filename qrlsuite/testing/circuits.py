@@ -5,9 +5,9 @@ from __future__ import annotations
 from qrlsuite.circuit import GATES, Circuit
 
 
-def every_gate() -> Circuit:
+def every_gate(mean_field: bool = False) -> Circuit:
     """Return a circuit of three qubits with every gate, controlled ones too, and angles of every form."""
-    circuit = Circuit(3, inputs=2)
+    circuit = Circuit(3, inputs=2, mean_field=mean_field)
     scale = circuit.parameter("scale", (2, 3))
     weight = circuit.parameter("weight", (12,))
     circuit.append("RX", 0, scale[0, 0] * circuit.input(0) + weight[0])

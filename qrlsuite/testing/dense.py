@@ -31,6 +31,8 @@ def expectation_values(
     circuit: Circuit, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     """Return the expectation values (len(circuit.observables),) of one input (circuit.inputs,)."""
+    if circuit.mean_field:
+        return _mean_field_values(circuit, inputs, parameters)
     n = circuit.qubits
     state = np.zeros((2,) * n, dtype=np.complex128)
     state[(0,) * n] = 1.0
@@ -46,6 +48,23 @@ def expectation_values(
         marginal = probabilities.sum(axis=tuple(q for q in range(n) if q != wire))
         values.append(float(marginal[0] - marginal[1]))
     return np.array(values)
+
+
+def _mean_field_values(
+    circuit: Circuit, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Keep a density matrix per qubit; two that meet in a gate are traced out of their common state after it."""
+    states = [np.diag([1, 0]).astype(np.complex128) for _ in range(circuit.qubits)]
+    for operation in circuit.operations:
+        matrix = _matrix(operation, [_angle(a, inputs, parameters) for a in operation.angles])
+        if len(operation.qubits) == 1:
+            (q,) = operation.qubits
+            states[q] = matrix @ states[q] @ matrix.conj().T
+            continue
+        a, b = operation.qubits
+        together = (matrix @ np.kron(states[a], states[b]) @ matrix.conj().T).reshape(2, 2, 2, 2)
+        states[a], states[b] = np.einsum("ikjk->ij", together), np.einsum("kikj->ij", together)
+    return np.array([float(np.trace(_Z @ states[q]).real) for q in circuit.observables])
 
 
 def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:

@@ -156,7 +156,7 @@ def cause(circuit: Circuit, what: int | Scalar) -> str:
 
 def _between(circuit: Circuit, before: bool, after: bool) -> Circuit:
     """Return the circuit begun in a random entangled state, or measured in a random basis, or both."""
-    made = Circuit(circuit.qubits, circuit.inputs)
+    made = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field)
     for p in circuit.parameters.values():
         made.parameter(p.name, p.shape, p.low, p.high)
     draw = np.random.default_rng(0)

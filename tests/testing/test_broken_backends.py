@@ -34,9 +34,9 @@ class Options:
     shots: Annotated[int | None, Field(description="repetitions; absent: exact")] = None
 
 
-def rewritten(circuit: Circuit, change: Change) -> Circuit:
+def rewritten(circuit: Circuit, change: Change, mean_field: bool | None = None) -> Circuit:
     """Return the circuit with every operation changed, or left out where the change gives None."""
-    made = Circuit(circuit.qubits, circuit.inputs)
+    made = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field if mean_field is None else mean_field)
     for p in circuit.parameters.values():
         made.parameter(p.name, p.shape, p.low, p.high)
     for operation in map(change, circuit.operations):
@@ -262,13 +262,22 @@ class UnseededSampling(Sampling, Unseeded):
     pass
 
 
-def spec(cls: type[Good], options: type[Any] = Options) -> CircuitBackendSpec:
+def spec(cls: type[Good], options: type[Any] = Options, mean_field: bool = False) -> CircuitBackendSpec:
     return CircuitBackendSpec(
         cls.__name__.lower(),
         "Breaks a rule",
         options=f"{HERE}:{options.__name__}",
         factory=f"{HERE}:{cls.__name__}",
+        mean_field=mean_field,
     )
+
+
+class NoMeanField(Good):
+    """Say that mean-field circuits are computed, and compute the circuit itself."""
+
+    def __init__(self, circuit: Circuit, options: Any) -> None:
+        self.shots = None
+        self.native = create_backend("native", rewritten(circuit, self.change, mean_field=False))
 
 
 CASES: Cases = [
@@ -384,6 +393,13 @@ CASES: Cases = [
         ),
     ),
     ("shots", Broken(spec(UnseededSampling, NoOptions), r"the same seeds give other samples")),
+    (
+        "mean field",
+        Broken(
+            spec(NoMeanField, NoOptions, True),
+            r"spec says mean_field=True, and values .* differ from density matrices",
+        ),
+    ),
 ]
 
 
@@ -393,15 +409,21 @@ def test_one_rule_is_broken(rule: str, case: Broken) -> None:
 
 
 def test_every_rule_has_a_backend_that_breaks_it() -> None:
-    findings = own_rules("circuit_backends", spec(Good))
+    findings = own_rules("circuit_backends", spec(Good, mean_field=True))
     assert all(finding.ok for finding in findings), findings
     assert {finding.rule for finding in findings} == {rule for rule, _ in CASES}
 
 
 def test_an_exact_backend_has_no_rule_about_shots() -> None:
-    findings = own_rules("circuit_backends", spec(Good, NoOptions))
+    findings = own_rules("circuit_backends", spec(Good, NoOptions, True))
     assert all(finding.ok for finding in findings), findings
     assert {finding.rule for finding in findings} == {rule for rule, _ in CASES} - {"shots"}
+
+
+def test_a_backend_of_circuits_alone_has_no_rule_about_mean_fields() -> None:
+    findings = own_rules("circuit_backends", spec(Good))
+    assert all(finding.ok for finding in findings), findings
+    assert {finding.rule for finding in findings} == {rule for rule, _ in CASES} - {"mean field"}
 
 
 def test_a_backend_that_always_samples_is_held_to_that() -> None:

@@ -30,7 +30,8 @@ class NativeBackend:
     """Batched statevector simulation with adjoint gradients, see `qrlsuite.circuit.CircuitBackend`.
 
     On the CPU compiled kernels run on one thread; tensors on another device are computed there, by plain torch
-    operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state.
+    operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state. Mean-field approximations of
+    circuits take 3 numbers per qubit and 6 per gate.
 
     Parameters
     ----------
@@ -73,13 +74,19 @@ class NativeBackend:
             flat = torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
         else:
             flat = inputs.new_zeros((size, 0))
-        if inputs.device.type != "cpu":
-            result = dense.expectations(self.program, inputs, flat)
-        else:
-            result = self.simulator()(inputs, flat)
+        run = self.simulator() if inputs.device.type == "cpu" else self.by_torch
+        result = run(inputs, flat)
         if not bool(torch.isfinite(result.detach().sum())):
             raise OptionError("the circuit's inputs or parameters are not finite (NaN or infinite)")
         return result
+
+    def by_torch(self, inputs: Tensor, flat: Tensor) -> Tensor:
+        """Return what the kernels return by torch operations, on any device, with flat parameters (S, P)."""
+        if self.circuit.mean_field:
+            from qrlsuite.plugins.circuits.native import mean_field
+
+            return dense.mean_field_expectations(mean_field.compile_circuit(self.circuit), inputs, flat)
+        return dense.expectations(self.program, inputs, flat)
 
     @cached_property
     def program(self) -> Program:

@@ -59,12 +59,12 @@ class Simulator:
 
     def __init__(self, circuit: Circuit) -> None:
         announce()
-        from qrlsuite.plugins.circuits.native import kernels
+        from qrlsuite.plugins.circuits.native import kernels, mean_field
 
-        self.program = compile_circuit(circuit)
-        self.kernels = kernels
-        self.tables = kernels.tables(self.program)
-        self.lanes = {dtype: kernels.lanes(kind) for dtype, kind in NUMPY.items()}
+        self.kernels: Any = mean_field if circuit.mean_field else kernels
+        self.program = (mean_field.compile_circuit if circuit.mean_field else compile_circuit)(circuit)
+        self.tables = self.kernels.tables(self.program)
+        self.lanes = {dtype: self.kernels.lanes(kind) for dtype, kind in NUMPY.items()}
         self.spare: dict[torch.dtype, np.ndarray[Any, Any]] = {}
         self._workspaces: dict[torch.dtype, _Workspace] = {}
 

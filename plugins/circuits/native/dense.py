@@ -6,7 +6,7 @@ adjoint, as on the CPU (see `sweeps`): memory does not grow with depth.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -23,6 +23,9 @@ from qrlsuite.plugins.circuits.native.program import (
     Program,
 )
 
+if TYPE_CHECKING:
+    from qrlsuite.plugins.circuits.native.mean_field import Program as MeanFieldProgram
+
 COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
 
 
@@ -35,7 +38,40 @@ def expectations(program: Program, inputs: Tensor, flat: Tensor) -> Tensor:
     return result.reshape(*inputs.shape[:2], len(program.observables))
 
 
-def _angles(program: Program, inputs: Tensor, flat: Tensor) -> Tensor:
+def mean_field_expectations(program: MeanFieldProgram, inputs: Tensor, flat: Tensor) -> Tensor:
+    """Return the mean-field values (S, B, O) of inputs (S, B, I) and flat parameters (S, P), see `mean_field`.
+
+    Gradients are autograd's: a step is a handful of numbers per lane.
+    """
+    angles = _angles(program, inputs, flat)
+    angles = angles.reshape(inputs.shape[0] * inputs.shape[1], angles.shape[2])
+    up = torch.zeros(len(angles), 3, dtype=angles.dtype, device=angles.device)
+    up[:, 2] = 1.0
+    vectors = [up] * program.qubits
+    for kind, control, target, block, _ in program.steps.tolist():
+        r = vectors[target]
+        if kind == HADAMARD:
+            vectors[target] = torch.stack([r[:, 2], -r[:, 1], r[:, 0]], 1)
+        elif kind == ROTATE:
+            a, b, phase = _block(program, block, angles)
+            axis = torch.stack([-b.imag, b.real, -a.imag], 1)
+            across = torch.linalg.cross(axis, r)
+            turned = r + 2 * (a.real[:, None] * across + torch.linalg.cross(axis, across))
+            if control == NONE:
+                vectors[target] = turned
+                continue
+            c = vectors[control]
+            vectors[target] = r + 0.5 * (1 - c[:, 2:]) * (turned - r)
+            trace = phase * torch.complex(a.real, -(axis * r).sum(1))
+            coherence = torch.complex(c[:, 0], c[:, 1]) * trace
+            vectors[control] = torch.stack([coherence.real, coherence.imag, c[:, 2]], 1)
+        else:
+            vectors[control], vectors[target] = r, vectors[control]
+    values = torch.stack([vectors[q][:, 2] for q in program.observables.tolist()], 1)
+    return values.reshape(*inputs.shape[:2], -1)
+
+
+def _angles(program: Program | MeanFieldProgram, inputs: Tensor, flat: Tensor) -> Tensor:
     """Return constant + scale * input + weight of every angle, (S, B, A)."""
     table = torch.from_numpy(program.angles).to(inputs.device)
     angles = torch.from_numpy(program.constants).to(inputs).expand(*inputs.shape[:2], -1)
@@ -155,7 +191,7 @@ def _halves(state: Tensor, control: int, target: int) -> tuple[Tensor, Tensor]:
     return parts[:, :, 0, :, 1], parts[:, :, 1, :, 1]
 
 
-def _block(program: Program, block: int, angles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _block(program: Program | MeanFieldProgram, block: int, angles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return (a, b) of a block's matrix in SU(2), and its phase, each (L,) complex."""
     kind = COMPLEX[angles.dtype]
     a = torch.ones(len(angles), dtype=kind, device=angles.device)

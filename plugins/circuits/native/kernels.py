@@ -74,7 +74,7 @@ def record_rows(program: Program) -> tuple[int, int, int]:
 
 
 @inlined
-def _fill_inputs(inputs: Any, seed: int, first: int, lanes: Any) -> None:
+def fill_inputs(inputs: Any, seed: int, first: int, lanes: Any) -> None:
     """Transpose the samples of a chunk into rows of lanes; zeros where there is no sample."""
     for i in range(inputs.shape[2]):
         for v in range(lanes.shape[1]):
@@ -95,7 +95,7 @@ def _angle(t: Any, index: int, flat: Any, seed: int, lanes: Any) -> Any:
 
 
 @inlined
-def _split(t: Any, record: Any) -> Any:
+def split(t: Any, record: Any) -> Any:
     """Return a chunk's state, sines and cosines, and blocks: views of its record."""
     first = record.shape[0] - 6 * (t.blocks.shape[0] - 1)
     second = first - 2 * t.rotations.shape[0]
@@ -103,7 +103,7 @@ def _split(t: Any, record: Any) -> Any:
 
 
 @inlined
-def _prepare(t: Any, flat: Any, seed: int, inputs: Any, trig: Any, gates: Any) -> None:
+def prepare(t: Any, flat: Any, seed: int, inputs: Any, trig: Any, gates: Any) -> None:
     """Fill in sine and cosine of every rotation's half angle, and (a, b) and the phase of every block."""
     one, zero = splat(inputs, 1.0), splat(inputs, 0.0)
     for g in range(t.blocks.shape[0] - 1):
@@ -201,9 +201,9 @@ def forward(t: Any, inputs: Any, flat: Any, records: Any, keep: int, w: Any, out
     for seed in range(inputs.shape[0]):
         for chunk in range(chunks):
             first = chunk * lanes
-            states, trig, gates = _split(t, records[seed * chunks + chunk if keep else 0])
-            _fill_inputs(inputs, seed, first, w.inputs)
-            _prepare(t, flat, seed, w.inputs, trig, gates)
+            states, trig, gates = split(t, records[seed * chunks + chunk if keep else 0])
+            fill_inputs(inputs, seed, first, w.inputs)
+            prepare(t, flat, seed, w.inputs, trig, gates)
             _run(t, states, gates)
             _measure(t, states, w)
             for v in range(min(lanes, inputs.shape[1] - first)):
@@ -243,7 +243,7 @@ def _weigh(t: Any, cotangent: Any, seed: int, first: int, final: Any, psi: Any, 
 
 
 @inlined
-def _chain(
+def chain(
     t: Any,
     block: int,
     overlap: Any,
@@ -309,7 +309,7 @@ def _unrun(
             kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
             if kind == ROTATE:
                 unrotate(psi, lam, n, a, b, gates, c, d, overlap)
-                _chain(t, c, overlap, flat, seed, inputs, trig, sums, slopes)
+                chain(t, c, overlap, flat, seed, inputs, trig, sums, slopes)
             elif kind == HADAMARD:
                 hadamard(psi, n, a, b, c)
                 hadamard(lam, n, a, b, c)
@@ -351,10 +351,10 @@ def backward(
             store(sums, p, zero)
         for chunk in range(chunks):
             first = chunk * lanes
-            states, trig, gates = _split(t, records[seed * chunks + chunk if kept else 0])
-            _fill_inputs(inputs, seed, first, w.inputs)
+            states, trig, gates = split(t, records[seed * chunks + chunk if kept else 0])
+            fill_inputs(inputs, seed, first, w.inputs)
             if not kept:
-                _prepare(t, flat, seed, w.inputs, trig, gates)
+                prepare(t, flat, seed, w.inputs, trig, gates)
                 _run(t, states, gates)
             _weigh(t, cotangent, seed, first, states, psi, lam, w)
             for i in range(slopes.shape[0]):

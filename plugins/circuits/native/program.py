@@ -168,7 +168,7 @@ class _Steps:
         step.touched |= set(bits)
 
 
-class _Compiler:
+class Compiler:
     """The arrays of a program, as they grow component by component."""
 
     def __init__(self, circuit: Circuit) -> None:
@@ -306,7 +306,7 @@ def compile_circuit(circuit: Circuit) -> Program:
         If gates connect more than `MAX_QUBITS` qubits.
     """
     circuit.require_simulable()
-    compiler = _Compiler(circuit)
+    compiler = Compiler(circuit)
     places: dict[int, int] = {}
     components = circuit.components()
     member = {wire: number for number, wires in enumerate(components) for wire in wires}
