@@ -152,10 +152,10 @@ def board(
     >>> [(row.tier, row.entry.label) for row in found.sections[0].rows]
     [(1, 'ddqn mlp width=64'), (2, 'ddqn mlp width=16')]
     """
-    folder, wanted = Path(runs), _several(tasks)
-    lookup.check_tasks(folder, *wanted)
-    found, left_out = collect.select(folder, wanted, entries, published, horizon, min_seeds)
-    return boards.build(found, left_out, rules.load(rule) if rule else None, horizon, alpha)
+    folder, task_names = Path(runs), _several(tasks)
+    lookup.check_tasks(folder, *task_names)
+    selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
+    return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
 
 
 def compare(
@@ -200,11 +200,11 @@ def compare(
     >>> str(found.outcome)
     'outperforms'
     """
-    one, other = (
+    left, other = (
         entry if isinstance(entry, EntryCurves) else load(entry, task=task, runs=runs, published=published)
         for entry in (first, second)
     )
-    return boards.compare_entries(one, other, rules.load(rule) if rule else None)
+    return boards.compare_entries(left, other, rules.load(rule) if rule else None)
 
 
 def plot(
@@ -346,13 +346,15 @@ def train(
     """
     entry = resolve(task, model, algorithm, from_mapping(options), preset)
     watching = [track] if isinstance(track, str) else list(track)
-    wanted = None if seeds is None else read_seeds(seeds)
+    seed_numbers = None if seeds is None else read_seeds(seeds)
     _check_positive("epochs", epochs)
-    where = _execution(engine, workers, device)
-    execution.check_minutes(minutes, where)
-    work = execution.plan(Path(runs), entry, where, wanted, epochs)
+    chosen_execution = _execution(engine, workers, device)
+    execution.check_minutes(minutes, chosen_execution)
+    work = execution.plan(Path(runs), entry, chosen_execution, seed_numbers, epochs)
     with trackers.asking(watching):
-        execution.train(work, where, RunDisplay(work, where.workers, not progress, "call"), minutes)
+        execution.train(
+            work, chosen_execution, RunDisplay(work, chosen_execution.workers, not progress, "call"), minutes
+        )
     return collect.read(work.store)
 
 
@@ -498,7 +500,7 @@ def tune(
         raise OptionError(f"out = {str(out)!r}: the preset file's name ends in .toml")
     _check_positive("epochs", epochs)
     _check_positive("trials", trials)
-    where = _execution(engine, workers, device)
+    chosen_execution = _execution(engine, workers, device)
     if minutes is not None and not 0 < minutes < float("inf"):
         raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
     varied = {
@@ -519,10 +521,10 @@ def tune(
         objective=objective,
     )
     searches = tuning_runner.build([request], Path(runs))
-    display = TuneDisplay(searches, where.workers, not progress, "call")
+    display = TuneDisplay(searches, chosen_execution.workers, not progress, "call")
     display.begin()
     budget = None if minutes is None else 60 * minutes
-    tuning_runner.run(searches, Path(runs), where, display, budget, preset)
+    tuning_runner.run(searches, Path(runs), chosen_execution, display, budget, preset)
     return searches[0]
 
 
@@ -627,23 +629,23 @@ def run_study(
     _check_positive("epochs", epochs)
     if minutes is not None and not 0 < minutes < float("inf"):
         raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
-    where = _execution(engine, workers, device)
-    wanted = None if seeds is None else read_seeds(seeds)
+    chosen_execution = _execution(engine, workers, device)
+    seed_numbers = None if seeds is None else read_seeds(seeds)
     study = study_files.load(name)
     studies.check(study)
-    words = [only] if isinstance(only, str) else only
-    members = study_runner.select(study, from_mapping(options), models, words)
+    names = [only] if isinstance(only, str) else only
+    members = study_runner.select(study, from_mapping(options), models, names)
     folder = Path(runs)
     speeds = speed.known(folder)
-    items = study_runner.survey(members, folder, where, speeds, wanted, epochs)
+    items = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
     budget = None if minutes is None else 60 * minutes
     if budget is not None:
-        study_runner.check_budget(items, budget, where.workers)
-    session = study_runner.Session(folder, where, speeds, budget, not progress, "call")
+        study_runner.check_budget(items, budget, chosen_execution.workers)
+    session = study_runner.Session(folder, chosen_execution, speeds, budget, not progress, "call")
     session.run(items)
     drawn = studies.write(study, members, folder, format)
-    after = study_runner.survey(members, folder, where, speeds, wanted, epochs)
-    overview = study_runner.Overview(study, after, where.workers)
+    after = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
+    overview = study_runner.Overview(study, after, chosen_execution.workers)
     return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
 
 

@@ -42,10 +42,10 @@ class EnvironmentFailure(QrlSuiteError):
     """An environment raised while it was being stepped; the message carries the environment's own."""
 
 
-def listed(words: Sequence[str], most: int = 20) -> str:
+def listed(names: Sequence[str], most: int = 20) -> str:
     """Join words with commas; the first `most` of them, and how many more there are."""
-    more = len(words) - most
-    return ", ".join(words[:most]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

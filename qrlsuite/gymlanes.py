@@ -71,8 +71,8 @@ class GymLanes(LaneEnv):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.env_id = env_id
-        given = dict(arguments or {})
-        first = make(env_id, given)
+        keywords = dict(arguments or {})
+        first = make(env_id, keywords)
         self._action_space, self._raw_space, flat = _supported(env_id, first)
         if normalization != "none" and not isinstance(self._raw_space, spaces.Box):
             raise OptionError(
@@ -81,7 +81,7 @@ class GymLanes(LaneEnv):
             )
         self._normalize = Normalization(normalization, flat, low, high, f"environment '{env_id}'")
         self.running_statistics = normalization == "running"
-        self.envs = [first, *(make(env_id, given) for _ in range(num_envs - 1))]
+        self.envs = [first, *(make(env_id, keywords) for _ in range(num_envs - 1))]
         batched_spaces(self, self._normalize.space, spaces.Discrete(int(self._action_space.n)), num_envs)
         limit = first.spec.max_episode_steps if first.spec is not None else None
         self.capacity = int(limit or UNLIMITED)
@@ -239,8 +239,8 @@ class GymLanes(LaneEnv):
 
     def _play(self, lane: int, action: int) -> tuple[float, bool, bool, dict[str, Any]]:
         """Take one step in one lane; returns reward, termination, truncation and info."""
-        given = np.int64(action + self._action_space.start)
-        observation, reward, terminated, truncated, info = self.envs[lane].step(given)
+        env_action = np.int64(action + self._action_space.start)
+        observation, reward, terminated, truncated, info = self.envs[lane].step(env_action)
         self._raw[lane] = self._flat(observation)
         return float(reward), bool(terminated), bool(truncated), info
 
@@ -338,9 +338,9 @@ def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
             f"environment '{env_id}' needs a package that is not installed: pip install {package}"
         ) from error
     except Exception as error:
-        given = f" with {dict(arguments)}" if arguments else ""
+        with_arguments = f" with {dict(arguments)}" if arguments else ""
         raise OptionError(
-            f"environment '{env_id}' cannot be made{given}: {type(error).__name__}: {error}"
+            f"environment '{env_id}' cannot be made{with_arguments}: {type(error).__name__}: {error}"
         ) from error
 
 
@@ -416,5 +416,5 @@ def quick_task(env_id: str) -> dict[str, Any]:
 
 def quick_name(env_id: str) -> str:
     """Return the task name of `--task gym:ID`: usable as a folder, `gym-acrobot-v1`."""
-    words = re.findall(r"[a-z0-9]+", env_id.lower())
-    return "-".join(["gym", *words])[:64].rstrip("-")
+    parts = re.findall(r"[a-z0-9]+", env_id.lower())
+    return "-".join(["gym", *parts])[:64].rstrip("-")

@@ -90,16 +90,16 @@ class Normalization:
 
 
 def _bounds(
-    given: Sequence[float] | None, own: NDArray[np.float64], name: str, what: str
+    replacement: Sequence[float] | None, declared: NDArray[np.float64], name: str, what: str
 ) -> NDArray[np.float64]:
     """Return one side's bounds (n,), the given or the box's own."""
-    values: NDArray[Any] = own if given is None else np.array(given, dtype=np.float64)
-    if values.shape != own.shape:
-        raise OptionError(f"{what}: {name} has {values.size} values, an observation has {own.size}")
+    values: NDArray[Any] = declared if replacement is None else np.array(replacement, dtype=np.float64)
+    if values.shape != declared.shape:
+        raise OptionError(f"{what}: {name} has {values.size} values, an observation has {declared.size}")
     if not np.isfinite(values).all() or np.abs(values).max() > 1e30:
         k = int(np.argmax(~np.isfinite(values) | (np.abs(values) > 1e30)))
         raise OptionError(
             f"{what}: normalization = 'bounds' needs finite bounds, and {name}[{k}] is {values[k]:g}: "
-            f"give {name} as a list of {own.size} numbers, or take normalization = 'arctan'"
+            f"give {name} as a list of {declared.size} numbers, or take normalization = 'arctan'"
         )
     return values

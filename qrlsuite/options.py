@@ -155,10 +155,10 @@ def validation_lines(error: pydantic.ValidationError) -> list[str]:
     lines = []
     for item in error.errors(include_url=False):
         path = ".".join(str(part) for part in item["loc"])
-        given = item.get("input")
-        shown = "" if isinstance(given, Mapping) or item["type"] == "missing" else f" = {_short(given)}"
+        value = item.get("input")
+        value_text = "" if isinstance(value, Mapping) or item["type"] == "missing" else f" = {_short(value)}"
         message = str(item["msg"]).removeprefix("Value error, ")
-        lines.append(f"{path}{shown}: {message}" if path else message)
+        lines.append(f"{path}{value_text}: {message}" if path else message)
     return lines
 
 
@@ -175,8 +175,8 @@ def file_problems(error: pydantic.ValidationError, model: type[pydantic.BaseMode
         path = [str(part) for part in item["loc"]]
         if item["type"] == "extra_forbidden":
             *parents, key = path
-            where = f" in [{'.'.join(parents)}]" if parents else ""
-            lines.append(f"unknown key '{key}'{where}{nearest(key, _keys(model, parents))}")
+            table = f" in [{'.'.join(parents)}]" if parents else ""
+            lines.append(f"unknown key '{key}'{table}{nearest(key, _keys(model, parents))}")
         elif item["type"] == "missing":
             lines.append(f"missing key '{'.'.join(path)}'")
         else:
@@ -260,7 +260,7 @@ def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
     """
     if is_dataclass(cls) and not hasattr(cls, "__pydantic_fields__"):
         cls = pydantic.dataclasses.dataclass(cls, frozen=vars(cls)["__dataclass_params__"].frozen)
-    found = {}
+    added = {}
     for name, info in (getattr(cls, "model_fields", None) or getattr(cls, "__pydantic_fields__", {})).items():
         for mark in info.metadata:
             if isinstance(mark, Since):
@@ -269,8 +269,8 @@ def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
                         f"{cls.__name__}.{name} was added in {mark.version} and needs a default"
                     )
                 default = info.get_default(call_default_factory=True)
-                found[name] = mark.version, pydantic_core.to_jsonable_python(default)
-    return found
+                added[name] = mark.version, pydantic_core.to_jsonable_python(default)
+    return added
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ def parse_setting(word: str) -> Setting:
     return Setting(side, name, value) if dot else Setting(None, side, value)
 
 
-def from_mapping(given: Mapping[str, Any] | None) -> list[Setting]:
+def from_mapping(values: Mapping[str, Any] | None) -> list[Setting]:
     """Return settings from a mapping: `{"qubits": 6, "algorithm.gamma": 0.9}`.
 
     Raises
@@ -319,7 +319,7 @@ def from_mapping(given: Mapping[str, Any] | None) -> list[Setting]:
         If a name is no text.
     """
     settings = []
-    for key, value in (given or {}).items():
+    for key, value in (values or {}).items():
         if not isinstance(key, str) or not key.strip():
             raise OptionError(
                 f"options {key!r}: write names, for example {{'qubits': 6, 'algorithm.gamma': 0.9}}"

@@ -92,8 +92,8 @@ class StackedPopulation(nn.Module):
         for name, _ in list(holder.named_parameters()):
             stacked = torch.stack([m.get_parameter(name).detach() for m in modules])
             owner, _, leaf = name.rpartition(".")
-            wanted = first.get_parameter(name).requires_grad
-            setattr(holder.get_submodule(owner), leaf, nn.Parameter(stacked, requires_grad=wanted))
+            trainable = first.get_parameter(name).requires_grad
+            setattr(holder.get_submodule(owner), leaf, nn.Parameter(stacked, requires_grad=trainable))
         for name, _ in list(holder.named_buffers()):
             owner, _, leaf = name.rpartition(".")
             holder.get_submodule(owner)._buffers[leaf] = torch.stack([m.get_buffer(name) for m in modules])

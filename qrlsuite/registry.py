@@ -211,15 +211,15 @@ def _collect(handed: list[tuple[str, specs.Spec]], kinds: Mapping[str, type[spec
         if type(spec) is expected:
             handed.append((kind, spec))
             return
-    wanted = next(iter(kinds.values())).__name__ if len(kinds) == 1 else "spec of `qrlsuite.specs`"
-    raise PluginError(f"register() needs a {wanted}, got {type(spec).__name__}")
+    accepted = next(iter(kinds.values())).__name__ if len(kinds) == 1 else "spec of `qrlsuite.specs`"
+    raise PluginError(f"register() needs a {accepted}, got {type(spec).__name__}")
 
 
 def _duplicate(kind: str, name: str, owners: list[str]) -> str:
-    what = f"{SINGULAR[kind].replace('_', ' ')} '{name}' is registered"
+    subject = f"{SINGULAR[kind].replace('_', ' ')} '{name}' is registered"
     if len(set(owners)) == 1:
-        return f"{what} twice by {owners[0]}: give one of them another name"
-    return f"{what} by both {' and '.join(owners)}: uninstall one of them (pip uninstall {owners[-1]})"
+        return f"{subject} twice by {owners[0]}: give one of them another name"
+    return f"{subject} by both {' and '.join(owners)}: uninstall one of them (pip uninstall {owners[-1]})"
 
 
 def words(error: BaseException) -> str:
@@ -238,23 +238,24 @@ def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
     PluginError
         If `QRLSUITE_LOAD_PLUGINS` names a distribution that has none.
     """
-    found: dict[tuple[str, str], metadata.EntryPoint] = {}
+    points: dict[tuple[str, str], metadata.EntryPoint] = {}
     for point in metadata.entry_points(group=hookspecs.PROJECT):
         owner = point.dist.name if point.dist is not None else "unknown"
-        found.setdefault((owner, point.value), point)
+        points.setdefault((owner, point.value), point)
     chosen = os.environ.get(LOAD_PLUGINS)
     if chosen is not None:
-        wanted = [word.strip() for word in chosen.split(",") if word.strip()]
-        owners = {_canonical(owner): owner for owner, _ in found}
-        for word in wanted:
+        allowed = [word.strip() for word in chosen.split(",") if word.strip()]
+        owners = {_canonical(owner): owner for owner, _ in points}
+        for word in allowed:
             if _canonical(word) not in owners:
                 raise PluginError(
                     f"{LOAD_PLUGINS}: no installed distribution '{word}' has plugins{nearest(word, owners)}"
                 )
-        kept = {"qrlsuite", *(owners[_canonical(word)] for word in wanted)}
-        found = {key: point for key, point in found.items() if key[0] in kept}
+        kept = {"qrlsuite", *(owners[_canonical(word)] for word in allowed)}
+        points = {key: point for key, point in points.items() if key[0] in kept}
     return sorted(
-        ((key[0], point) for key, point in found.items()), key=lambda p: (p[0] != "qrlsuite", p[0], p[1].name)
+        ((key[0], point) for key, point in points.items()),
+        key=lambda p: (p[0] != "qrlsuite", p[0], p[1].name),
     )
 
 
@@ -285,16 +286,16 @@ def create(
     registry = Registry(manager, strict=strict)
     for distribution, point in points():
         version = point.dist.version if point.dist is not None else ""
-        found = Plugin(point.name, point.value, distribution, version)
-        registry.plugins.append(found)
+        plugin = Plugin(point.name, point.value, distribution, version)
+        registry.plugins.append(plugin)
         try:
-            found.requires = required_versions(point.dist)
+            plugin.requires = required_versions(point.dist)
             check_version(point.dist)
-            found.registered = registry.add_plugin(_import(point, distribution), distribution)
+            plugin.registered = registry.add_plugin(_import(point, distribution), distribution)
         except PluginError as error:
             if strict:
                 raise
-            found.problem = str(error)
+            plugin.problem = str(error)
             registry.report(f"{error}; skipped")
     return registry
 
@@ -327,12 +328,12 @@ def load() -> Registry:
     global _loading
     _loading = True
     try:
-        found = create(is_strict())
+        registry = create(is_strict())
     finally:
         _loading = False
     if "gymnasium" in sys.modules:
-        qrlsuite._register(found)
-    return found
+        qrlsuite._register(registry)
+    return registry
 
 
 def environment(name: str) -> specs.EnvironmentSpec:

@@ -142,8 +142,8 @@ class CartPole(CartPoleEnv):
         bounds: tuple[float, float, float, float] = (2.4, 2.5, 0.21, 2.5),
         render_mode: str | None = None,
     ) -> None:
-        given = {"steps": steps, "normalization": normalization, "bounds": bounds}
-        self.options = parse(given)
+        values = {"steps": steps, "normalization": normalization, "bounds": bounds}
+        self.options = parse(values)
         if self.options.normalization == "running":
             raise OptionError(
                 "environment 'cartpole': running statistics belong to an agent, which keeps them in a task; "
@@ -215,11 +215,11 @@ class CartPoleLanes(LaneEnv):
         qrlsuite.errors.OptionError
             If `options` has another key than `state`, or it has another shape.
         """
-        given = dict(options or {})
-        start = given.pop("state", None)
-        if given:
+        settings = dict(options or {})
+        start = settings.pop("state", None)
+        if settings:
             raise OptionError(
-                f"environment 'cartpole': reset() takes the option 'state', not {sorted(given)}"
+                f"environment 'cartpole': reset() takes the option 'state', not {sorted(settings)}"
             )
         if seed is not None or not self.streams:
             self.seed_from(seed)

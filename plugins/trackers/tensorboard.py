@@ -40,10 +40,10 @@ class TensorBoard:
 
     def run_started(self, run: Mapping[str, Any]) -> None:
         """Open a new event file for a seed, which goes on after `run["epochs"]`."""
-        own = Path(run["folder"])
-        folder = own / "tensorboard"
+        run_folder = Path(run["folder"])
+        folder = run_folder / "tensorboard"
         if self.target is not None:
-            folder = self.target / run["task"] / run["entry"] / own.name
+            folder = self.target / run["task"] / run["entry"] / run_folder.name
         folder.mkdir(parents=True, exist_ok=True)
         # readers go through files in the order of their names
         path = folder / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}"

@@ -9,20 +9,20 @@ from typer.core import TyperCommand, TyperGroup
 OPTION = "--across"
 
 
-def spread(words: list[str]) -> list[str]:
+def spread(arguments: list[str]) -> list[str]:
     """Write the option before each of its words, as Click understands it.
 
     >>> spread(["--across", "beam6g", "cartpole", "--alpha", "0.1"])
     ['--across', 'beam6g', '--across', 'cartpole', '--alpha', '0.1']
     """
-    found, inside = list[str](), False
-    for place, word in enumerate(words):
+    expanded, inside = list[str](), False
+    for index, word in enumerate(arguments):
         if word.startswith("-"):
             inside = word == OPTION
-        elif inside and words[place - 1] != OPTION:
-            found.append(OPTION)
-        found.append(word)
-    return found
+        elif inside and arguments[index - 1] != OPTION:
+            expanded.append(OPTION)
+        expanded.append(word)
+    return expanded
 
 
 class SeveralTasksGroup(TyperGroup):

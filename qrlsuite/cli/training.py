@@ -60,8 +60,8 @@ def execution_of(
     device: str = "cpu",
 ) -> Execution:
     """Build the engine that a command's options name; the errors are those of `qrlsuite.engine.execution.create`."""
-    given = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
-    return execution.create(engine, workers, {"partition": partition, "time": time, **given}, device)
+    chosen = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
+    return execution.create(engine, workers, {"partition": partition, "time": time, **chosen}, device)
 
 
 _PIECE = re.compile(r"(\d+(?:\.\d+)?)\s*(seconds|sec|s|minutes|min|m|hours|h|days|d)")
@@ -79,8 +79,8 @@ def seconds(text: str) -> float:
     >>> seconds("1h 30min")
     5400.0
     """
-    words = text.strip().lower()
-    pieces = _PIECE.findall(words)
-    if not pieces or _PIECE.sub("", words).strip():
+    duration = text.strip().lower()
+    pieces = _PIECE.findall(duration)
+    if not pieces or _PIECE.sub("", duration).strip():
         raise OptionError(f"--budget {text}: write a time, for example 90s, 30min, 2h or 1h30min")
     return sum(float(number) * _SECONDS[unit[0]] for number, unit in pieces)

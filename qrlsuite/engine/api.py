@@ -57,7 +57,7 @@ class EngineOutcome:
 class Engine(Protocol):
     """A place where groups run; built as `factory(options)`, `options` None for a spec without options."""
 
-    def workers(self, asked: int | None) -> int:
+    def workers(self, requested: int | None) -> int:
         """Return how many groups may run at a time, given what the user asked for."""
 
     def queued(self, store: EntryStore) -> set[int]:
@@ -90,12 +90,12 @@ def worker_command(work: Work, group: SeedGroup) -> list[str]:
     ]
 
 
-def create(name: str, given: Mapping[str, Any]) -> Engine:
+def create(name: str, option_values: Mapping[str, Any]) -> Engine:
     """Build a registered engine.
 
     Parameters
     ----------
-    given:
+    option_values:
         Its options by name; None stands for an option that was not given.
 
     Raises
@@ -106,15 +106,15 @@ def create(name: str, given: Mapping[str, Any]) -> Engine:
         If a package that it needs is not installed; the message has the pip command.
     """
     spec = cast(specs.EngineSpec, registry.load().get("engines", name).spec)
-    values = {key: value for key, value in given.items() if value is not None}
-    if spec.options is None and values:
-        raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(values))}")
+    chosen_values = {key: value for key, value in option_values.items() if value is not None}
+    if spec.options is None and chosen_values:
+        raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(chosen_values))}")
     for module, command in spec.extras.items():
         if importlib.util.find_spec(module) is None:
             raise QrlSuiteError(f"engine '{name}' needs the package '{module}': {command}")
     chosen = None
     if spec.options is not None:
-        chosen = options.build(specs.resolve(spec.options), values, f"engine '{name}'")
+        chosen = options.build(specs.resolve(spec.options), chosen_values, f"engine '{name}'")
     return cast(Engine, specs.resolve(spec.factory)(chosen))
 
 

@@ -258,12 +258,12 @@ class RunDisplay:
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
-        there = len(self.plan.seeds) - len(busy) - todo
+        complete = len(self.plan.seeds) - len(busy) - todo
         places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
         parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
-        parts += [f"{counted(there, 'seed')} already there"] * bool(there) + [f"{resumed} resume"] * bool(
-            resumed
-        )
+        parts += [f"{counted(complete, 'seed')} already there"] * bool(complete) + [
+            f"{resumed} resume"
+        ] * bool(resumed)
         end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
         if self.expected is not None:
@@ -294,13 +294,13 @@ class RunDisplay:
             completed += len(group.seeds) * (state.get("phase") == "finished")
             epochs.append(epoch)
             scores += state.get("seed_scores") or []
-        words = [
+        parts = [
             f"seeds {completed}/{sum(len(g.seeds) for g in self.groups)}",
             f"epoch {min(epochs)}/{self.epochs}",
         ]
-        words += [f"median score {statistics.median(scores):.3f}"] if scores else []
-        words += [f"{duration(left)} left"] if left is not None else ["measuring"]
-        text = "  ".join(words)
+        parts += [f"median score {statistics.median(scores):.3f}"] if scores else []
+        parts += [f"{duration(left)} left"] if left is not None else ["measuring"]
+        text = "  ".join(parts)
         if self.bar.shown:
             self.bar.update(done, "training", text)
         elif now - self._last_line >= PLAIN_SECONDS:
@@ -360,11 +360,15 @@ class RunDisplay:
         """Sum the run up, and say what to type next."""
         self.close()
         score = summary["median_score"]
-        shown = f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
-        self.console.print(f"{counted(summary['seeds'], 'seed')} complete{shown}")
-        wanted = self.entry.task.file.protocol.seeds
-        if summary["seeds"] < wanted:
-            self.console.print(f"provisional: the task's protocol asks for {wanted} seeds")
+        score_text = (
+            f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
+        )
+        self.console.print(f"{counted(summary['seeds'], 'seed')} complete{score_text}")
+        protocol_seeds = self.entry.task.file.protocol.seeds
+        if summary["seeds"] < protocol_seeds:
+            self.console.print(f"provisional: the task's protocol asks for {protocol_seeds} seeds")
         name = self.entry.task.name
-        for words in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
-            self.console.print(f"next: {command(*words, runs=self.plan.runs)}", markup=False, soft_wrap=True)
+        for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
+            self.console.print(
+                f"next: {command(*arguments, runs=self.plan.runs)}", markup=False, soft_wrap=True
+            )

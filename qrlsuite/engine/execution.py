@@ -149,13 +149,13 @@ def plan(
     StoreError
         If the entry's folder is damaged, or belongs to another entry.
     """
-    wanted = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
+    requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
     store = EntryStore.find(runs, entry)
     busy = {seed for claim in living(store) for seed in claim.seeds} | execution.engine.queued(store)
-    busy &= set(wanted)
-    missing = plan_groups(store, sorted(set(wanted) - busy), last, execution.workers)
-    return Plan(runs, entry, store, wanted, last, frozenset(busy), missing)
+    busy &= set(requested)
+    missing = plan_groups(store, sorted(set(requested) - busy), last, execution.workers)
+    return Plan(runs, entry, store, requested, last, frozenset(busy), missing)
 
 
 class _TimeIsUp(Exception):

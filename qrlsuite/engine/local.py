@@ -49,9 +49,9 @@ class LocalEngine:
     def __init__(self, options: None = None) -> None:
         self._running: list[_Job] = []
 
-    def workers(self, asked: int | None) -> int:
+    def workers(self, requested: int | None) -> int:
         """Return the number asked for, else one per core that this process may use."""
-        return asked or usable_cores()
+        return requested or usable_cores()
 
     def queued(self, store: EntryStore) -> set[int]:
         """Return nothing: what waits for a local process waits in that process."""

@@ -138,9 +138,9 @@ class SlurmEngine:
         self._asked = 0.0
         self._answer: set[str] | None = None
 
-    def workers(self, asked: int | None) -> int:
+    def workers(self, requested: int | None) -> int:
         """Return the number of array tasks asked for, else `TASKS`."""
-        return asked or TASKS
+        return requested or TASKS
 
     def queued(self, store: EntryStore) -> set[int]:
         """Return the seeds whose tasks SLURM still knows as waiting or running.

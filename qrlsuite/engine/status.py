@@ -63,7 +63,7 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
         If there is no such folder.
     """
     lookup.check_tasks(runs, task)
-    found = []
+    statuses = []
     queues = Queues()
     for store in entries(runs, task):
         entry, queued, problem = look(store), None, None
@@ -73,5 +73,5 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
                 entry = look(store, queued)
             except QrlSuiteError as error:
                 problem = str(error)
-        found.append(EntryStatus(entry, tuple(groups(store, queued)), problem))
-    return found
+        statuses.append(EntryStatus(entry, tuple(groups(store, queued)), problem))
+    return statuses

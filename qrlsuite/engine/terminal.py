@@ -40,19 +40,21 @@ def command(*words: str, runs: Path | None = None) -> str:
         The results folder of a command that takes `--runs`; it is left out where it is the default.
     """
     default = Path(os.environ.get("QRLSUITE_RUNS") or "runs")
-    where = [] if runs is None or runs == default else ["--runs", str(runs)]
-    return f"{_program()} {shlex.join([*words, *where])}"
+    runs_option = [] if runs is None or runs == default else ["--runs", str(runs)]
+    return f"{_program()} {shlex.join([*words, *runs_option])}"
 
 
 def _program() -> str:
-    own = Path(sys.executable).parent / "qrlsuite"  # not resolved: a virtual environment's python is a link
-    found = shutil.which("qrlsuite")
-    if found is not None and own.exists() and os.path.samefile(found, own):
+    installed = (
+        Path(sys.executable).parent / "qrlsuite"
+    )  # not resolved: a virtual environment's python is a link
+    on_path = shutil.which("qrlsuite")
+    if on_path is not None and installed.exists() and os.path.samefile(on_path, installed):
         return "qrlsuite"
-    if not own.exists():
+    if not installed.exists():
         return f"{shlex.quote(sys.executable)} -m qrlsuite"
     here = Path.cwd()
-    return shlex.quote(str(own.relative_to(here) if own.is_relative_to(here) else own))
+    return shlex.quote(str(installed.relative_to(here) if installed.is_relative_to(here) else installed))
 
 
 def printable(text: object) -> str:

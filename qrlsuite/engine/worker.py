@@ -136,12 +136,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--follow-parent", type=int, metavar="PID", help="stop, saving, when this parent process ends"
     )
-    given = parser.parse_args(arguments)
-    if given.follow_parent is not None and not _end_with(given.follow_parent):
+    options = parser.parse_args(arguments)
+    if options.follow_parent is not None and not _end_with(options.follow_parent):
         return 130
     try:
         _checkpoint_seconds()
-        train_group(given.folder, parse_seeds(given.seeds), given.epochs, given.device, given.follow_parent)
+        train_group(
+            options.folder, parse_seeds(options.seeds), options.epochs, options.device, options.follow_parent
+        )
     except SeedsClaimedError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)
         return 3

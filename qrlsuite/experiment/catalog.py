@@ -12,15 +12,15 @@ from qrlsuite.experiment.task import load
 
 def hooks() -> list[dict[str, str]]:
     """Return every hook: its name, its signature, the first line of its manual and the manual."""
-    found = []
+    described = []
     for name, function in vars(hookspecs).items():
         if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec"):
             manual = inspect.getdoc(function) or ""
             arguments = ", ".join(inspect.signature(function).parameters)
             summary = manual.partition("\n")[0]
             row = {"name": name, "summary": summary, "signature": f"{name}({arguments})", "manual": manual}
-            found.append(row)
-    return found
+            described.append(row)
+    return described
 
 
 def describe(kind: str, name: str) -> dict[str, Any]:

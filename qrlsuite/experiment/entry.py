@@ -68,22 +68,22 @@ class Entry:
     @property
     def label(self) -> str:
         """A readable name: the model with its first option and every option that is not the default."""
-        words = [self.model.name]
+        parts = [self.model.name]
         plain = options.identity(self.model_options)
         defaults = options.plain(specs.resolve(self.model.options)())
-        words += [f"{k}={v}" for i, (k, v) in enumerate(plain.items()) if i == 0 or v != defaults.get(k)]
+        parts += [f"{k}={v}" for i, (k, v) in enumerate(plain.items()) if i == 0 or v != defaults.get(k)]
         usual = self._usual_algorithm_options()
-        words += [
+        parts += [
             f"{k}={v}" for k, v in options.identity(self.algorithm_options).items() if v != usual.get(k)
         ]
-        return f"{self.algorithm.name} {' '.join(words)}"
+        return f"{self.algorithm.name} {' '.join(parts)}"
 
     def _usual_algorithm_options(self) -> options.Values:
         """Return the algorithm's options as the task's default preset has them, later ones at their defaults."""
         _, values = self.task.preset(None, self.algorithm.name, self.model.family)
         cls = specs.resolve(self.algorithm.options)
-        given = {k: v for k, v in values.items() if k not in options.later(cls)}
-        return options.plain(options.build(cls, given, "preset"))
+        covered = {k: v for k, v in values.items() if k not in options.later(cls)}
+        return options.plain(options.build(cls, covered, "preset"))
 
     def distributions(self) -> list[str]:
         """Return the distributions whose code makes the entry's numbers, each once.
@@ -98,8 +98,8 @@ class Entry:
             "ansatzes": getattr(self.model_options, "ansatz", None),
             "circuit_backends": getattr(self.model_options, "backend", None),
         }
-        found = [known.entries[kind].get(name) for kind, name in named.items() if isinstance(name, str)]
-        return list(dict.fromkeys(each.distribution for each in found if each is not None))
+        registered = [known.entries[kind].get(name) for kind, name in named.items() if isinstance(name, str)]
+        return list(dict.fromkeys(each.distribution for each in registered if each is not None))
 
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
@@ -141,8 +141,8 @@ def resolve(
     """
     task = load(task_name)
     file = presets.load(Path(preset)) if preset is not None and preset.endswith(".toml") else None
-    wanted = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
-    algorithm = registry.algorithm(wanted)
+    name = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
+    algorithm = registry.algorithm(name)
     model = registry.model(model_name)
     model_defaults: Mapping[str, Any] = {} if file is None else file.model_options
     sides = option_sides(task, algorithm, model, settings, model_defaults)
@@ -151,13 +151,16 @@ def resolve(
     _hand_to_ansatz(values, sides, model_defaults)
     task = task.with_environment(values["environment"])
     chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
-    tuning, own = task.tuning(chosen, algorithm.name, model.family), {"algorithm": defaults}
+    tuning, defaults_by_side = task.tuning(chosen, algorithm.name, model.family), {"algorithm": defaults}
     if file is not None and preset is not None:
         presets.require(file, preset, algorithm.name, model.name)
-        for side, given in (("algorithm", file.algorithm_options), ("model", file.model_options)):
-            options.build(sides[side], given, f"preset file {preset}: {side} '{getattr(file, side)}'")
+        for side, side_options in (("algorithm", file.algorithm_options), ("model", file.model_options)):
+            options.build(sides[side], side_options, f"preset file {preset}: {side} '{getattr(file, side)}'")
         chosen, defaults = Path(preset).name, {**defaults, **file.algorithm_options}
-        tuning, own = file.tuning, {"algorithm": file.algorithm_options, "model": file.model_options}
+        tuning, defaults_by_side = (
+            file.tuning,
+            {"algorithm": file.algorithm_options, "model": file.model_options},
+        )
     model_options = options.build(
         sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
     )
@@ -172,7 +175,9 @@ def resolve(
         ),
         model_options=model_options,
         preset=chosen,
-        tuning=None if tuning is None or chosen is None else presets.record_of(tuning, chosen, own, values),
+        tuning=None
+        if tuning is None or chosen is None
+        else presets.record_of(tuning, chosen, defaults_by_side, values),
     )
 
 
@@ -247,14 +252,14 @@ def _hand_to_ansatz(
     values: dict[str, options.Values], sides: Mapping[str, type[Any]], defaults: Mapping[str, Any]
 ) -> None:
     """Move options that were set for an ansatz to the model: into its table `ansatz_options`, or to its own option."""
-    given = values.pop("ansatz", {})
-    for name in [name for name in given if name in getattr(sides["model"], "passes_on", ())]:
-        values["model"][name] = given.pop(name)
+    ansatz_options = values.pop("ansatz", {})
+    for name in [name for name in ansatz_options if name in getattr(sides["model"], "passes_on", ())]:
+        values["model"][name] = ansatz_options.pop(name)
     table = values["model"].get("ansatz_options", defaults.get("ansatz_options", {}))
-    if given and isinstance(
+    if ansatz_options and isinstance(
         table, Mapping
     ):  # what is no table is refused where the model's options are built
-        values["model"]["ansatz_options"] = {**table, **given}
+        values["model"]["ansatz_options"] = {**table, **ansatz_options}
 
 
 def from_record(record: Mapping[str, Any], source: str) -> Entry:

@@ -109,8 +109,8 @@ def _lines(error: pydantic.ValidationError) -> list[str]:
         *parents, key = (str(part) for part in item["loc"])
         if item["type"] == "extra_forbidden":
             known = (TuningRecord if parents else PresetFile).model_fields
-            where = f" in [{'.'.join(parents)}]" if parents else ""
-            lines.append(f"unknown key '{key}'{where}{nearest(key, known)}")
+            table = f" in [{'.'.join(parents)}]" if parents else ""
+            lines.append(f"unknown key '{key}'{table}{nearest(key, known)}")
         elif item["type"] == "missing":
             lines.append(f"missing key '{'.'.join([*parents, key])}'")
         else:
@@ -120,21 +120,21 @@ def _lines(error: pydantic.ValidationError) -> list[str]:
 
 def require(preset: PresetFile, source: str, algorithm: str, model: str) -> None:
     """Raise OptionError unless a preset file is for this algorithm and this model."""
-    for kind, wanted, given in (
+    for kind, expected, actual in (
         ("algorithm", preset.algorithm, algorithm),
         ("model", preset.model, model),
     ):
-        if wanted != given:
+        if expected != actual:
             raise OptionError(
-                f"preset file {source} holds settings for {kind} '{wanted}', not for '{given}': "
-                f"write --{kind} {wanted}, or tune {given}"
+                f"preset file {source} holds settings for {kind} '{expected}', not for '{actual}': "
+                f"write --{kind} {expected}, or tune {actual}"
             )
 
 
 def record_of(
     tuning: TuningRecord,
     source: str,
-    own: Mapping[str, Mapping[str, Any]],
+    chosen: Mapping[str, Mapping[str, Any]],
     values: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Return what an entry keeps of the tuning of its preset, see `EntryTuning`.
@@ -143,14 +143,14 @@ def record_of(
     ----------
     source:
         The preset's name.
-    own:
+    chosen:
         What the preset gives, by side (`algorithm`, `model`); a side that it says nothing of is absent.
     values:
         What `--set` gave, by side: where that differs from the preset, the record says so.
     """
     changed = sorted(
         f"{side}.{name}"
-        for side, content in own.items()
+        for side, content in chosen.items()
         for name, value in values.get(side, {}).items()
         if content.get(name) != value
     )

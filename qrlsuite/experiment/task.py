@@ -220,8 +220,8 @@ class Task:
         except UnknownNameError as error:
             raise TaskError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
-        where = f"{source}: environment.options"
-        self.environment_options = options.build(cls, file.environment.options, where)
+        location = f"{source}: environment.options"
+        self.environment_options = options.build(cls, file.environment.options, location)
         self.definition: dict[str, Any] = {
             "environment": file.environment.name,
             "environment_options": options.identity(self.environment_options),
@@ -261,8 +261,8 @@ class Task:
         if not values:
             return self
         merged = {**self.file.environment.options, **values}
-        where = f"environment '{self.environment.name}'"  # not the file: its own options are in order
-        options.build(specs.resolve(self.environment.options), merged, where)
+        location = f"environment '{self.environment.name}'"  # not the file: its own options are in order
+        options.build(specs.resolve(self.environment.options), merged, location)
         section = self.file.environment.model_copy(update={"options": merged})
         changed = Task(self.file.model_copy(update={"environment": section}), self.source)
         if changed.hash != self.hash:
@@ -349,15 +349,15 @@ def parse(text: str, source: str) -> Task:
 def _environment_problems(section: Any) -> list[str]:
     """Return what is wrong with the environment of a file that is not in order elsewhere."""
     try:
-        given = EnvironmentSection.model_validate(section)
+        parsed = EnvironmentSection.model_validate(section)
     except pydantic.ValidationError:
         return []  # named already
     try:
-        cls = specs.resolve(registry.environment(given.name).options)
+        cls = specs.resolve(registry.environment(parsed.name).options)
     except UnknownNameError as error:
         return [f"environment.name: {error}"]
     try:
-        options.build(cls, given.options, "environment.options")
+        options.build(cls, parsed.options, "environment.options")
     except OptionError as error:
         return [str(error)]
     return []

@@ -28,8 +28,8 @@ from qrlsuite.results.store import entries
 VARIABLES = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "CUDA_", "QRLSUITE_", "XDG_CACHE_HOME", "PYTHONPATH")
 """Environment variables, by how they begin, that change how fast or from where things run."""
 
-LITTLE = 1_000_000_000
-"""Bytes of free space below which it is worth a word; a finished seed takes a quarter of a megabyte."""
+LOW_DISK_BYTES = 1_000_000_000
+"""Free bytes below which the results folder is reported as nearly full; a seed takes a quarter of a megabyte."""
 
 Facts = dict[str, Any]
 
@@ -61,7 +61,7 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
     announce:
         Called with what is being done, before every step that takes a while.
     """
-    found = Diagnosis()
+    diagnosis = Diagnosis()
     sections: dict[str, Callable[[Diagnosis], Facts]] = {
         "suite": _suite,
         "python": _python,
@@ -73,32 +73,34 @@ def diagnose(runs: Path, announce: Callable[[str], None] = lambda doing: None) -
         "runs": functools.partial(_runs, runs),
         "slurm": _slurm,
     }
-    for name, look in sections.items():
+    for name, inspect in sections.items():
         try:
-            found.facts[name] = look(found)
+            diagnosis.facts[name] = inspect(diagnosis)
         except Exception as error:
-            found.facts[name] = {"error": words(error)}
-            found.broken.append(f"{name}: {words(error)}")
-    return found
+            diagnosis.facts[name] = {"error": words(error)}
+            diagnosis.broken.append(f"{name}: {words(error)}")
+    return diagnosis
 
 
-def _suite(found: Diagnosis) -> Facts:
+def _suite(diagnosis: Diagnosis) -> Facts:
 
     location, stated = Path(qrlsuite.__file__).parent, packages.about()["version"]
     if not stated:
-        found.broken.append(f"{location} is on the path, and not installed: pip install it")
+        diagnosis.broken.append(f"{location} is on the path, and not installed: pip install it")
     elif stated != qrlsuite.__version__:
-        found.broken.append(
+        diagnosis.broken.append(
             f"{location} is qrlsuite {qrlsuite.__version__}, and what is installed is {stated}: install it again"
         )
     return {"version": qrlsuite.__version__, "location": str(location), "commit": collect([])["commit"]}
 
 
-def _python(found: Diagnosis) -> Facts:
+def _python(diagnosis: Diagnosis) -> Facts:
 
     needed = packages.about()["python"]
     if not SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
-        found.broken.append(f"Python {platform.python_version()} is not supported: qrlsuite needs {needed}")
+        diagnosis.broken.append(
+            f"Python {platform.python_version()} is not supported: qrlsuite needs {needed}"
+        )
     return {
         "version": platform.python_version(),
         "executable": sys.executable,
@@ -106,11 +108,11 @@ def _python(found: Diagnosis) -> Facts:
     }
 
 
-def _machine(found: Diagnosis) -> Facts:
+def _machine(diagnosis: Diagnosis) -> Facts:
 
     usable, quota = usable_cores(), _quota()
     if quota is not None and quota < usable:
-        found.remarks.append(
+        diagnosis.remarks.append(
             f"this container may use {quota:g} of {usable} cores: qrlsuite run --workers {max(1, int(quota))}"
         )
     return {
@@ -135,13 +137,13 @@ def _quota() -> float | None:
         return None
 
 
-def _packages(found: Diagnosis) -> Facts:
+def _packages(diagnosis: Diagnosis) -> Facts:
     needed = list(packages.requirements())
-    found.broken += filter(None, map(packages.lacking, needed))
+    diagnosis.broken += filter(None, map(packages.lacking, needed))
     return {requirement.name: packages.version(requirement) for requirement in needed}
 
 
-def _extras(found: Diagnosis) -> Facts:
+def _extras(diagnosis: Diagnosis) -> Facts:
     facts: Facts = {}
     for extra in packages.about()["extras"]:
         needed = list(packages.requirements(extra=extra))
@@ -153,25 +155,25 @@ def _extras(found: Diagnosis) -> Facts:
     return facts
 
 
-def _tried(announce: Callable[[str], None], found: Diagnosis) -> Facts:
+def _tried(announce: Callable[[str], None], diagnosis: Diagnosis) -> Facts:
     answers, failed = packages.attempt(announce)
-    found.broken += failed
+    diagnosis.broken += failed
     facts = {name: answers.get(name, {}) for name in ("torch", "simulator")}
     driver = Path("/proc/driver/nvidia/version").exists()
     if driver and not facts["torch"].get("devices"):
-        found.remarks.append(
+        diagnosis.remarks.append(
             "there is an NVIDIA driver, and this torch sees no GPU: --device cuda needs a CUDA build of torch"
         )
     temporary = Path(tempfile.gettempdir())
     for folder in map(Path, facts["simulator"].get("cache", [])):
         if temporary in folder.parents:
-            found.remarks.append(
+            diagnosis.remarks.append(
                 f"the compiled simulator is kept in {temporary} only: set QRLSUITE_CACHE to a folder that stays"
             )
     return {**facts, "nvidia_driver": driver}
 
 
-def _plugins(found: Diagnosis) -> Facts:
+def _plugins(diagnosis: Diagnosis) -> Facts:
 
     known = registry.load()
     facts: Facts = {"loaded": {}, "failed": {}, "incompatible": {}, "problems": list(known.problems)}
@@ -183,47 +185,49 @@ def _plugins(found: Diagnosis) -> Facts:
             [plugin.problem] if plugin.problem else [n for some in plugin.registered.values() for n in some]
         )
         if plugin.problem and plugin.distribution == "qrlsuite":
-            found.broken.append(plugin.problem)
+            diagnosis.broken.append(plugin.problem)
     if not any(plugin.distribution == "qrlsuite" for plugin in known.plugins):
-        found.broken.append("the suite's own models and tasks are not there: install it again, with pip")
-    found.remarks += [problem for problem in known.problems if not problem.startswith(tuple(found.broken))]
+        diagnosis.broken.append("the suite's own models and tasks are not there: install it again, with pip")
+    diagnosis.remarks += [
+        problem for problem in known.problems if not problem.startswith(tuple(diagnosis.broken))
+    ]
     return facts
 
 
-def _runs(folder: Path, found: Diagnosis) -> Facts:
+def _runs(folder: Path, diagnosis: Diagnosis) -> Facts:
 
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     facts: Facts = {"folder": str(folder), "exists": folder.exists(), "entries": 0, "seeds": 0}
-    facts["free_bytes"] = shutil.disk_usage(there).free
+    facts["free_bytes"] = shutil.disk_usage(existing).free
     try:
-        with tempfile.TemporaryFile(dir=there) as file:
+        with tempfile.TemporaryFile(dir=existing) as file:
             file.write(b"\0" * 4096)
             file.flush()
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         facts["writable"] = True
     except OSError as error:
         facts["writable"] = False
-        found.broken.append(f"{there} cannot be written and locked: {error.strerror}; use --runs DIR")
-    if facts["free_bytes"] < LITTLE:
-        found.remarks.append(f"little space is left at {there}: {facts['free_bytes'] / 1e6:.0f} MB")
+        diagnosis.broken.append(f"{existing} cannot be written and locked: {error.strerror}; use --runs DIR")
+    if facts["free_bytes"] < LOW_DISK_BYTES:
+        diagnosis.remarks.append(f"little space is left at {existing}: {facts['free_bytes'] / 1e6:.0f} MB")
     if folder.is_dir():
         stores = entries(folder)
         facts |= {"entries": len(stores), "seeds": sum(len(store.seeds()) for store in stores)}
     return facts
 
 
-def _slurm(found: Diagnosis) -> Facts:
+def _slurm(diagnosis: Diagnosis) -> Facts:
     sbatch = shutil.which("sbatch")
     facts: Facts = {"sbatch": sbatch, "job": os.environ.get("SLURM_JOB_ID")}
     if sbatch is not None:
         try:
-            said = subprocess.run(
+            answer = subprocess.run(
                 [sbatch, "--version"], capture_output=True, text=True, timeout=20, check=True
             )
-            facts["version"] = said.stdout.strip()
+            facts["version"] = answer.stdout.strip()
         except (OSError, subprocess.SubprocessError) as error:
-            found.remarks.append(f"{sbatch} --version fails: {error}")
-        missing = found.facts.get("extras", {}).get("slurm", {})
+            diagnosis.remarks.append(f"{sbatch} --version fails: {error}")
+        missing = diagnosis.facts.get("extras", {}).get("slurm", {})
         if missing.get("missing"):
-            found.remarks.append(f"SLURM is here, and --engine slurm needs {missing['install']}")
+            diagnosis.remarks.append(f"SLURM is here, and --engine slurm needs {missing['install']}")
     return facts

@@ -21,13 +21,13 @@ PATIENCE = 600
 def about() -> dict[str, Any]:
     """Return the suite's metadata: version, the Python that it needs, its extras; empty where it is not installed."""
     try:
-        found = metadata.metadata("qrlsuite")
+        package = metadata.metadata("qrlsuite")
     except metadata.PackageNotFoundError:
         return {"version": "", "python": "", "extras": []}
     return {
-        "version": found["Version"],
-        "python": found["Requires-Python"] or "",
-        "extras": found.get_all("Provides-Extra") or [],
+        "version": package["Version"],
+        "python": package["Requires-Python"] or "",
+        "extras": package.get_all("Provides-Extra") or [],
     }
 
 
@@ -60,11 +60,11 @@ def version(requirement: Requirement) -> str | None:
 
 def lacking(requirement: Requirement) -> str:
     """Say what is wrong with what is installed, and what to type; `""` where nothing is."""
-    found = version(requirement)
-    if found is not None and requirement.specifier.contains(found, prereleases=True):
+    installed = version(requirement)
+    if installed is not None and requirement.specifier.contains(installed, prereleases=True):
         return ""
-    what = "is not installed" if found is None else f"{found} is installed, and does not fit"
-    return f"{requirement.name} {what}: pip install '{requirement.name}{requirement.specifier}'"
+    problem = "is not installed" if installed is None else f"{installed} is installed, and does not fit"
+    return f"{requirement.name} {problem}: pip install '{requirement.name}{requirement.specifier}'"
 
 
 def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]:
@@ -100,12 +100,12 @@ def attempt(announce: Callable[[str], None]) -> tuple[dict[str, Any], list[str]]
             process.kill()
             process.communicate()
         errors.seek(0)
-        said = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
+        last_line = (errors.read().strip().splitlines() or ["it said nothing"])[-1]
     causes: dict[str, list[str]] = {}
     for step, answer in answers.items():
         if isinstance(answer, dict) and "error" in answer:
             causes.setdefault(answer["error"], []).append(step)
     failed = [f"{', '.join(steps)}: {error}" for error, steps in causes.items()]
     if process.returncode:
-        failed.append(f"{doing}: the process ended with code {process.returncode}: {said}")
+        failed.append(f"{doing}: the process ended with code {process.returncode}: {last_line}")
     return answers, failed

@@ -23,12 +23,12 @@ def main(modules: list[str]) -> None:
     def step(doing: str, name: str, call: Callable[[], Any]) -> None:
         print(json.dumps({"doing": doing}), file=out, flush=True)
         try:
-            found = call()
+            answer = call()
         except (Exception, SystemExit) as error:
             with contextlib.suppress(Exception):
                 print(json.dumps({name: {"error": f"{type(error).__name__}: {error}"}}), file=out, flush=True)
         else:
-            print(json.dumps({name: found}), file=out, flush=True)
+            print(json.dumps({name: answer}), file=out, flush=True)
 
     for module in modules:
         step(f"import {module}", f"import {module}", lambda module=module: _import(module))  # type: ignore[misc]
@@ -64,9 +64,9 @@ def simulator() -> dict[str, Any]:
 
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0))
-    found = expectations(circuit, np.array([[0.0], [np.pi]]), {}).tolist()
-    if not np.allclose(found, [[1.0], [-1.0]], atol=1e-6):
-        raise ValueError(f"<Z> after RX(0) and RX(pi) is {found}, and must be [[1], [-1]]")
+    values = expectations(circuit, np.array([[0.0], [np.pi]]), {}).tolist()
+    if not np.allclose(values, [[1.0], [-1.0]], atol=1e-6):
+        raise ValueError(f"<Z> after RX(0) and RX(pi) is {values}, and must be [[1], [-1]]")
     return {"cache": sorted(_caches()), **_numba()}
 
 
@@ -90,12 +90,12 @@ def _caches() -> set[str]:
     """Return the folders in which the suite's compiled functions are kept."""
     from numba.core.dispatcher import Dispatcher
 
-    found = set()
+    folders = set()
     for name, module in list(sys.modules.items()):
         if name.startswith("qrlsuite."):
             compiled = [value for value in vars(module).values() if isinstance(value, Dispatcher)]
-            found |= {str(value.stats.cache_path) for value in compiled if value.stats.cache_path}
-    return found
+            folders |= {str(value.stats.cache_path) for value in compiled if value.stats.cache_path}
+    return folders
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ def _suite(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _python(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    where = "" if facts["virtual_environment"] else ", no virtual environment"
-    yield "python", f"{facts['version']}, {facts['executable']}{where}"
+    environment = "" if facts["virtual_environment"] else ", no virtual environment"
+    yield "python", f"{facts['version']}, {facts['executable']}{environment}"
 
 
 def _machine(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -56,11 +56,11 @@ def _packages(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _extras(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for extra, about in facts.items():
-        there = [
+        installed = [
             f"{name} {version}" for name, version in about["versions"].items() if name not in about["missing"]
         ]
         lacks = f"no {', '.join(about['missing'])}: {about['install']}" if about["missing"] else ""
-        yield f"[{extra}]", "; ".join(filter(None, [", ".join(there), lacks]))
+        yield f"[{extra}]", "; ".join(filter(None, [", ".join(installed), lacks]))
 
 
 def _tried(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -96,13 +96,13 @@ def _plugins(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for state in ("loaded", "incompatible", "failed"):
         for distribution, names in facts[state].items():
             if state != "loaded":
-                shown = f"{state.upper()}, see below"
+                text = f"{state.upper()}, see below"
             elif distribution.startswith("qrlsuite "):
-                shown = "the suite's own"
+                text = "the suite's own"
             else:
                 more = f", and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-                shown = f"{', '.join(names[:SHOWN])}{more}" if names else "nothing by name"
-            yield "plugin", f"{distribution}: {shown}"
+                text = f"{', '.join(names[:SHOWN])}{more}" if names else "nothing by name"
+            yield "plugin", f"{distribution}: {text}"
 
 
 def _runs(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:

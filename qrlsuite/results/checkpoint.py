@@ -91,7 +91,7 @@ def headers(store: EntryStore) -> list[Header]:
     """
     if not store.groups.is_dir():
         return []
-    found = []
+    headers_found = []
     for path in sorted(store.groups.glob("*/checkpoint.safetensors")):
         try:
             with path.open("rb") as file:
@@ -109,16 +109,16 @@ def headers(store: EntryStore) -> list[Header]:
             ) from None
         if version != str(FORMAT_VERSION):
             raise StoreError(f"{path} has format version {version}, this suite reads {FORMAT_VERSION}")
-        found.append(Header(path, epoch, seeds))
-    return found
+        headers_found.append(Header(path, epoch, seeds))
+    return headers_found
 
 
 def latest(store: EntryStore) -> dict[int, Header]:
     """Return the newest checkpoint of every seed that has one; a seed without a folder starts again."""
-    found = headers(store)
-    begun = set(store.seeds()) if found else set()
+    newest_first = headers(store)
+    begun = set(store.seeds()) if newest_first else set()
     newest: dict[int, Header] = {}
-    for header in found:
+    for header in newest_first:
         for seed in begun.intersection(header.seeds):
             if seed not in newest or newest[seed].epoch < header.epoch:
                 newest[seed] = header

@@ -197,12 +197,12 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
         with _locked(store.claims):
             now = _file_system_time(store.claims)
             states = {claim: _state(claim, now) for claim in claims(store)}
-            wanted = set(seeds)
-            suspects = [c for c, state in states.items() if state == "suspect" and wanted & set(c.seeds)]
+            claimed = set(seeds)
+            suspects = [c for c, state in states.items() if state == "suspect" and claimed & set(c.seeds)]
             states |= dict.fromkeys(_abandoned(suspects), "dead")
             holders = [claim for claim, state in states.items() if state != "dead"]
             for holder in holders:
-                shared = sorted(wanted & set(holder.seeds))
+                shared = sorted(claimed & set(holder.seeds))
                 if shared:
                     raise SeedsClaimedError(_refusal(holder, shared))
             for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:

@@ -51,17 +51,17 @@ class Stored:
 
 def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     """Return what the entries in some folders are called by; a damaged one is called by its folder."""
-    found = []
+    entries = []
     for store in stores:
         name, task = store.path.name, store.path.parent.name
         try:
             record = store.record()
         except StoreError:  # is said where it is the one that was asked for
-            found.append(Stored(store, name, name, task, (task, "", str(store.path))))
+            entries.append(Stored(store, name, name, task, (task, "", str(store.path))))
         else:
             key = (record["task_name"], record["task_hash"], record["name"])
-            found.append(Stored(store, record["name"], record["label"], record["task_name"], key))
-    return found
+            entries.append(Stored(store, record["name"], record["label"], record["task_name"], key))
+    return entries
 
 
 def check_tasks(runs: Path, *tasks: str | None) -> None:
@@ -81,14 +81,14 @@ def check_tasks(runs: Path, *tasks: str | None) -> None:
             raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
 
 
-def choose(among: Sequence[N], name: str, where: object) -> N:
+def choose(among: Sequence[N], name: str, searched: object) -> N:
     """Return the one entry whose name, label, label without the algorithm, or hash is `name` or begins with it.
 
     Where several tasks have such an entry, `TASK/NAME` is one of them. A whole name goes before a beginning.
 
     Parameters
     ----------
-    where:
+    searched:
         For the message: the folder that was looked into.
 
     Raises
@@ -102,7 +102,7 @@ def choose(among: Sequence[N], name: str, where: object) -> N:
         alike = [e for e in among if mentions(e, name)]
         if not alike:
             labels = {_short(e) for e in among}
-            raise UnknownNameError(f"no entry '{name}' in {where}{nearest(name, labels)}")
+            raise UnknownNameError(f"no entry '{name}' in {searched}{nearest(name, labels)}")
         raise UnknownNameError(f"no entry begins with '{name}'; did you mean {_choices(alike, among)}?")
     if len(fitting) > 1:
         raise UnknownNameError(f"'{name}' may be any of {_choices(fitting, among)}: write one of these")
@@ -129,11 +129,11 @@ def _choices(entries: Sequence[Named], among: Sequence[Named]) -> str:
     """List what to type for some entries: the label, with task or hash where several among all have that label."""
     labels = Counter(e.label for e in among)
     places = Counter((e.task, e.label) for e in among)
-    words = []
+    choices = []
     for entry in entries:
         if labels[entry.label] == 1:
-            words.append(entry.label)
+            choices.append(entry.label)
         else:
             unique = places[entry.task, entry.label] == 1
-            words.append(f"{entry.task}/{entry.label if unique else entry.name}")
-    return listed([f"'{word}'" for word in sorted(words)])
+            choices.append(f"{entry.task}/{entry.label if unique else entry.name}")
+    return listed([f"'{word}'" for word in sorted(choices)])

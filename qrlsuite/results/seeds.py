@@ -54,7 +54,7 @@ def parse_seeds(text: str) -> list[int]:
     return sorted(seeds)
 
 
-def read_seeds(given: int | str | Iterable[int]) -> list[int]:
+def read_seeds(requested: int | str | Iterable[int]) -> list[int]:
     """Return the seeds that are meant by a number (100: seeds 0 to 99), text as in `parse_seeds`, or the seeds.
 
     Raises
@@ -62,11 +62,11 @@ def read_seeds(given: int | str | Iterable[int]) -> list[int]:
     OptionError
         If it is none of these, names no seed, one twice, or a negative one.
     """
-    if isinstance(given, str):
-        return parse_seeds(given)
-    if _is_seed(given):
-        return parse_seeds(str(given))
-    seeds = list(given) if isinstance(given, Iterable) else [given]
+    if isinstance(requested, str):
+        return parse_seeds(requested)
+    if _is_seed(requested):
+        return parse_seeds(str(requested))
+    seeds = list(requested) if isinstance(requested, Iterable) else [requested]
     wrong = [seed for seed in seeds if not _is_seed(seed)]
     if wrong:
         raise OptionError(

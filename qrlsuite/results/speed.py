@@ -184,11 +184,15 @@ class Speeds:
         """Return the best estimate for an entry in groups of `together` seeds; None for as many as were measured."""
         subject = _subject(entry)
         reference = _nearest(subject, self.references)
-        own = next((speed for speed in self.measured if speed.hash == entry.hash), None)
-        size = together or (own.group if own is not None else None)
-        if own is not None and size and max(own.group / size, size / own.group) <= SAME_SIZE:
-            return Estimate(own.seconds, "measured", max(own.within, WITHIN["measured"]))
-        alike = own or _nearest(subject, self.measured)
+        same_entry = next((speed for speed in self.measured if speed.hash == entry.hash), None)
+        size = together or (same_entry.group if same_entry is not None else None)
+        if (
+            same_entry is not None
+            and size
+            and max(same_entry.group / size, size / same_entry.group) <= SAME_SIZE
+        ):
+            return Estimate(same_entry.seconds, "measured", max(same_entry.within, WITHIN["measured"]))
+        alike = same_entry or _nearest(subject, self.measured)
         if alike is not None:
             base = _nearest(alike, self.references)
             if reference is None or base is None:
@@ -204,9 +208,9 @@ class Speeds:
 
     def note(self, store: EntryStore) -> None:
         """Take in what an entry's folder has measured by now."""
-        found = measure(store)
-        if found is not None:
-            self.measured = [*(speed for speed in self.measured if speed.hash != found.hash), found]
+        measured = measure(store)
+        if measured is not None:
+            self.measured = [*(speed for speed in self.measured if speed.hash != measured.hash), measured]
 
 
 def known(*folders: Path) -> Speeds:
@@ -283,10 +287,10 @@ def calibration() -> float:
     path = Path(os.environ.get("QRLSUITE_CACHE") or standard).expanduser() / CALIBRATION_FILE
     key = f"{provenance.processor()}, qrlsuite {metadata.version('qrlsuite')}"
     try:
-        found = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError):
-        found = {}
-    kept = found if isinstance(found, dict) else {}
+        content = {}
+    kept = content if isinstance(content, dict) else {}
     seconds = kept.get(key)
     if isinstance(seconds, int | float) and 0 < seconds < 1e9:
         return float(seconds)
@@ -364,7 +368,7 @@ def _subject(entry: Entry) -> Speed:
 def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
     """Return what an entry's speed may depend on, by name; a list counts by its length."""
     protocol = task["protocol"]
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: protocol.get(name) for name in ("environments", "interactions", "validation_episodes")
     }
     for part in (
@@ -372,8 +376,8 @@ def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, 
         identity.get("algorithm_options"),
         identity.get("model_options"),
     ):
-        found |= part or {}
-    return {name: len(value) if isinstance(value, list) else value for name, value in found.items()}
+        values |= part or {}
+    return {name: len(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def _nearest(subject: Speed, known: Sequence[Speed]) -> Speed | None:

@@ -365,9 +365,9 @@ def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     They are `classical` and `quantum`, summed over `networks`: all that are trained. Records without `networks` are of
     older versions, which counted the first network alone; they stand only where no newer one is there.
     """
-    found = [dict(record.get("parameters", {})) for record in records]
-    whole = [counts for counts in found if "networks" in counts]
-    return next(iter([*whole, *found]), {})
+    per_run = [dict(record.get("parameters", {})) for record in records]
+    whole = [counts for counts in per_run if "networks" in counts]
+    return next(iter([*whole, *per_run]), {})
 
 
 def _is_count(value: Any) -> bool:
@@ -555,8 +555,8 @@ class EntryStore:
 
     def seeds(self) -> list[int]:
         """Return the seeds that have a folder, sorted."""
-        found = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
-        return sorted(int(match.group(1)) for match in found if match)
+        matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
+        return sorted(int(match.group(1)) for match in matches if match)
 
     def finished(self, seeds: Iterable[int], epochs: int) -> set[int]:
         """Return which of the seeds have completed that many epochs."""

@@ -103,10 +103,10 @@ def outline(store: EntryStore) -> dict[str, Any]:
     records = [store.seed(seed).record() or {} for seed in seeds]
     made_with: list[Any] = []
     for run in records:
-        made_with += [made for made in run.get("provenance", []) if made not in made_with]
-    shown = ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
+        made_with += [provenance for provenance in run.get("provenance", []) if provenance not in made_with]
+    keys = ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
     return {
-        **{key: record[key] for key in shown},
+        **{key: record[key] for key in keys},
         "seeds": len(seeds),
         "provenance": made_with,
         "parameters": parameters_of(records),
@@ -145,7 +145,7 @@ def _seeds(
 
 def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
     """Return the tasks that an engine wrote down when it handed them to a queue (`job`, `seeds`, `epochs`)."""
-    found: list[dict[str, Any]] = []
+    queued: list[dict[str, Any]] = []
     for path in sorted(store.path.glob("*/submitted.json")):
         try:
             tasks = read_json(path).get("tasks")
@@ -157,8 +157,8 @@ def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
                 f"{path} is damaged: delete it; seeds that still wait may then be submitted twice"
             )
             continue
-        found += tasks
-    return found
+        queued += tasks
+    return queued
 
 
 def is_task(task: Any) -> bool:
@@ -222,7 +222,7 @@ def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[Gro
         As for `look`.
     """
     alive = living(store)
-    found = [_running(store, claim) for claim in alive]
+    statuses = [_running(store, claim) for claim in alive]
     seen = {seed for claim in alive for seed in claim.seeds}
     done = _finished(store)
     gone: list[GroupStatus] = []
@@ -233,7 +233,7 @@ def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[Gro
             progress, job = read_progress(path), f"job {task['job']}"
             waits = tuple(seed for seed in rest if queued is None or seed in queued)
             if waits:
-                found.append(GroupStatus(waits, "submitted", job, progress))
+                statuses.append(GroupStatus(waits, "submitted", job, progress))
             if len(waits) < len(rest):
                 left_out = tuple(seed for seed in rest if seed not in waits)
                 gone.append(GroupStatus(left_out, "stopped", f"{job} has left the queue", progress))
@@ -242,11 +242,11 @@ def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[Gro
     for path in sorted(store.groups.glob("*/progress.json")):
         progress = read_progress(path)
         if progress.get("error") and left:
-            found.append(GroupStatus((), "failed", path.parent.name, progress))
-    found += gone
+            statuses.append(GroupStatus((), "failed", path.parent.name, progress))
+    statuses += gone
     if left:
-        found.append(GroupStatus(tuple(sorted(left)), "stopped", "nobody"))
-    return found
+        statuses.append(GroupStatus(tuple(sorted(left)), "stopped", "nobody"))
+    return statuses
 
 
 def _running(store: EntryStore, claim: Claim) -> GroupStatus:
@@ -284,7 +284,7 @@ def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[st
     tuple
         What can be removed, and one line for each entry that was left alone because it is damaged.
     """
-    found: list[Garbage] = []
+    unused: list[Garbage] = []
     problems: list[str] = []
     for store in entries(runs, task):
         try:
@@ -293,10 +293,10 @@ def garbage(runs: Path, task: str | None = None) -> tuple[list[Garbage], list[st
             for header in checkpoint.headers(store):
                 if set(header.seeds) <= done - held:
                     size, _ = _usage(header.path.parent)
-                    found.append(Garbage(store, header.path.parent, header.seeds, size))
+                    unused.append(Garbage(store, header.path.parent, header.seeds, size))
         except QrlSuiteError as error:
             problems.append(str(error))
-    return found, problems
+    return unused, problems
 
 
 def remove(items: Sequence[Garbage]) -> int:

@@ -130,15 +130,15 @@ def package(name: str, kind: Kind) -> Package:
     import jinja2
 
     module, thing = _names(name, kind)
-    words = _WORDS[kind]
+    template_words = _WORDS[kind]
     # with the kind: the distribution has the same name
     kinds = (Kind.environment, Kind.task) if kind is Kind.environment else (kind,)
-    checks = [f"qrlsuite check {one}:{thing}" for one in kinds]
-    commands = tuple(line.format(thing=thing) for line in ("pytest", *checks, *words.commands))
+    checks = [f"qrlsuite check {singular}:{thing}" for singular in kinds]
+    commands = tuple(line.format(thing=thing) for line in ("pytest", *checks, *template_words.commands))
     source = f"src/{module}"
     contents = {
         f"{source}/__init__.py": f"registers the {kind} with qrlsuite",
-        **{f"{source}/{file}": meaning for file, meaning in words.files.items()},
+        **{f"{source}/{file}": meaning for file, meaning in template_words.files.items()},
         f"tests/test_{module}.py": "runs qrlsuite's checks",
     }
     values = {
@@ -147,11 +147,11 @@ def package(name: str, kind: Kind) -> Package:
         "thing": thing,
         "kind": str(kind),
         "article": "an" if kind[0] in "ae" else "a",
-        "summary": words.summary,
+        "summary": template_words.summary,
         "check": checks[0],
         "commands": commands,
         "contents": list(contents.items()),
-        "files": any(file.endswith(".toml") for file in words.files),
+        "files": any(file.endswith(".toml") for file in template_words.files),
         "versions": compatible_versions(),
     }
     environment = jinja2.Environment(
@@ -207,7 +207,7 @@ def compatible_versions() -> str:
     return f">={major}.{minor},<{major + 1}" if major else f">=0.{minor},<0.{minor + 1}"
 
 
-def write(made: Package, out: Path) -> Path:
+def write(package: Package, out: Path) -> Path:
     """Write a package below a folder; returns the package's folder.
 
     Raises
@@ -215,14 +215,14 @@ def write(made: Package, out: Path) -> Path:
     ScaffoldError
         If the package's folder is there already, or cannot be written. Nothing is changed then.
     """
-    folder = out / made.name
+    folder = out / package.name
     if folder.exists() or folder.is_symlink():
         raise ScaffoldError(f"{folder} is there already and is left as it is: choose another name or --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{made.name}-", dir=out) as temporary:
-            draft = Path(temporary) / made.name
-            for path, text in made.files.items():
+        with tempfile.TemporaryDirectory(prefix=f".{package.name}-", dir=out) as temporary:
+            draft = Path(temporary) / package.name
+            for path, text in package.files.items():
                 file = draft / path
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(text, encoding="utf-8")

@@ -148,7 +148,7 @@ def dumps(file: PlanFile) -> str:
 def write(
     name: str,
     task: str,
-    words: Sequence[str],
+    names: Sequence[str],
     runs: Path,
     *,
     algorithm: str | None = None,
@@ -165,7 +165,7 @@ def write(
 
     Parameters
     ----------
-    words:
+    names:
         For each entry its model and settings, or its label: `mlp width=64`, `ddqn mlp width=64`.
     epochs:
         Of every seed; None for the task's protocol.
@@ -178,10 +178,16 @@ def write(
         If there are fewer than two entries, they would end at different horizons, or a name, an option or a number
         cannot be used.
     """
-    drafts = [_draft(text, algorithm) for text in words]
+    drafts = [_draft(text, algorithm) for text in names]
     entries = [
-        resolve(task, model, own, [setting("", word, value) for word, value in given.items()], preset)
-        for own, model, given in drafts
+        resolve(
+            task,
+            model,
+            algorithm_name,
+            [setting("", word, value) for word, value in settings.items()],
+            preset,
+        )
+        for algorithm_name, model, settings in drafts
     ]
     if len(entries) < 2:
         raise OptionError(f"{len(entries)} of two or more entries: write each as 'MODEL NAME=VALUE ...'")
@@ -213,10 +219,10 @@ def write(
                     model=entry.model.name,
                     algorithm=entry.algorithm.name,
                     preset=preset,
-                    options=given,
+                    options=settings,
                     hash=entry.hash,
                 )
-                for entry, (_, _, given) in zip(entries, drafts)
+                for entry, (_, _, settings) in zip(entries, drafts)
             ],
         )
     except pydantic.ValidationError as error:
@@ -233,8 +239,8 @@ def _draft(text: str, algorithm: str | None) -> tuple[str | None, str, dict[str,
     plain = [word for word in text.split() if "=" not in word]
     if len(plain) not in (1, 2) or text.split()[: len(plain)] != plain:
         raise OptionError(f"entry '{text}': write 'MODEL NAME=VALUE ...', for example 'mlp width=64'")
-    given = [options.parse_setting(word) for word in text.split()[len(plain) :]]
-    values = {".".join(part for part in (each.side, each.name) if part): each.value for each in given}
+    settings = [options.parse_setting(word) for word in text.split()[len(plain) :]]
+    values = {".".join(part for part in (each.side, each.name) if part): each.value for each in settings}
     return plain[0] if len(plain) == 2 else algorithm, plain[-1], values
 
 
@@ -272,24 +278,24 @@ class DecisionStudy:
     def __init__(self, file: PlanFile, source: str, runs: Path) -> None:
         self.file, self.source, self.runs = file, source, runs
         self.folder = runs / FOLDER / file.name
-        found = []
-        for place, each in enumerate(file.entries):
-            words = [setting("options", word, value) for word, value in each.options.items()]
+        planned = []
+        for index, each in enumerate(file.entries):
+            settings = [setting("options", word, value) for word, value in each.options.items()]
             try:
-                entry = resolve(file.task, each.model, each.algorithm, words, each.preset)
+                entry = resolve(file.task, each.model, each.algorithm, settings, each.preset)
             except QrlSuiteError as error:
-                raise type(error)(f"{source}: entries.{place}: {error}") from None
+                raise type(error)(f"{source}: entries.{index}: {error}") from None
             if entry.hash != each.hash:
                 raise OptionError(
-                    f"{source}: entries.{place}.hash is '{each.hash}', these options make '{entry.hash}' here: it is "
+                    f"{source}: entries.{index}.hash is '{each.hash}', these options make '{entry.hash}' here: it is "
                     "another entry than was planned; write a new plan with `qrlsuite decide new`"
                 )
-            found.append(replace(entry, plan=file.hash))
-        self.entries = dict(zip(_names(found), found))
+            planned.append(replace(entry, plan=file.hash))
+        self.entries = dict(zip(_names(planned), planned))
         grid = Grid.relative if file.epsilons is not None else Grid.absolute
         try:
             self.plan = DecisionPlan(
-                tuple(_names(found)),
+                tuple(_names(planned)),
                 tuple(file.looks),
                 file.alpha,
                 file.spending,  # type: ignore[arg-type]  # checked there
@@ -332,9 +338,9 @@ class DecisionStudy:
             If its folder holds seeds that the plan did not train.
         """
         if not self.begun:
-            for name, seeds, where in self.trained_before():
+            for name, seeds, path in self.trained_before():
                 raise OptionError(
-                    f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({where}): a plan "
+                    f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a plan "
                     f"needs seeds that nobody has seen; with first_seed = {_next_block(self.file)} it has others"
                 )
             return
@@ -342,10 +348,10 @@ class DecisionStudy:
         if kept.hash != self.file.hash:
             before, after = kept.model_dump(mode="json"), self.file.model_dump(mode="json")
             keys = [key for key in before if before[key] != after[key]]
-            words = [f"{key} (was {_short(before[key])}, is {_short(after[key])})" for key in keys]
+            changes = [f"{key} (was {_short(before[key])}, is {_short(after[key])})" for key in keys]
             raise OptionError(
-                f"{self.source}: {', '.join(words)} changed after the plan began: it can be ended, not changed; a new "
-                f"plan needs a name and seeds of its own (the plan as it began: {self.folder / 'plan.toml'})"
+                f"{self.source}: {', '.join(changes)} changed after the plan began. End this plan and write "
+                f"a new one with other seeds (the plan as it began: {self.folder / 'plan.toml'})"
             )
         for name, entry in self.entries.items():
             for seed, record in self._records(entry):
@@ -361,14 +367,14 @@ class DecisionStudy:
         plans = self.runs / FOLDER
         if plans.is_dir():
             others += sorted(path for path in plans.iterdir() if path.is_dir() and path != self.folder)
-        found = []
+        trained = []
         for name, entry in self.entries.items():
             for other in others:
                 path = other / entry.task.name / entry.name
                 if path.is_dir():
                     seeds = [seed for seed in EntryStore(path).seeds() if seed in self.file.block]
-                    found += [(name, seeds, path)] if seeds else []
-        return found
+                    trained += [(name, seeds, path)] if seeds else []
+        return trained
 
     def begin(self) -> None:
         """Keep the plan as it is now, before its first seed.
@@ -415,11 +421,11 @@ class DecisionStudy:
     @property
     def taken(self) -> dict[int, str]:
         """When each look was taken, by its number of seeds."""
-        found: dict[int, str] = {}
+        times: dict[int, str] = {}
         for line in read_lines(self._log):
             if "look" in line:
-                found.setdefault(line["look"], str(line["time"]))
-        return found
+                times.setdefault(line["look"], str(line["time"]))
+        return times
 
     def _records(self, entry: Entry) -> Iterator[tuple[int, Mapping[str, Any]]]:
         store = EntryStore.find(self.folder, entry)
@@ -445,14 +451,14 @@ class DecisionStudy:
 
     def curves(self) -> dict[str, LearningCurves]:
         """Return the learning curves of the finished seeds; entries without any are absent."""
-        found = {}
+        curves = {}
         for name, entry in self.entries.items():
             store = EntryStore.find(self.folder, entry)
             values = [store.seed(seed).read().curve[: self.file.epochs] for seed in self.seeds(name)]
             if values:
                 steps = entry.task.file.protocol.interactions
-                found[name] = LearningCurves(np.stack(values), steps, name)
-        return found
+                curves[name] = LearningCurves(np.stack(values), steps, name)
+        return curves
 
     def decision(self) -> Decision:
         """Return what is decided by the plan and the curves so far; writes nothing.
@@ -530,8 +536,8 @@ def _names(entries: Sequence[Entry]) -> list[str]:
     labels = [entry.label for entry in entries]
     result = []
     for index, entry in enumerate(entries):
-        words = (names[index] for names in (short, labels) if Counter(names)[names[index]] == 1)
-        result.append(next(words, entry.name))
+        chosen = (names[index] for names in (short, labels) if Counter(names)[names[index]] == 1)
+        result.append(next(chosen, entry.name))
     return result
 
 

@@ -341,8 +341,8 @@ class Session:
     def _batch(self, item: PendingEntry, chosen: list[int], title: str) -> PendingEntry:
         """Train some seeds of an item; returns what is left of it."""
         work = item.plan
-        there = sorted(set(work.seeds) - set(work.missing) - set(work.busy))
-        part = plan(self.runs, work.entry, self.execution, sorted([*there, *chosen]), work.epochs)
+        complete = sorted(set(work.seeds) - set(work.missing) - set(work.busy))
+        part = plan(self.runs, work.entry, self.execution, sorted([*complete, *chosen]), work.epochs)
         display = RunDisplay(part, self.execution.workers, self.quiet, self.again)
         display.console.print(f"\n[bold]{title}[/bold]", end="  ")
         outcome = train(part, self.execution, display)
@@ -363,6 +363,6 @@ class Session:
             done = store.finished(part.missing, work.epochs)
             self.trained += len(done)
             stuck = set(part.missing) - done  # another process has them
-            wanted = [seed for seed in work.seeds if seed not in stuck]
-            rest = plan(self.runs, work.entry, self.execution, wanted, work.epochs)
+            remaining = [seed for seed in work.seeds if seed not in stuck]
+            rest = plan(self.runs, work.entry, self.execution, remaining, work.epochs)
         return PendingEntry(rest, item.groups, self.speeds.estimate(work.entry, rest.together))

@@ -44,18 +44,21 @@ def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:
     OptionError
         If no size up to 4096 is large enough.
     """
-    wanted = parameters(target)
+    target_size = parameters(target)
     low, high = 1, 1
-    while parameters(make(high)) < wanted:
+    while parameters(make(high)) < target_size:
         low, high = high, 2 * high
         if high > LARGEST_SIZE:
-            raise OptionError(f"no size up to {LARGEST_SIZE} has the {wanted} parameters of {target.label}")
+            raise OptionError(
+                f"no size up to {LARGEST_SIZE} has the {target_size} parameters of {target.label}"
+            )
     while low < high:
         middle = (low + high) // 2
-        if parameters(make(middle)) < wanted:
+        if parameters(make(middle)) < target_size:
             low = middle + 1
         else:
             high = middle
     return min(
-        (size for size in (low - 1, low) if size >= 1), key=lambda size: abs(parameters(make(size)) - wanted)
+        (size for size in (low - 1, low) if size >= 1),
+        key=lambda size: abs(parameters(make(size)) - target_size),
     )

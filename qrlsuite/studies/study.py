@@ -94,20 +94,20 @@ class StudyFile(_StudyTable):
         problems = [
             f"two groups are named '{name}'" for name in sorted({n for n in names if names.count(n) > 1})
         ]
-        for place, group in enumerate(self.entries):
-            earlier = names[:place]
+        for index, group in enumerate(self.entries):
+            earlier = names[:index]
             if group.match is not None and group.match.group not in earlier:
                 problems.append(
-                    f"entries.{place}.match.group = '{group.match.group}' is no earlier group"
+                    f"entries.{index}.match.group = '{group.match.group}' is no earlier group"
                     f"{nearest(group.match.group, earlier)}"
                 )
         titles = [picture.name for picture in self.pictures]
         problems += [
             f"two pictures are named '{name}'" for name in sorted({t for t in titles if titles.count(t) > 1})
         ]
-        for place, picture in enumerate(self.pictures):
+        for index, picture in enumerate(self.pictures):
             problems += [
-                f"pictures.{place}.entries: no group '{word}'{nearest(word, names)}"
+                f"pictures.{index}.entries: no group '{word}'{nearest(word, names)}"
                 for word in picture.entries
                 if word not in names
             ]
@@ -165,25 +165,27 @@ class Study:
         named = {name for group in self.file.entries for name in _listed(group.model)}
         for name in sorted(set(models) - named):
             raise OptionError(f"study '{self.name}' has no entry with model '{name}'{nearest(name, named)}")
-        found: dict[str, list[Member]] = {}
+        by_group: dict[str, list[Member]] = {}
         used: set[tuple[str | None, str]] = set()
         for group in self.file.entries:
             members: dict[tuple[str, str], Member] = {}
             for draft in _drafts(group):
-                targets = [m.entry for m in found[group.match.group]] if group.match is not None else [None]
+                targets = (
+                    [m.entry for m in by_group[group.match.group]] if group.match is not None else [None]
+                )
                 for target in targets:
                     try:
                         entry = _entry(group, draft, settings, models, target, used)
                     except QrlSuiteError as error:
                         raise type(error)(f"{self.source}, group '{group.name}': {error}") from None
                     members.setdefault((entry.task.name, entry.name), Member(group.name, entry))
-            found[group.name] = list(members.values())
+            by_group[group.name] = list(members.values())
         for setting in settings:
             if (setting.side, setting.name) not in used:
                 raise OptionError(
                     f"{setting.written}: no entry of study '{self.name}' has an option of that name"
                 )
-        every = [member for members_ in found.values() for member in members_]
+        every = [member for members_ in by_group.values() for member in members_]
         if len(every) > LARGEST:
             raise OptionError(f"study '{self.name}' has {len(every)} entries, more than {LARGEST}")
         return every
@@ -198,8 +200,8 @@ class _Draft:
     settings: tuple[Setting, ...]
 
 
-def _listed(words: str | list[str]) -> list[str]:
-    return [words] if isinstance(words, str) else words
+def _listed(names: str | list[str]) -> list[str]:
+    return [names] if isinstance(names, str) else names
 
 
 def setting(key: str, word: str, value: Any) -> Setting:
@@ -231,18 +233,22 @@ def _entry(
     sides = option_sides(loaded, algorithm, registry.model(model), every)
     applicable = [s for s in settings if _has(sides, s)]
     used |= {(s.side, s.name) for s in applicable}
-    words = [*draft.settings, *applicable]
+    all_settings = [*draft.settings, *applicable]
     if target is not None and group.match is not None:
         option = group.match.option
         if not any(s.name == option and s.side in (None, "model") for s in applicable):
             value = nearest_size(
                 lambda size: resolve(
-                    draft.task, model, group.algorithm, [*words, Setting("model", option, size)], group.preset
+                    draft.task,
+                    model,
+                    group.algorithm,
+                    [*all_settings, Setting("model", option, size)],
+                    group.preset,
                 ),
                 target,
             )
-            words.append(Setting("model", option, value))
-    return resolve(draft.task, model, group.algorithm, words, group.preset)
+            all_settings.append(Setting("model", option, value))
+    return resolve(draft.task, model, group.algorithm, all_settings, group.preset)
 
 
 def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:

@@ -77,25 +77,25 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
 
     from qrlsuite.testing import common
 
-    wanted = plural(kind)
-    if wanted == "trackers" and not _is_named_tracker(name_or_spec):
+    plural_kind = plural(kind)
+    if plural_kind == "trackers" and not _is_named_tracker(name_or_spec):
         from qrlsuite.testing import tracker
 
         return tracker.check_plugin(name_or_spec)
-    subject = common.subject(wanted, name_or_spec, settings)
+    subject = common.subject(plural_kind, name_or_spec, settings)
     findings, usable = common.check_common(subject)
     if not usable:
         return findings
-    file = importlib.import_module(f"qrlsuite.testing.{_FILES[wanted]}")
-    own: list[Finding] = file.check(subject, **more)
-    return findings + own
+    file = importlib.import_module(f"qrlsuite.testing.{_FILES[plural_kind]}")
+    kind_findings: list[Finding] = file.check(subject, **more)
+    return findings + kind_findings
 
 
-def _is_named_tracker(given: Any) -> bool:
+def _is_named_tracker(subject: Any) -> bool:
     """Tell a tracker that is registered by name from a plugin that implements the hooks of run events."""
     from qrlsuite import registry, specs
 
-    return isinstance(given, specs.TrackerSpec) or given in registry.load().entries["trackers"]
+    return isinstance(subject, specs.TrackerSpec) or subject in registry.load().entries["trackers"]
 
 
 def plural(kind: str) -> str:

@@ -53,10 +53,10 @@ def check(subject: Subject) -> list[Finding]:
 
 
 def _builds(subject: Subject) -> None:
-    made = ToyGroup(subject, range(S))
+    group = ToyGroup(subject, range(S))
     require(
-        ACTIONS in made.outputs,
-        f"build_model was called with {made.outputs} outputs, and there are {ACTIONS} actions: take "
+        ACTIONS in group.outputs,
+        f"build_model was called with {group.outputs} outputs, and there are {ACTIONS} actions: take "
         "envs.single_action_space.n",
     )
 
@@ -76,21 +76,21 @@ def _trains(subject: Subject) -> None:
 
 
 def _interactions(subject: Subject) -> None:
-    made = ToyGroup(subject, range(S)).start()
+    group = ToyGroup(subject, range(S)).start()
     for epoch in (1, 2):
-        made.train()
+        group.train()
         require(
-            made.envs.steps == epoch * ROUNDS,
-            f"after {epoch} epochs of {ROUNDS} rounds the lanes were stepped {made.envs.steps} times: sample "
+            group.envs.steps == epoch * ROUNDS,
+            f"after {epoch} epochs of {ROUNDS} rounds the lanes were stepped {group.envs.steps} times: sample "
             "complexity counts interactions, so an epoch is cut where its rounds end, also inside an episode",
         )
 
 
 def _acts(subject: Subject) -> None:
-    made = ToyGroup(subject, range(S)).start()
-    made.train()
-    before = made.save()
-    first, second = made.act(), made.act()
+    group = ToyGroup(subject, range(S)).start()
+    group.train()
+    before = group.save()
+    first, second = group.act(), group.act()
     require(
         isinstance(first, np.ndarray),
         f"act returned {type(first).__name__}, and must return a numpy array: end with .cpu().numpy()",
@@ -108,12 +108,12 @@ def _acts(subject: Subject) -> None:
         np.array_equal(first, second),
         "act chooses differently on the same observations: it must be greedy, without exploration or sampling",
     )
-    name = differs(before, made.save())
+    name = differs(before, group.save())
     require(name is None, f"act changes the state '{name}': validation must leave no trace in training")
     never = ToyGroup(subject, range(S)).start()
     never.train(2)
-    made.train()
-    name = differs(never.save(), made.save())
+    group.train()
+    name = differs(never.save(), group.save())
     require(
         name is None,
         f"an epoch after act ends with another '{name}' than without it: validation must leave no trace in training; "
@@ -122,16 +122,16 @@ def _acts(subject: Subject) -> None:
 
 
 def _learns(subject: Subject) -> None:
-    made = ToyGroup(subject, range(S)).start()
-    before = {k: v.detach().clone() for k, v in made.algorithm.policy_state().items()}
+    group = ToyGroup(subject, range(S)).start()
+    before = {k: v.detach().clone() for k, v in group.algorithm.policy_state().items()}
     require(bool(before), "policy_state() is empty: it is what is published as the trained agents")
     for name, value in before.items():
         require(
             value.dim() > 0 and value.shape[0] == S,
             f"policy '{name}' of shape {tuple(value.shape)} has no leading axis of {S} seeds",
         )
-    made.train(3)
-    after = made.algorithm.policy_state()
+    group.train(3)
+    after = group.algorithm.policy_state()
     for s in range(S):
         require(
             any(not torch.equal(before[name][s], value[s]) for name, value in after.items()),
@@ -143,7 +143,7 @@ def _learns(subject: Subject) -> None:
         for name, value in other.algorithm.policy_state().items():
             value.copy_(after[name])
     require(
-        np.array_equal(other.act(), made.act()),
+        np.array_equal(other.act(), group.act()),
         "trained parameters, copied into the tensors of policy_state(), do not make a new algorithm act as the trained "
         "one: return the tensors that act uses, all of them and no copies, for `qrlsuite evaluate` loads into them",
     )
@@ -156,12 +156,12 @@ def _trained(subject: Subject, seeds: Sequence[int], noise: int = 0) -> dict[str
         state = np.random.get_state()  # noqa: NPY002
         np.random.seed(noise)  # noqa: NPY002
         try:
-            made = ToyGroup(subject, seeds).start()
-            metrics = made.train(2)
+            group = ToyGroup(subject, seeds).start()
+            metrics = group.train(2)
             return {
-                **made.save(),
+                **group.save(),
                 **{f"metric {k}": v for k, v in metrics.items()},
-                "actions": array(made.act()),
+                "actions": array(group.act()),
             }
         finally:
             np.random.set_state(state)  # noqa: NPY002
@@ -177,9 +177,9 @@ def _same(subject: Subject) -> None:
 
 
 def _different(subject: Subject) -> None:
-    made = ToyGroup(subject, [0, 1]).start()
-    made.train(2)
-    policy = made.algorithm.policy_state()
+    group = ToyGroup(subject, [0, 1]).start()
+    group.train(2)
+    policy = group.algorithm.policy_state()
     require(
         any(not torch.equal(value[0], value[1]) for value in policy.values()),
         "seeds 0 and 1 became the same agent: are populations built by build_model, with every seed's stream?",
@@ -187,9 +187,9 @@ def _different(subject: Subject) -> None:
 
 
 def _seed_first(subject: Subject) -> None:
-    made = ToyGroup(subject, range(S)).start()
-    made.train()
-    state = made.algorithm.state_dict()
+    group = ToyGroup(subject, range(S)).start()
+    group.train()
+    state = group.algorithm.state_dict()
     require(bool(state), "state_dict() is empty: what training depends on is lost when a run is resumed")
     for name, value in state.items():
         require(isinstance(value, Tensor), f"state '{name}' is {type(value).__name__}, not a tensor")

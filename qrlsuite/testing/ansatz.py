@@ -25,19 +25,19 @@ def check(subject: Subject) -> list[Finding]:
     """Check an ansatz at 1 to 4 qubits, with 1 to 3 layers and with three per qubit."""
     spec = subject.spec
     assert isinstance(spec, specs.AnsatzSpec)
-    build, given = specs.resolve(spec.build), subject.options()
+    build, options = specs.resolve(spec.build), subject.options()
     circuits: Circuits = {}
     rules = Checklist()
-    if not rules.run("builds", "1 to 4 qubits, 1 to 12 layers", lambda: _builds(build, given, circuits)):
+    if not rules.run("builds", "1 to 4 qubits, 1 to 12 layers", lambda: _builds(build, options, circuits)):
         return rules.findings
-    rules.run("pure", "built twice, it is the same circuit", lambda: _pure(build, given, circuits))
+    rules.run("pure", "built twice, it is the same circuit", lambda: _pure(build, options, circuits))
     rules.run("inputs used", "every input feature sets an angle", lambda: _inputs(circuits))
     rules.run("parameters used", "every trainable scalar sets an angle", lambda: _parameters(circuits))
     grows = rules.run("layers", "more layers make a longer circuit", lambda: _layers(circuits))
     with one_thread():
-        found = "every input and every parameter changes an expectation value"
-        if rules.run("effects", found, lambda: _effects(circuits, grows)):
-            rules.findings[-1] = Finding("effects", True, found + _idle(circuits))
+        message = "every input and every parameter changes an expectation value"
+        if rules.run("effects", message, lambda: _effects(circuits, grows)):
+            rules.findings[-1] = Finding("effects", True, message + _idle(circuits))
         same = "every installed backend gives the values of dense matrices"
         if rules.run("backends", same, lambda: _backends(circuits)):
             rules.run(
@@ -48,16 +48,16 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _builds(build: Any, given: Any, circuits: Circuits) -> None:
+def _builds(build: Any, options: Any, circuits: Circuits) -> None:
     refused = ""
     sizes = {(qubits, layers) for qubits in QUBITS for layers in (*LAYERS, 3 * qubits)} | {(LARGEST, 1)}
     for qubits, layers in sorted(sizes):
-        where = effects.size(qubits, layers)
+        size = effects.size(qubits, layers)
         try:
-            circuit = build(qubits, layers, given)
+            circuit = build(qubits, layers, options)
         except CircuitError as error:
             raise BrokenRuleError(
-                f"{where}: {error}; an ansatz that cannot have this size raises qrlsuite.errors.OptionError and says "
+                f"{size}: {error}; an ansatz that cannot have this size raises qrlsuite.errors.OptionError and says "
                 "which sizes it can have"
             ) from error
         except OptionError as error:  # an ansatz may refuse a size, in words
@@ -65,7 +65,7 @@ def _builds(build: Any, given: Any, circuits: Circuits) -> None:
             continue
         except Exception as error:
             raise BrokenRuleError(
-                f"{where}: {type(error).__name__}: {error}; an ansatz that cannot have this size raises "
+                f"{size}: {type(error).__name__}: {error}; an ansatz that cannot have this size raises "
                 "qrlsuite.errors.OptionError and says which sizes it can have"
             ) from error
         require(
@@ -76,7 +76,7 @@ def _builds(build: Any, given: Any, circuits: Circuits) -> None:
             circuit.qubits == qubits,
             f"with qubits = {qubits} the circuit has {circuit.qubits}: write Circuit(qubits)",
         )
-        require(bool(circuit.operations), f"{where}: the circuit has no gate; append some before `return`")
+        require(bool(circuit.operations), f"{size}: the circuit has no gate; append some before `return`")
         if qubits != LARGEST:
             circuits[qubits, layers] = circuit
     require(
@@ -86,11 +86,11 @@ def _builds(build: Any, given: Any, circuits: Circuits) -> None:
     )
 
 
-def _pure(build: Any, given: Any, circuits: Circuits) -> None:
+def _pure(build: Any, options: Any, circuits: Circuits) -> None:
     for (qubits, layers), circuit in circuits.items():
         before = _content(circuit)  # kept apart: an ansatz that remembers may go on with the same object
         require(
-            before == _content(build(qubits, layers, given)) == _content(circuit),
+            before == _content(build(qubits, layers, options)) == _content(circuit),
             f"{effects.size(qubits, layers)}: built twice, the circuits differ; an ansatz must not draw random "
             "numbers or remember anything, for each agent builds its own: make the Circuit inside the function",
         )
@@ -112,16 +112,16 @@ def _inputs(circuits: Circuits) -> None:
 
 def _parameters(circuits: Circuits) -> None:
     for (qubits, layers), circuit in circuits.items():
-        where, used = effects.size(qubits, layers), effects.uses(circuit)
+        size, used = effects.size(qubits, layers), effects.uses(circuit)
         require(
             bool(circuit.parameters),
-            f"{where}: there is no trainable parameter; declare some: circuit.parameter('weights', (layers, qubits))",
+            f"{size}: there is no trainable parameter; declare some: circuit.parameter('weights', (layers, qubits))",
         )
         for name, parameter in circuit.parameters.items():
             unused = [i for i in range(parameter.size) if (name, i) not in used]
             require(
                 not unused,
-                f"{where}: {effects.written(parameter, unused[0] if unused else 0)} of shape {parameter.shape} sets "
+                f"{size}: {effects.written(parameter, unused[0] if unused else 0)} of shape {parameter.shape} sets "
                 f"no angle ({len(unused)} of {parameter.size} do not); declare a smaller parameter or use all of it",
             )
 
@@ -138,10 +138,10 @@ def _layers(circuits: Circuits) -> None:
 
 def _effects(circuits: Circuits, grows: bool) -> None:
     for (qubits, layers), circuit in circuits.items():
-        where = effects.size(qubits, layers)
-        effects.require_inputs_and_parameters(circuit, where)
+        size = effects.size(qubits, layers)
+        effects.require_inputs_and_parameters(circuit, size)
         if grows and layers == 3 * qubits:
-            effects.require_middle(circuit, where)
+            effects.require_middle(circuit, size)
 
 
 def _idle(circuits: Circuits) -> str:

@@ -28,25 +28,25 @@ def check(subject: Subject) -> list[Finding]:
     """Check a backend on circuits of two and three qubits that contain every gate."""
     spec = subject.spec
     assert isinstance(spec, specs.CircuitBackendSpec)
-    factory, given = specs.resolve(spec.factory), subject.options()
+    factory, options = specs.resolve(spec.factory), subject.options()
     circuit = every_gate()
     rules = Checklist()
-    made: list[Any] = []
+    backends: list[Any] = []
     cause = "factory takes a Circuit and the options; one that it cannot run is refused by qrlsuite.errors.OptionError"
     builds = "from a circuit with every gate, and options"
-    if not rules.run("builds", builds, lambda: made.append(_build(factory, circuit, given)), cause):
+    if not rules.run("builds", builds, lambda: backends.append(_build(factory, circuit, options)), cause):
         return rules.findings
-    run = made[0]
+    run = backends[0]
     with one_thread():
         cause = (
             "it is called with inputs (S, B, in), a dict of parameters (S, ...), and seeds: None, or S integers "
             "from 0 to 2^63 - 1, which numpy.random.default_rng and torch.Generator take"
         )
         shapes = "(S, B, observables) in float32 and float64, for one agent, input or observable too"
-        if not rules.run("shapes", shapes, lambda: _shapes(factory, run, circuit, given), cause):
+        if not rules.run("shapes", shapes, lambda: _shapes(factory, run, circuit, options), cause):
             return rules.findings
         if run.shots is None:
-            rules.run("values", "equal to dense matrices within 1e-6", lambda: _values(factory, given))
+            rules.run("values", "equal to dense matrices within 1e-6", lambda: _values(factory, options))
             rules.run("gradients", "equal to finite differences", lambda: _gradients(run, circuit))
             rules.run("repeatable", "called twice, the same bits", lambda: _repeatable(run, circuit))
             rules.run(
@@ -58,7 +58,7 @@ def check(subject: Subject) -> list[Finding]:
             rules.run(
                 "mean field",
                 "values, gradients and seeds of mean-field circuits too",
-                lambda: _mean_field(factory, given),
+                lambda: _mean_field(factory, options),
             )
         if run.shots is not None or "shots" in specs.resolve(spec.options).__dataclass_fields__:
             rules.run(
@@ -112,8 +112,8 @@ def evaluate(
     return result
 
 
-def _build(factory: Any, circuit: Circuit, given: Any) -> Any:
-    run = factory(circuit, given)
+def _build(factory: Any, circuit: Circuit, options: Any) -> Any:
+    run = factory(circuit, options)
     require(
         callable(run),
         f"factory returned {type(run).__name__}, which cannot be called: write __call__(self, inputs, parameters, "
@@ -130,10 +130,10 @@ def _build(factory: Any, circuit: Circuit, given: Any) -> Any:
     return run
 
 
-def _shapes(factory: Any, run: Any, circuit: Circuit, given: Any) -> None:
+def _shapes(factory: Any, run: Any, circuit: Circuit, options: Any) -> None:
     single = small()
     single.measure([1])
-    alone = factory(single, given)
+    alone = factory(single, options)
     for dtype in (torch.float32, torch.float64):
         _shape(run, circuit, S, 3, dtype)
     for agents, batch in ((1, 1), (S, 1), (1, 3)):
@@ -176,25 +176,25 @@ def _dense(circuit: Circuit, x: Tensor, weights: dict[str, Tensor]) -> Tensor:
     return torch.from_numpy(np.array(rows))
 
 
-def _distance(factory: Any, circuit: Circuit, given: Any, reverse: bool = False) -> float:
+def _distance(factory: Any, circuit: Circuit, options: Any, reverse: bool = False) -> float:
     """Return how far a backend's values are from those of dense matrices."""
     x, weights, _ = sample(circuit, batch=3)
     expected = _dense(circuit, x, weights)
-    got = factory(circuit, given)(x, weights).detach()
+    got = factory(circuit, options)(x, weights).detach()
     return float((got - (expected.flip(2) if reverse else expected)).abs().max())
 
 
-def _values(factory: Any, given: Any) -> None:
+def _values(factory: Any, options: Any) -> None:
     for circuit in (small(), every_gate()):
-        difference = _distance(factory, circuit, given)
+        difference = _distance(factory, circuit, options)
         if difference < 1e-6:
             continue
         cause = (
             "the gates are right one by one, so look at their order, at constants, at elements that set several "
             "angles, and at scale * input + weight"
         )
-        wrong = _wrong_gates(factory, given)
-        if _distance(factory, circuit, given, reverse=True) < 1e-6:
+        wrong = _wrong_gates(factory, options)
+        if _distance(factory, circuit, options, reverse=True) < 1e-6:
             cause = "they agree in reverse: results come in the order of circuit.observables"
         elif wrong:
             cause = (
@@ -219,7 +219,7 @@ def _mean_field(factory: Any, given: Any) -> None:
     _independence(run, circuit, None)
 
 
-def _wrong_gates(factory: Any, given: Any) -> list[str]:
+def _wrong_gates(factory: Any, options: Any) -> list[str]:
     """Return the gates, each tried by itself between rotations about X and Y, whose values are wrong."""
     tried = [
         (gate, control) for gate, kind in GATES.items() for control in (False, True)[: 1 + kind.controllable]
@@ -227,7 +227,7 @@ def _wrong_gates(factory: Any, given: Any) -> list[str]:
     return [
         f"{gate} with control" if controlled else gate
         for gate, controlled in tried
-        if not _distance(factory, one_gate(gate, controlled), given) < 1e-6
+        if not _distance(factory, one_gate(gate, controlled), options) < 1e-6
     ]
 
 
@@ -258,8 +258,8 @@ def _gradients(run: Any, circuit: Circuit) -> None:
 
 
 def _repeatable(run: Any, circuit: Circuit) -> None:
-    given = sample(circuit)
-    first, second = evaluate(run, *given), evaluate(run, *given)
+    settings = sample(circuit)
+    first, second = evaluate(run, *settings), evaluate(run, *settings)
     for name, value in first.items():
         require(
             torch.equal(value, second[name]),
@@ -289,12 +289,12 @@ def _independence(run: Any, circuit: Circuit, seeds: Sequence[int] | None) -> No
 
 def _shots(subject: Subject, factory: Any, shots: int | None) -> None:
     """Check sampling with the backend's own number of shots, or with SHOTS where it is exact by default."""
-    circuit, asked = small(), shots or SHOTS
-    given = subject.options() if shots else dataclasses.replace(subject.options(), shots=asked)
-    run = factory(circuit, given)
+    circuit, n_shots = small(), shots or SHOTS
+    options = subject.options() if shots else dataclasses.replace(subject.options(), shots=n_shots)
+    run = factory(circuit, options)
     require(
-        run.shots == asked,
-        f"shots = {asked} was asked for, and the backend's attribute says {run.shots}: write "
+        run.shots == n_shots,
+        f"shots = {n_shots} was asked for, and the backend's attribute says {run.shots}: write "
         "self.shots = options.shots",
     )
     x, weights, _ = sample(circuit)
@@ -312,8 +312,8 @@ def _shots(subject: Subject, factory: Any, shots: int | None) -> None:
     )
     error = float((first - _dense(circuit, x, weights)).square().mean().sqrt())
     require(
-        error <= 2 / math.sqrt(asked),
-        f"with {asked} shots values are {error:.2g} from the exact ones (root mean square), and sampling allows "
-        f"{1 / math.sqrt(asked):.2g}: are there fewer shots than asked for, or is there a bias?",
+        error <= 2 / math.sqrt(n_shots),
+        f"with {n_shots} shots values are {error:.2g} from the exact ones (root mean square), and sampling allows "
+        f"{1 / math.sqrt(n_shots):.2g}: are there fewer shots than asked for, or is there a bias?",
     )
     _independence(run, circuit, SEEDS)

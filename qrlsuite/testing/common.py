@@ -42,13 +42,13 @@ class Subject:
 
     def references(self) -> dict[str, str]:
         """Return the references of the spec by field; those inside of a field have its name and a dot in front."""
-        found = {field: getattr(self.spec, field, None) for field in REFERENCES}
+        references = {field: getattr(self.spec, field, None) for field in REFERENCES}
         if isinstance(self.spec, specs.EnvironmentSpec):
-            found |= {f"policies.{name}": reference for name, reference in self.spec.policies.items()}
+            references |= {f"policies.{name}": reference for name, reference in self.spec.policies.items()}
             for picture in self.spec.pictures:
                 for part in ("draw", "options"):
-                    found[f"pictures.{picture.name}.{part}"] = getattr(picture, part)
-        return {field: reference for field, reference in found.items() if reference is not None}
+                    references[f"pictures.{picture.name}.{part}"] = getattr(picture, part)
+        return {field: reference for field, reference in references.items() if reference is not None}
 
     def options(self) -> Any:
         """Build the options object with the settings."""
@@ -65,14 +65,14 @@ class Subject:
         return " and ".join(sorted({c for m, c in extras.items() if importlib.util.find_spec(m) is None}))
 
 
-def subject(kind: str, given: str | specs.Spec, settings: Mapping[str, Any] | None = None) -> Subject:
+def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, Any] | None = None) -> Subject:
     """Look up what is to be checked.
 
     Parameters
     ----------
     kind:
         A key of `registry.KINDS`.
-    given:
+    name_or_spec:
         A registered name, or a spec, registered or not.
     settings:
         Values of options. Where there are options `qubits` and `layers` and they are not set, two qubits and one
@@ -84,11 +84,11 @@ def subject(kind: str, given: str | specs.Spec, settings: Mapping[str, Any] | No
         If nothing or more than one thing has that name.
     """
     known = registry.load()
-    if isinstance(given, str):
-        found = known.get(kind, given)
-        spec, distribution = found.spec, found.distribution
+    if isinstance(name_or_spec, str):
+        registered = known.get(kind, name_or_spec)
+        spec, distribution = registered.spec, registered.distribution
     else:
-        spec, distribution = given, None
+        spec, distribution = name_or_spec, None
         entry = known.entries[kind].get(spec.name)
         if entry is not None and entry.spec == spec:
             distribution = entry.distribution
@@ -150,7 +150,7 @@ def _name(subject: Subject) -> None:
 def _references(subject: Subject) -> None:
     for field, reference in subject.references().items():
         try:
-            found = specs.resolve(reference)
+            target = specs.resolve(reference)
         except Exception as error:
             require(
                 False,
@@ -158,11 +158,11 @@ def _references(subject: Subject) -> None:
                 + (subject.missing() or "is the name spelled as in the file, and the package installed?"),
             )
         require(
-            callable(found), f"{field} = {reference!r} is {type(found).__name__}, and it must be callable"
+            callable(target), f"{field} = {reference!r} is {type(target).__name__}, and it must be callable"
         )
         if _is_options(field):
             require(
-                isinstance(found, type) and dataclasses.is_dataclass(found),
+                isinstance(target, type) and dataclasses.is_dataclass(target),
                 f"{field} = {reference!r} is not a dataclass: write a class under @pydantic.dataclasses.dataclass",
             )
 
@@ -173,12 +173,12 @@ def _is_options(field: str) -> bool:
 
 def _all_references(subject: Subject) -> tuple[str, ...]:
     """Return the references of the subject's whole distribution, so that one process serves all of them."""
-    found = set(subject.references().values())
+    references = set(subject.references().values())
     if subject.distribution is not None:
         for kind, entry in registry.load():
             if entry.distribution == subject.distribution:
-                found |= set(Subject(kind, entry.spec, None, (), {}).references().values())
-    return tuple(sorted(found))
+                references |= set(Subject(kind, entry.spec, None, (), {}).references().values())
+    return tuple(sorted(references))
 
 
 def _lazy(subject: Subject) -> None:
@@ -215,11 +215,11 @@ def _spawn(subject: Subject) -> None:
     if options is not None:
         cls = specs.resolve(options)
         try:
-            made = option_values.build(cls, subject.settings, subject.title)
+            built = option_values.build(cls, subject.settings, subject.title)
         except Exception:  # the rule `options` reports it
             return
         try:
-            ForkingPickler.dumps(made)
+            ForkingPickler.dumps(built)
         except Exception as error:
             require(
                 False,
@@ -247,8 +247,8 @@ def _options(subject: Subject) -> None:
         defaults = option_values.build(cls, {}, subject.title)
     except Exception as error:
         require(False, f"the defaults are not valid: {error}; every option needs a default that works")
-    for made in (defaults, subject.options()):
-        _stored(subject, cls, made)
+    for options in (defaults, subject.options()):
+        _stored(subject, cls, options)
     for name in option_values.field_names(cls):
         try:
             setattr(defaults, name, getattr(defaults, name))
@@ -260,16 +260,16 @@ def _options(subject: Subject) -> None:
         )
 
 
-def _stored(subject: Subject, cls: type[Any], made: Any) -> None:
+def _stored(subject: Subject, cls: type[Any], options: Any) -> None:
     """Require that options can be stored, and read again as what they were."""
     for name in option_values.field_names(cls):
         require(
-            not _has_set(getattr(made, name)),
+            not _has_set(getattr(options, name)),
             f"option '{name}' holds a set, whose order is another one in every process, and so would be the name under "
             "which results are kept: use a tuple",
         )
     try:
-        plain = json.loads(json.dumps(option_values.plain(made), allow_nan=False))
+        plain = json.loads(json.dumps(option_values.plain(options), allow_nan=False))
     except ValueError as error:
         require(
             False,
@@ -285,8 +285,8 @@ def _stored(subject: Subject, cls: type[Any], made: Any) -> None:
             "or of another type?",
         )
     require(
-        again == made,
-        f"options stored and read again differ: {made} became {again}; is a value changed when it is read?",
+        again == options,
+        f"options stored and read again differ: {options} became {again}; is a value changed when it is read?",
     )
 
 

@@ -76,11 +76,11 @@ def used_inputs(circuit: Circuit) -> set[int]:
 def uses(circuit: Circuit) -> dict[Scalar, list[int]]:
     """Return at which operations each trainable scalar sets an angle."""
     places: dict[Scalar, list[int]] = {}
-    for place, op in enumerate(circuit.operations):
+    for index, op in enumerate(circuit.operations):
         for angle in op.angles:
             for element in (angle.scale, angle.weight):
                 if element is not None:
-                    places.setdefault((element.parameter, element.index), []).append(place)
+                    places.setdefault((element.parameter, element.index), []).append(index)
     return places
 
 
@@ -109,77 +109,77 @@ def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
     return set(felt(x)), {(name, i) for name, leaf in parameters.items() for i in felt(leaf)}
 
 
-def require_inputs_and_parameters(circuit: Circuit, where: str) -> None:
+def require_inputs_and_parameters(circuit: Circuit, size: str) -> None:
     """Require that every used input feature, and some scalar of every used parameter, has an effect."""
     used = uses(circuit)
     inputs, scalars = effective(circuit)
     for feature in sorted(used_inputs(circuit) - inputs):
         raise BrokenRuleError(
-            f"{where}: input {feature} sets an angle, and no expectation value depends on it, so the agent cannot "
+            f"{size}: input {feature} sets an angle, and no expectation value depends on it, so the agent cannot "
             f"see it: {cause(circuit, feature)}"
         )
     for name, parameter in circuit.parameters.items():
         mine = [scalar for scalar in used if scalar[0] == name]
         if mine and scalars.isdisjoint(mine):
             raise BrokenRuleError(
-                f"{where}: no expectation value depends on any element of '{name}' of shape {parameter.shape}, so it "
+                f"{size}: no expectation value depends on any element of '{name}' of shape {parameter.shape}, so it "
                 f"is trained for nothing: {cause(circuit, mine[0])}; or refuse this size with OptionError"
             )
 
 
-def require_middle(circuit: Circuit, where: str) -> None:
+def require_middle(circuit: Circuit, size: str) -> None:
     """Require that every trainable scalar that is used in the middle third of the gates has an effect."""
     _, scalars = effective(circuit)
     third = len(circuit) // 3
     idle = [
         scalar
         for scalar, places in uses(circuit).items()
-        if scalar not in scalars and any(third <= place < len(circuit) - third for place in places)
+        if scalar not in scalars and any(third <= position < len(circuit) - third for position in places)
     ]
     for name, index in idle[:1]:
         parameter = circuit.parameters[name]
         others = f", nor on {len(idle) - 1} more there" if len(idle) > 1 else ""
         raise BrokenRuleError(
-            f"{where}: no expectation value depends on {written(parameter, index)} of shape {parameter.shape}, which "
+            f"{size}: no expectation value depends on {written(parameter, index)} of shape {parameter.shape}, which "
             f"is used in the middle of the circuit{others}; it is trained for nothing: {cause(circuit, (name, index))}"
         )
 
 
-def cause(circuit: Circuit, what: int | Scalar) -> str:
+def cause(circuit: Circuit, source: int | Scalar) -> str:
     """Say why an input feature or a trainable scalar has no effect."""
     for before, after, why in ((True, False, _START), (False, True, _END), (True, True, _BOTH)):
         inputs, scalars = effective(_between(circuit, before, after))
-        if what in inputs or what in scalars:
+        if source in inputs or source in scalars:
             return why
     return _CANCELS
 
 
 def _between(circuit: Circuit, before: bool, after: bool) -> Circuit:
     """Return the circuit begun in a random entangled state, or measured in a random basis, or both."""
-    made = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field)
+    part = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field)
     for p in circuit.parameters.values():
-        made.parameter(p.name, p.shape, p.low, p.high)
+        part.parameter(p.name, p.shape, p.low, p.high)
     draw = np.random.default_rng(0)
 
     def scramble() -> None:
         for _ in range(2):
             for q in range(circuit.qubits):
-                made.append("U3", q, *draw.uniform(0.5, 2.5, 3))
+                part.append("U3", q, *draw.uniform(0.5, 2.5, 3))
             for q in range(circuit.qubits - 1):
-                made.append("CNOT", (q, q + 1))
+                part.append("CNOT", (q, q + 1))
 
     if before:
         scramble()
     for op in circuit.operations:
-        made.append(op.gate, op.wires, *op.angles, control=op.control)
+        part.append(op.gate, op.wires, *op.angles, control=op.control)
     if after:
         scramble()
     else:
-        made.measure(circuit.observables)
-    return made
+        part.measure(circuit.observables)
+    return part
 
 
-def idle_at_the_ends(circuit: Circuit, where: str) -> str:
+def idle_at_the_ends(circuit: Circuit, size: str) -> str:
     """Name the trainable scalars without effect; `""` where there are none."""
     _, scalars = effective(circuit)
     idle = [scalar for scalar in uses(circuit) if scalar not in scalars]
@@ -187,6 +187,6 @@ def idle_at_the_ends(circuit: Circuit, where: str) -> str:
         return ""
     named = ", ".join(written(circuit.parameters[name], index) for name, index in idle[:3])
     return (
-        f"; at the ends of the circuit {len(idle)} of {circuit.parameter_count} scalars do not ({where}: {named}"
+        f"; at the ends of the circuit {len(idle)} of {circuit.parameter_count} scalars do not ({size}: {named}"
         f"{', ...' * (len(idle) > 3)})"
     )

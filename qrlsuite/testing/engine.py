@@ -19,15 +19,17 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.EngineSpec)
     rules = Checklist()
-    made: list[Any] = []
+    engines: list[Any] = []
     cause = subject.missing() or "the factory takes the options, or None where the spec has none"
-    factory, given = specs.resolve(spec.factory), subject.options()
-    if not rules.run("builds", "factory(options)", lambda: made.append(factory(given)), cause):
+    factory, options = specs.resolve(spec.factory), subject.options()
+    if not rules.run("builds", "factory(options)", lambda: engines.append(factory(options)), cause):
         return rules.findings
-    if not rules.run("methods", "workers(asked), queued(store), run(work, show)", lambda: _methods(made[0])):
+    if not rules.run(
+        "methods", "workers(asked), queued(store), run(work, show)", lambda: _methods(engines[0])
+    ):
         return rules.findings
-    rules.run("workers", "a number of one or more, asked for or not", lambda: _workers(made[0]))
-    rules.run("queued", "no seed of an entry that was never submitted waits", lambda: _queued(made[0]))
+    rules.run("workers", "a number of one or more, asked for or not", lambda: _workers(engines[0]))
+    rules.run("queued", "no seed of an entry that was never submitted waits", lambda: _queued(engines[0]))
     return rules.findings
 
 
@@ -45,15 +47,15 @@ def _methods(engine: Any) -> None:
 
 
 def _workers(engine: Any) -> None:
-    for asked in (None, 1, 3):
-        got = engine.workers(asked)
+    for requested in (None, 1, 3):
+        got = engine.workers(requested)
         require(
             isinstance(got, int) and not isinstance(got, bool) and got >= 1,
-            f"workers({asked}) returned {got!r}, and must return how many groups may run at a time, one or more",
+            f"workers({requested}) returned {got!r}, and must return how many groups may run at a time, one or more",
         )
         require(
-            asked is None or got <= asked,
-            f"workers({asked}) returned {got}: more than --workers {asked} allows",
+            requested is None or got <= requested,
+            f"workers({requested}) returned {got}: more than --workers {requested} allows",
         )
 
 

@@ -180,10 +180,10 @@ def _array(name: str, value: Any, shape: tuple[int, ...], dtype: type) -> None:
         value.shape == shape,
         f"{name} have shape {value.shape}, and must have {shape}: lanes come first, then what the space says",
     )
-    wanted = np.dtype(dtype)
+    expected = np.dtype(dtype)
     require(
-        value.dtype == wanted,
-        f"{name} are {value.dtype}, and must be {wanted}: convert with .astype(np.{wanted})",
+        value.dtype == expected,
+        f"{name} are {value.dtype}, and must be {expected}: convert with .astype(np.{expected})",
     )
     require(
         bool(np.isfinite(value).all()),
@@ -203,9 +203,9 @@ def _end(lanes: Lanes) -> int:
     """Return the length of the first episode that ends."""
     envs, unreset = lanes.make([0]), lanes.make([0], autoreset=False)
     alike = np.array_equal(envs.reset()[0], unreset.reset()[0])
-    given = iter(actions([0], choices(envs), LONGEST + 5))
+    rows = iter(actions([0], choices(envs), LONGEST + 5))
     for step in range(1, LONGEST + 1):
-        row = next(given)
+        row = next(rows)
         after, _, terminated, truncated, infos = envs.step(row)
         last = unreset.step(row)[0]
         done = terminated | truncated
@@ -214,7 +214,7 @@ def _end(lanes: Lanes) -> int:
             continue
         _final(infos, done, after, last if alike else after, step)
         for _ in range(5):
-            _, _, terminated, truncated, _ = envs.step(next(given))
+            _, _, terminated, truncated, _ = envs.step(next(rows))
             done = done & (terminated | truncated)
         require(
             step == 1 or not done.any(),

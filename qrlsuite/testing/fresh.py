@@ -50,10 +50,10 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
     )
     for line in done.stdout.splitlines():
         if line.startswith(_MARK):
-            found: dict[str, Any] = json.loads(line.removeprefix(_MARK))
-            return found
-    said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
-    return {"modules": {}, "heavy": [], "references": {}, "crash": said[-1]}
+            answer: dict[str, Any] = json.loads(line.removeprefix(_MARK))
+            return answer
+    lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
+    return {"modules": {}, "heavy": [], "references": {}, "crash": lines[-1]}
 
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:

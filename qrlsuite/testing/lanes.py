@@ -90,25 +90,25 @@ def actions(seeds: Sequence[int], count: int, steps: int) -> NDArray[np.int64]:
     return np.concatenate(columns, axis=1).astype(np.int64)
 
 
-def play(envs: LaneEnv, given: NDArray[np.int64], reset: bool = True) -> Seen:
+def play(envs: LaneEnv, actions: NDArray[np.int64], reset: bool = True) -> Seen:
     """Return everything that lanes show under actions (T, L); observations have one more where they are reset."""
     names = ("observations", "rewards", "terminated", "truncated", "scores")
     seen: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     if reset:
         seen["observations"].append(np.array(envs.reset()[0]))
-    for row in given:
-        *shown, infos = envs.step(row)
-        for values, value in zip(seen.values(), (*shown, _scores(infos, envs.num_envs))):
+    for row in actions:
+        *step, infos = envs.step(row)
+        for values, value in zip(seen.values(), (*step, _scores(infos, envs.num_envs))):
             values.append(np.array(value))
     return {name: np.stack(values, axis=1) for name, values in seen.items()}
 
 
 def _scores(infos: Mapping[str, Any], lanes: int) -> NDArray[np.float64]:
     """Return the scores of the episodes that end in a step (L,), NaN where none ends."""
-    given = infos.get("final_info", {}).get("score")
-    if given is None or np.shape(given) != (lanes,):  # the rule `score` looks at the form
+    score = infos.get("final_info", {}).get("score")
+    if score is None or np.shape(score) != (lanes,):  # the rule `score` looks at the form
         return np.full(lanes, np.nan)
-    return np.where(infos["_final_obs"], given, np.nan)
+    return np.where(infos["_final_obs"], score, np.nan)
 
 
 def differs(a: Seen, b: Seen) -> str | None:
@@ -122,8 +122,8 @@ def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
 
 def first_episodes(seen: Seen) -> list[Seen]:
     """Return what every lane showed in its first episode, without the observation that follows its last step."""
-    found = []
+    episodes = []
     for lane, ended in enumerate(seen["terminated"] | seen["truncated"]):
         length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
-        found.append({name: value[lane, :length] for name, value in seen.items()})
-    return found
+        episodes.append({name: value[lane, :length] for name, value in seen.items()})
+    return episodes

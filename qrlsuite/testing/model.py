@@ -32,55 +32,57 @@ class Subjects:
 
     def agent(self, seed: int) -> nn.Module:
         """Return one agent, from a generator of that seed."""
-        made: nn.Module = self.build(OBS, OUT, self.options, torch.Generator().manual_seed(seed))
-        return made
+        agent: nn.Module = self.build(OBS, OUT, self.options, torch.Generator().manual_seed(seed))
+        return agent
 
     def population(self, seeds: Sequence[int]) -> nn.Module:
         """Return a population of freshly built agents."""
         agents = [self.agent(seed) for seed in seeds]
         if self.spec.population is None:
             return populations.stack(agents)
-        made: nn.Module = specs.resolve(self.spec.population)(agents, self.options)
-        return made
+        population: nn.Module = specs.resolve(self.spec.population)(agents, self.options)
+        return population
 
 
 def check(subject: Subject) -> list[Finding]:
     """Check a model with 4 inputs and 3 outputs."""
-    made = Subjects(subject)
+    subjects = Subjects(subject)
     rules = Checklist()
     with one_thread():
         if not rules.run(
-            "builds", "a torch.nn.Module from (4, 3, options, generator)", lambda: _builds(made)
+            "builds", "a torch.nn.Module from (4, 3, options, generator)", lambda: _builds(subjects)
         ):
             return rules.findings
         cause = "forward takes (B, inputs) and returns (B, outputs)"
-        if not rules.run("shapes", "(B, 4) to (B, 3), float32, finite", lambda: _shapes(made), cause):
+        if not rules.run("shapes", "(B, 4) to (B, 3), float32, finite", lambda: _shapes(subjects), cause):
             return rules.findings
         rules.run(
-            "parameters registered", "what wants a gradient is known to torch", lambda: _registered(made)
+            "parameters registered", "what wants a gradient is known to torch", lambda: _registered(subjects)
         )
         rules.run(
             "nothing hidden",
             "what differs between seeds, or is changed by a pass, is registered",
-            lambda: _hidden(made),
+            lambda: _hidden(subjects),
         )
-        rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(made))
-        rules.run("same seed", "the generator alone decides the parameters", lambda: _same(made))
-        rules.run("different seed", "every generator gives other parameters", lambda: _different(made))
-        rules.run("global randomness", "torch's is untouched by building and running", lambda: _global(made))
-        rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(made))
-        flows = rules.run("gradients", "reach every trainable parameter", lambda: _flow(made))
-        if flows and not made.sampled:
-            rules.run("finite differences", "equal the gradients", lambda: _differences(made))
-        rules.run("copies", "deep copies are independent and equal", lambda: _copies(made))
+        rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(subjects))
+        rules.run("same seed", "the generator alone decides the parameters", lambda: _same(subjects))
+        rules.run("different seed", "every generator gives other parameters", lambda: _different(subjects))
+        rules.run(
+            "global randomness", "torch's is untouched by building and running", lambda: _global(subjects)
+        )
+        rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(subjects))
+        flows = rules.run("gradients", "reach every trainable parameter", lambda: _flow(subjects))
+        if flows and not subjects.sampled:
+            rules.run("finite differences", "equal the gradients", lambda: _differences(subjects))
+        rules.run("copies", "deep copies are independent and equal", lambda: _copies(subjects))
         if not rules.run(
-            "population", "(S, B, 4) to (S, B, 3), each slice its agent", lambda: _population(made)
+            "population", "(S, B, 4) to (S, B, 3), each slice its agent", lambda: _population(subjects)
         ):
             return rules.findings
         rules.run(
-            "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(made)
+            "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(subjects)
         )
-        rules.run("state", "saved, sliced and restored exactly", lambda: _state(made))
+        rules.run("state", "saved, sliced and restored exactly", lambda: _state(subjects))
     return rules.findings
 
 
@@ -88,16 +90,16 @@ def _x(*lead: int, seed: int = 0) -> Tensor:
     return torch.rand(*lead, B, OBS, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
-def _builds(made: Subjects) -> None:
-    agent = made.agent(0)
+def _builds(subjects: Subjects) -> None:
+    agent = subjects.agent(0)
     require(
         isinstance(agent, nn.Module),
         f"build returned {type(agent).__name__}, not a torch.nn.Module: is `return` there?",
     )
 
 
-def _shapes(made: Subjects) -> None:
-    agent = made.agent(0)
+def _shapes(subjects: Subjects) -> None:
+    agent = subjects.agent(0)
     for batch in (B, 1):
         values = agent(_x()[:batch])
         require(isinstance(values, Tensor), f"forward returned {type(values).__name__}, not a tensor")
@@ -126,46 +128,46 @@ def _inside(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _registered(made: Subjects) -> None:
-    agent = made.agent(0)
+def _registered(subjects: Subjects) -> None:
+    agent = subjects.agent(0)
     known = {id(m) for m in agent.modules()}
     tensors = {id(t) for t in [*agent.parameters(), *agent.buffers()]}
     for path, module in agent.named_modules():
         for name, attribute in vars(module).items():
             if name.startswith("_") and name in vars(nn.Module()):
                 continue
-            where = f"{path}.{name}".lstrip(".")
+            full_name = f"{path}.{name}".lstrip(".")
             for item in _inside(attribute):
                 require(
                     not isinstance(item, nn.Module) or id(item) in known,
-                    f"self.{where} holds a module in a plain list or dict, so torch does not see its parameters and "
-                    "nothing trains them: use nn.ModuleList or nn.ModuleDict",
+                    f"self.{full_name} holds a module in a plain list or dict, so torch does not see its "
+                    "parameters and nothing trains them: use nn.ModuleList or nn.ModuleDict",
                 )
                 require(
                     not (isinstance(item, Tensor) and item.requires_grad) or id(item) in tensors,
-                    f"self.{where} is a tensor that wants a gradient and is no registered parameter, so nothing trains "
-                    "or saves it: write self.name = nn.Parameter(...), or nn.ParameterList for several",
+                    f"self.{full_name} is a tensor that wants a gradient and is no registered parameter, so nothing "
+                    "trains or saves it: write self.name = nn.Parameter(...), or nn.ParameterList for several",
                 )
     trainable = [name for name, p in agent.named_parameters() if p.requires_grad]
     require(bool(trainable), "there is no trainable parameter: write self.name = nn.Parameter(...)")
 
 
-def _hidden(made: Subjects) -> None:
+def _hidden(subjects: Subjects) -> None:
     try:
-        hidden.require_none(made.agent, OBS, made.spec.name)
+        hidden.require_none(subjects.agent, OBS, subjects.spec.name)
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
 
 
-def _quantum(made: Subjects) -> None:
-    agent = made.agent(0)
+def _quantum(subjects: Subjects) -> None:
+    agent = subjects.agent(0)
     declared = populations.quantum_parameters(agent)
     known = {name for name, _ in agent.named_parameters()}
     require(
         declared <= known,
         f"quantum_parameters() names {sorted(declared - known)}, which are none of {sorted(known)}",
     )
-    if made.spec.family == "quantum":
+    if subjects.spec.family == "quantum":
         require(
             bool(declared),
             "family = 'quantum' and no parameter is declared quantum, so that quantum_lr reaches none: define "
@@ -196,59 +198,59 @@ _DRAW = (
 )
 
 
-def _same(made: Subjects) -> None:
+def _same(subjects: Subjects) -> None:
     kept = np.random.get_state()  # noqa: NPY002
     with torch.random.fork_rng(devices=[]):
         built = []
         for noise in (1, 2):
             torch.manual_seed(noise)
             np.random.seed(noise)  # noqa: NPY002
-            built.append(_values(made.agent(7)))
+            built.append(_values(subjects.agent(7)))
         np.random.set_state(kept)  # noqa: NPY002
     name = _equal(*built)
     require(name is None, f"two builds from generators of the same seed differ in '{name}': {_DRAW}")
 
 
-def _different(made: Subjects) -> None:
+def _different(subjects: Subjects) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
-        first = _values(made.agent(7))
+        first = _values(subjects.agent(7))
         torch.manual_seed(1)
-        second = _values(made.agent(8))
+        second = _values(subjects.agent(8))
         require(
             _equal(first, second) is not None,
             f"generators of different seeds give the same parameters: {_DRAW}",
         )
         generator = torch.Generator().manual_seed(7)
         torch.manual_seed(1)
-        one = _values(made.build(OBS, OUT, made.options, generator))
+        values = _values(subjects.build(OBS, OUT, subjects.options, generator))
         torch.manual_seed(1)
-        two = _values(made.build(OBS, OUT, made.options, generator))
+        two = _values(subjects.build(OBS, OUT, subjects.options, generator))
     require(
-        _equal(one, two) is not None,
+        _equal(values, two) is not None,
         "the second network from one generator (a critic, say) equals the first: draw from the generator, do not "
         "only read its seed",
     )
 
 
-def _global(made: Subjects) -> None:
+def _global(subjects: Subjects) -> None:
     before = torch.get_rng_state()
-    made.agent(0)(_x())
+    subjects.agent(0)(_x())
     require(
         torch.equal(before, torch.get_rng_state()),
         f"building or running it draws from torch's global generator, which all seeds share: {_DRAW}",
     )
 
 
-def _pure(made: Subjects) -> None:
-    agent, x = made.agent(0), _x()
+def _pure(subjects: Subjects) -> None:
+    agent, x = subjects.agent(0), _x()
     kept = x.clone()
     first = agent(x).detach().clone()
     require(
         torch.equal(x, kept),
         "forward changes its input in place: avoid x += ..., x.mul_(...), relu(inplace=True)",
     )
-    if not made.sampled:
+    if not subjects.sampled:
         require(
             torch.equal(first, agent(x).detach()),
             "two passes over the same input differ: dropout, batch normalization and other state have no place here, "
@@ -268,8 +270,8 @@ def _gradients(module: nn.Module, x: Tensor) -> dict[str, Tensor | None]:
     return {name: p.grad for name, p in module.named_parameters() if p.requires_grad}
 
 
-def _flow(made: Subjects) -> None:
-    for name, gradient in _gradients(made.agent(0), _x()).items():
+def _flow(subjects: Subjects) -> None:
+    for name, gradient in _gradients(subjects.agent(0), _x()).items():
         require(
             gradient is not None,
             f"parameter '{name}' gets no gradient: forward does not use it, or detaches what it gave",
@@ -282,8 +284,8 @@ def _flow(made: Subjects) -> None:
         )
 
 
-def _differences(made: Subjects) -> None:
-    agent = made.agent(0).double()
+def _differences(subjects: Subjects) -> None:
+    agent = subjects.agent(0).double()
     x = _x().double()
     gradients = {name: g.clone() for name, g in _gradients(agent, x).items() if g is not None}
     exact_type = next(iter(gradients.values())).dtype == torch.float64
@@ -309,13 +311,13 @@ def _differences(made: Subjects) -> None:
         )
 
 
-def _copies(made: Subjects) -> None:
-    agent, x = made.agent(0), _x()
+def _copies(subjects: Subjects) -> None:
+    agent, x = subjects.agent(0), _x()
     agent(x)
     copied = copy.deepcopy(agent)
     name = _equal(_values(agent), _values(copied))
     require(name is None, f"copy.deepcopy, which makes target networks, changes '{name}'")
-    if not made.sampled:
+    if not subjects.sampled:
         require(torch.equal(agent(x), copied(x)), "a deep copy computes something else than its original")
     before = _values(agent)
     with torch.no_grad():
@@ -327,14 +329,14 @@ def _copies(made: Subjects) -> None:
     )
 
 
-def _population(made: Subjects) -> None:
-    together, x = made.population(range(S)), _x(S)
+def _population(subjects: Subjects) -> None:
+    together, x = subjects.population(range(S)), _x(S)
     values = together(x)
     require(
         tuple(values.shape) == (S, B, OUT),
         f"the population maps ({S}, {B}, {OBS}) to {tuple(values.shape)}, and it must give ({S}, {B}, {OUT})",
     )
-    agent = made.agent(2)
+    agent = subjects.agent(2)
     mine = {name: tuple(p.shape) for name, p in agent.named_parameters()}
     theirs = {name: tuple(p.shape) for name, p in together.named_parameters()}
     require(
@@ -345,8 +347,8 @@ def _population(made: Subjects) -> None:
         populations.quantum_parameters(together) == populations.quantum_parameters(agent),
         "the population declares other quantum parameters than its agents: hand quantum_parameters() on",
     )
-    for seed in range(0 if made.sampled else S):
-        difference = float((values[seed] - made.agent(seed)(x[seed])).detach().abs().max())
+    for seed in range(0 if subjects.sampled else S):
+        difference = float((values[seed] - subjects.agent(seed)(x[seed])).detach().abs().max())
         require(
             difference < 1e-4,
             f"slice {seed} of the population differs from agent {seed} alone by {difference:.2g}: are slices mixed, or "
@@ -354,16 +356,16 @@ def _population(made: Subjects) -> None:
         )
 
 
-def _independence(made: Subjects) -> None:
+def _independence(subjects: Subjects) -> None:
     x = _x(S)
-    whole = made.population(range(S))
+    whole = subjects.population(range(S))
     gradients = _gradients(whole, x)
-    values = made.population(range(S))(x).detach()
+    values = subjects.population(range(S))(x).detach()
     for members in SIZES:
         chosen = list(members)
-        part = made.population(chosen)
+        part = subjects.population(chosen)
         require(
-            torch.equal(made.population(chosen)(x[chosen]).detach(), values[chosen]),
+            torch.equal(subjects.population(chosen)(x[chosen]).detach(), values[chosen]),
             f"seeds {chosen} among themselves compute other values than among all {S}; products of narrow matrices "
             "round differently by size of the stack: use torch.nn.Linear (which is replaced by an exact form) or "
             "qrlsuite.population.linear, and no reduction over seeds",
@@ -377,8 +379,8 @@ def _independence(made: Subjects) -> None:
             )
 
 
-def _state(made: Subjects) -> None:
-    first, second = made.population(range(S)), made.population(range(10, 10 + S))
+def _state(subjects: Subjects) -> None:
+    first, second = subjects.population(range(S)), subjects.population(range(10, 10 + S))
     x = _x(S)
     first(x)  # a pass may advance a counter
     state = _values(first)
@@ -395,7 +397,7 @@ def _state(made: Subjects) -> None:
         "a population with restored state computes something else: something it depends on is not in state_dict(); "
         "register it with register_buffer",
     )
-    alone = made.population([99])
+    alone = subjects.population([99])
     alone.load_state_dict({name: value[3:4] for name, value in state.items()})
     first.load_state_dict(state)
     require(

@@ -19,22 +19,22 @@ _STREAMS = (
 def same_seed(lanes: Lanes, steps: int) -> None:
     """The same streams and actions give the same bits, in new and in used lanes."""
     first, second = (lanes.make([0, 1]) for _ in range(2))
-    given = actions([0, 1], choices(first), steps)
-    name = differs(play(first, given), play(second, given))
+    action_rows = actions([0, 1], choices(first), steps)
+    name = differs(play(first, action_rows), play(second, action_rows))
     require(name is None, f"the same streams and actions give other {name}: {_STREAMS}")
     first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
     again = lanes.make([0, 1])
     again.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
-    name = differs(play(first, given), play(again, given))
+    name = differs(play(first, action_rows), play(again, action_rows))
     require(name is None, f"a used environment, reset, shows other {name} than a new one: {_STREAMS}")
 
 
 def different_seed(lanes: Lanes, steps: int) -> None:
     """Other streams give other episodes."""
     envs, others = lanes.make([0]), lanes.make([5])
-    given = actions([0], choices(envs), steps)
+    action_rows = actions([0], choices(envs), steps)
     require(
-        differs(play(envs, given), play(others, given)) is not None,
+        differs(play(envs, action_rows), play(others, action_rows)) is not None,
         f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
         "deterministic=True",
     )
@@ -58,8 +58,8 @@ def seed_independence(lanes: Lanes, steps: int) -> None:
 def state(lanes: Lanes, steps: int) -> None:
     """Saved in the middle of an episode, sliced, and restored in new lanes, episodes go on as they would have."""
     envs = lanes.make(range(S))
-    given = actions(range(S), choices(envs), 2 * steps)
-    play(envs, given[: max(1, steps // 2)])
+    action_rows = actions(range(S), choices(envs), 2 * steps)
+    play(envs, action_rows[: max(1, steps // 2)])
     saved = {}
     for name, value in envs.state_dict().items():
         require(
@@ -73,13 +73,13 @@ def state(lanes: Lanes, steps: int) -> None:
         )
         saved[name] = value.copy()
     streams = pack(envs.streams)
-    expected = play(envs, given[steps:], reset=False)
+    expected = play(envs, action_rows[steps:], reset=False)
     for members in (tuple(range(S)), (3,), (4, 1)):
         mine = rows(members)
         other = lanes.make(members)
         other.seed_lanes(unpack(streams[mine]))
         other.load_state_dict({name: value[mine].copy() for name, value in saved.items()})
-        got = play(other, given[steps:][:, mine], reset=False)
+        got = play(other, action_rows[steps:][:, mine], reset=False)
         lost = differs(got, {key: value[mine] for key, value in expected.items()})
         require(
             lost is None,
@@ -91,22 +91,22 @@ def state(lanes: Lanes, steps: int) -> None:
 def validation(lanes: Lanes) -> None:
     """Lanes play the same first episodes whether or not they are reset, and whoever is beside them."""
     count = choices(lanes.make([0]))
-    given = actions(range(S), count, LONGEST)
+    action_rows = actions(range(S), count, LONGEST)
     envs = lanes.make(range(S), autoreset=False, shared=True)
-    length = _until_all_ended(envs, given)
-    whole = first_episodes(play(lanes.make(range(S), autoreset=False, shared=True), given[:length]))
+    length = _until_all_ended(envs, action_rows)
+    whole = first_episodes(play(lanes.make(range(S), autoreset=False, shared=True), action_rows[:length]))
     for members in ((3,), (4, 1)):
         mine = rows(members)
         alone = lanes.make(members, autoreset=False, shared=True)
-        part = first_episodes(play(alone, given[:length, mine]))
+        part = first_episodes(play(alone, action_rows[:length, mine]))
         name = next((name for a, lane in zip(part, mine) if (name := differs(a, whole[lane]))), None)
         require(
             name is None,
             f"where a stream serves several lanes, seeds {list(members)} among themselves see other {name} than among "
             f"all {S}: lane l draws from self.streams[l * len(self.streams) // self.num_envs], and from no other",
         )
-    with_reset = first_episodes(play(lanes.make(range(S)), given[:length]))
-    without = first_episodes(play(lanes.make(range(S), autoreset=False), given[:length]))
+    with_reset = first_episodes(play(lanes.make(range(S)), action_rows[:length]))
+    without = first_episodes(play(lanes.make(range(S), autoreset=False), action_rows[:length]))
     name = next((name for a, b in zip(with_reset, without) if (name := differs(a, b))), None)
     require(
         name is None,
@@ -115,11 +115,11 @@ def validation(lanes: Lanes) -> None:
     )
 
 
-def _until_all_ended(envs: LaneEnv, given: NDArray[np.int64]) -> int:
+def _until_all_ended(envs: LaneEnv, action_rows: NDArray[np.int64]) -> int:
     """Step lanes that are not reset until an episode ended in each, and on; return the number of steps."""
     envs.reset()
     over = np.zeros(envs.num_envs, dtype=bool)
-    for step, row in enumerate(given, start=1):
+    for step, row in enumerate(action_rows, start=1):
         _, _, terminated, truncated, _ = envs.step(row)
         over |= terminated | truncated
         if over.all():
@@ -127,6 +127,7 @@ def _until_all_ended(envs: LaneEnv, given: NDArray[np.int64]) -> int:
                 envs.step(row)
             return step
     raise BrokenRuleError(
-        f"without autoreset, {np.count_nonzero(~over)} of {len(over)} lanes have not ended after {len(given)} steps of "
-        "random actions: every episode needs a time limit, for validation waits until each lane has ended"
+        f"without autoreset, {np.count_nonzero(~over)} of {len(over)} lanes have not ended after "
+        f"{len(action_rows)} steps of random actions: every episode "
+        "needs a time limit, for validation waits until each lane has ended"
     )

@@ -42,7 +42,9 @@ def select(word: str) -> list[CheckTarget]:
         return _of_kind(kind, name)
     owners = {kind: _owners(kind, word) for kind in registry.KINDS if word in known.entries[kind]}
     kinds, distribution = list(owners), _distribution(word)
-    if word == distribution and {owner for own in owners.values() for owner in own} <= {word}:
+    if word == distribution and {
+        owner for registered_names in owners.values() for owner in registered_names
+    } <= {word}:
         return of_distribution(word)
     if len(kinds) > 1 or (kinds and word == distribution):
         ways = [f"{registry.SINGULAR[kind].replace('_', '-')}:{word}" for kind in kinds]
@@ -72,20 +74,20 @@ def of_distribution(distribution: str) -> list[CheckTarget]:
     problems = [p.problem for p in known.plugins if p.distribution == distribution and p.problem]
     if problems:
         raise QrlSuiteError("; ".join(problems))
-    found = [
+    targets = [
         CheckTarget(kind, entry.spec.name)
         for kind, entry in known
         if distribution in _owners(kind, entry.spec.name)
     ]
-    found += [
+    targets += [
         CheckTarget("trackers", module) for module, owner in _watching().items() if owner == distribution
     ]
-    if not found:
+    if not targets:
         raise QrlSuiteError(
             f"'{distribution}' registers nothing by name and watches no run; commands have no rules. Nothing to check: "
             "if there should be, is every hook under @hookimpl, in the module that the entry point names?"
         )
-    return found
+    return targets
 
 
 def _of_kind(kind: str, name: str) -> list[CheckTarget]:
@@ -97,12 +99,12 @@ def _of_kind(kind: str, name: str) -> list[CheckTarget]:
                 f"no plugin is of a distribution '{name}'{nearest(name, _distributions())}"
             )
         return of_distribution(distribution)
-    known, wanted = registry.load(), plural(kind)
-    if wanted != "trackers" or (wanted, name) in known.duplicates:
-        known.get(wanted, name)
-    elif name not in known.entries[wanted] and not _is_module(name):
-        raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[wanted])}")
-    return [CheckTarget(wanted, name)]
+    known, plural_kind = registry.load(), plural(kind)
+    if plural_kind != "trackers" or (plural_kind, name) in known.duplicates:
+        known.get(plural_kind, name)
+    elif name not in known.entries[plural_kind] and not _is_module(name):
+        raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[plural_kind])}")
+    return [CheckTarget(plural_kind, name)]
 
 
 def _owners(kind: str, name: str) -> list[str]:

@@ -22,11 +22,13 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.SignificanceTestSpec)
     rules = Checklist()
-    made: list[Any] = []
+    rules_built: list[Any] = []
     cause = "the factory is called without arguments"
-    if not rules.run("builds", "a rule with a name and a promise", lambda: made.append(_build(spec)), cause):
+    if not rules.run(
+        "builds", "a rule with a name and a promise", lambda: rules_built.append(_build(spec)), cause
+    ):
         return rules.findings
-    rule = made[0]
+    rule = rules_built[0]
     cause = "it is called with two qrlsuite.statistics.Evidence objects"
     if not rules.run("signs", "an integer of -1, 0 or 1 in every cell", lambda: _signs(rule), cause):
         return rules.findings

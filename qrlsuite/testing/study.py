@@ -68,5 +68,5 @@ def _show(spec: specs.StudySpec) -> None:
             [*command, "--runs", runs], capture_output=True, text=True, check=False, env=environment()
         )
     if done.returncode != 0:
-        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
-        raise BrokenRuleError(" ".join(said).removeprefix("qrlsuite: "))
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
+        raise BrokenRuleError(" ".join(lines).removeprefix("qrlsuite: "))

@@ -57,14 +57,14 @@ def _algorithms(task: Task) -> None:
                 _algorithm(f"[presets.{preset}.{name}]", name, values)
 
 
-def _algorithm(where: str, name: str, values: Mapping[str, Any] | None = None) -> None:
-    """Require that an algorithm exists and takes values of options; `where` the file says so."""
+def _algorithm(location: str, name: str, values: Mapping[str, Any] | None = None) -> None:
+    """Require that an algorithm exists and takes values of options; `location` the file says so."""
     try:
         spec = registry.algorithm(name)
         if values is not None:
             options.build(specs.resolve(spec.options), values, f"algorithm '{name}'")
     except QrlSuiteError as error:
-        raise BrokenRuleError(f"{where}: {error}") from error
+        raise BrokenRuleError(f"{location}: {error}") from error
 
 
 def _ranking(task: Task) -> None:
@@ -110,9 +110,9 @@ def _scores(task: Task) -> None:
 
 def _score(task: Task, value: float, score: float) -> None:
     """Require that one episode's score is usable; `value` is its return."""
-    said = f"an episode of random actions has the return {value:.6g} and the score {score:.6g}"
+    observed = f"an episode of random actions has the return {value:.6g} and the score {score:.6g}"
     require(
         task.file.ranking.epsilons is None or 0 <= score <= 1 + 1e-9,
-        f"{said}, outside [0, 1]: is max_return the best possible return, and no return negative? Else rank on "
+        f"{observed}, outside [0, 1]: is max_return the best possible return, and no return negative? Else rank on "
         "thresholds",
     )

@@ -56,9 +56,9 @@ def check_format(
         "file", "an absolute path, to a file that is there", lambda: check_path("path", spec.path)
     ):
         return None
-    made: list[T] = []
-    rules.run("format", valid, lambda: made.append(parsed(spec, parse)), cause)
-    return made[0] if made else None
+    results: list[T] = []
+    rules.run("format", valid, lambda: results.append(parsed(spec, parse)), cause)
+    return results[0] if results else None
 
 
 def check_names(rules: Checklist, spec: FileSpec, name: str, summary: str, otherwise: str) -> None:

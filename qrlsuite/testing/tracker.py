@@ -53,20 +53,20 @@ def check(subject: Subject) -> list[Finding]:
     spec = subject.spec
     assert isinstance(spec, specs.TrackerSpec)
     rules = Checklist()
-    made: list[Any] = []
+    trackers: list[Any] = []
     with tempfile.TemporaryDirectory() as folder:
         for target in (None, str(Path(folder) / "target")):
             if not rules.run(
                 "builds" if target is None else "target",
                 f"factory({'None' if target is None else 'target'}), with a method for an event",
-                lambda target=target: made.append(_build(spec, target)),  # type: ignore[misc]
+                lambda target=target: trackers.append(_build(spec, target)),  # type: ignore[misc]
                 "the factory takes one argument: what the user writes after --track NAME=, or None",
             ):
                 return rules.findings
         rules.run(
             "events",
             RUNS,
-            lambda: _sent(made, Path(folder)),
+            lambda: _sent(trackers, Path(folder)),
         )
     return rules.findings
 
@@ -94,28 +94,30 @@ def _sent(trackers: list[Any], folder: Path) -> None:
 def check_plugin(plugin: Any) -> list[Finding]:
     """Check a plugin that watches every run, given as a module, an object or a module's name."""
     rules = Checklist()
-    found: list[Any] = [plugin]
+    plugins: list[Any] = [plugin]
     if isinstance(plugin, str):
-        found.clear()
+        plugins.clear()
         if not rules.run(
             "imports",
             "the module can be imported",
-            lambda: found.append(importlib.import_module(plugin)),
+            lambda: plugins.append(importlib.import_module(plugin)),
             "no tracker of that name is registered, nor is there a module of that name",
         ):
             return rules.findings
-    made = found[0]
-    if not rules.run("hooks", "at least one run event, with its arguments", lambda: _hooks(made)):
+    plugin_object = plugins[0]
+    if not rules.run("hooks", "at least one run event, with its arguments", lambda: _hooks(plugin_object)):
         return rules.findings
-    if isinstance(made, ModuleType):
+    if isinstance(plugin_object, ModuleType):
         rules.run(
-            "lazy imports", f"importing it imports none of {', '.join(HEAVY)}", lambda: _lazy(made.__name__)
+            "lazy imports",
+            f"importing it imports none of {', '.join(HEAVY)}",
+            lambda: _lazy(plugin_object.__name__),
         )
     with tempfile.TemporaryDirectory() as folder:
         rules.run(
             "events",
             RUNS,
-            lambda: _a_run(_caller(made), Path(folder)),
+            lambda: _a_run(_caller(plugin_object), Path(folder)),
         )
     return rules.findings
 
@@ -169,9 +171,9 @@ def _a_run(send: Callable[..., None], folder: Path) -> None:
     """Send what two seeds' runs send: two epochs, the second of them again after resuming."""
     runs = []
     for seed in (7, 8):
-        own = folder / f"seed-{seed:04d}"
-        own.mkdir(exist_ok=True)
-        runs.append({**RUN, "seed": seed, "folder": str(own)})
+        seed_folder = folder / f"seed-{seed:04d}"
+        seed_folder.mkdir(exist_ok=True)
+        runs.append({**RUN, "seed": seed, "folder": str(seed_folder)})
     for first, last in ((1, 2), (2, 2)):
         for run in runs:
             _unchanged(send, "run_started", run={**run, "epochs": first - 1})

@@ -168,23 +168,23 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     """
     stored = [parameters(store.seed(seed)) for seed in seeds]
     trainer = Trainer(entry, seeds, device)
-    own: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())
+    state: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())
     if trainer.statistics is not None:
-        own |= trainer.statistics.published()
+        state |= trainer.statistics.published()
     for seed, arrays in zip(seeds, stored):
-        problem = _misfit({name: value[0] for name, value in own.items()}, arrays)
+        problem = _misfit({name: value[0] for name, value in state.items()}, arrays)
         if problem:
             raise StoreError(
                 f"{store.seed(seed).path / 'final.safetensors'} does not fit the entry's model: {problem}"
             )
     with torch.no_grad():
-        for name, value in own.items():
+        for name, value in state.items():
             together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
             value.copy_(together.reshape(value.shape))
     if trainer.statistics is not None:
         trainer.statistics.refresh()
     for name, loaded in trainer.algorithm.policy_state().items():
-        value = own[name]
+        value = state[name]
         if not torch.equal(value.cpu(), loaded.cpu()) and not bool(torch.isnan(value).any()):
             raise PluginError(
                 f"algorithm '{type(trainer.algorithm).__name__}': policy_state() returns copies; it has to return "
@@ -193,19 +193,20 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     return trainer
 
 
-def _misfit(own: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[Any]]) -> str | None:
+def _misfit(expected: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[Any]]) -> str | None:
     """Say where names, shapes or types of stored parameters differ from the model's own; None where they agree."""
-    missing, unexpected = sorted(set(own) - set(stored)), sorted(set(stored) - set(own))
+    missing, unexpected = sorted(set(expected) - set(stored)), sorted(set(stored) - set(expected))
     if missing:
         return f"it has no '{missing[0]}'" + (f", but '{unexpected[0]}'" if unexpected else "")
     if unexpected:
         return f"it has '{unexpected[0][:80]}', which the model has not"
-    for name, value in own.items():
-        given = stored[name]
-        wanted = str(value.dtype).removeprefix("torch.")
-        scalar = value.dim() == 0 and given.shape == (1,)  # how a number per agent is stored
-        if not (given.shape == tuple(value.shape) or scalar) or given.dtype.name != wanted:
-            return f"'{name}' is {given.dtype.name} of shape {given.shape}, not {wanted} of shape {tuple(value.shape)}"
+    for name, value in expected.items():
+        stored_value = stored[name]
+        dtype = str(value.dtype).removeprefix("torch.")
+        scalar = value.dim() == 0 and stored_value.shape == (1,)  # how a number per agent is stored
+        if not (stored_value.shape == tuple(value.shape) or scalar) or stored_value.dtype.name != dtype:
+            found = f"{stored_value.dtype.name} of shape {stored_value.shape}"
+            return f"'{name}' is {found}, not {dtype} of shape {tuple(value.shape)}"
     return None
 
 

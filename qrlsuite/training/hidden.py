@@ -43,8 +43,10 @@ def _of_module(
     for name, part in module.named_modules(prefix=path):
         for attribute, value in vars(part).items():
             # a recurrent layer's second list of its own parameters, which torch keeps up to date
-            own = attribute in _OF_TORCH or (isinstance(part, nn.RNNBase) and attribute == "_flat_weights")
-            if not own:
+            torch_owned = attribute in _OF_TORCH or (
+                isinstance(part, nn.RNNBase) and attribute == "_flat_weights"
+            )
+            if not torch_owned:
                 yield from _inside(value, f"{name}.{attribute}".lstrip("."), cure, seen)
 
 
@@ -78,8 +80,8 @@ def _inside(value: Any, path: str, cure: str, seen: set[int]) -> Iterator[tuple[
             for key, item in value.items():
                 yield from _inside(item, f"{path}[{key!r}]", cure, seen)
         else:
-            for place, item in enumerate(value):
-                yield from _inside(item, f"{path}[{place}]", cure, seen)
+            for index, item in enumerate(value):
+                yield from _inside(item, f"{path}[{index}]", cure, seen)
 
 
 def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> None:
@@ -116,14 +118,16 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> 
             _refuse(model, path, "is changed by a forward pass, and torch does not know it", cure)
 
 
-def _equal(one: Any, other: Any) -> bool:
-    if type(one) is not type(other):
+def _equal(first: Any, second: Any) -> bool:
+    if type(first) is not type(second):
         return False
-    if isinstance(one, Tensor):
-        one, other = one.numpy(), other.numpy()
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
-    return bool(one == other) or one != one  # nan
+    if isinstance(first, Tensor):
+        first, second = first.numpy(), second.numpy()
+    if isinstance(first, np.ndarray):
+        return first.dtype == second.dtype and np.array_equal(
+            first, second, equal_nan=first.dtype.kind in "fc"
+        )
+    return bool(first == second) or first != first  # nan
 
 
 def _refuse(model: str, path: str, problem: str, cure: str) -> None:

@@ -74,13 +74,13 @@ class MeteredEnv(LaneEnv):
                     f"{self.returns[ended][~np.isfinite(scores)][0]}: are there rewards that are nan or infinite?"
                 )
             return scores
-        given = infos.get("final_info", {}).get("score")
-        if given is None:
+        score = infos.get("final_info", {}).get("score")
+        if score is None:
             raise EnvironmentFailure(
                 f"environment '{self.environment_name}' gave no info['score'] at the end of an episode: "
                 "set [score] source = 'return' and max_return in the task file"
             )
-        scores = np.asarray(given, np.float64)[ended]
+        scores = np.asarray(score, np.float64)[ended]
         if not (np.isfinite(scores).all() and (scores >= 0).all() and (scores <= 1 + 1e-9).all()):
             raise EnvironmentFailure(
                 f"environment '{self.environment_name}' gave a score outside [0, 1]: {scores[:5].tolist()}"

@@ -26,7 +26,7 @@ TRACK = "QRLSUITE_TRACK"
 EVENTS = ("run_started", "epoch_finished", "run_finished")
 
 
-def parse(words: Sequence[str]) -> dict[str, str | None]:
+def parse(requests: Sequence[str]) -> dict[str, str | None]:
     """Return targets by name from words `NAME` or `NAME=TARGET`.
 
     Raises
@@ -36,32 +36,32 @@ def parse(words: Sequence[str]) -> dict[str, str | None]:
     QrlSuiteError
         If a package that a tracker needs is not installed; the message has the pip command.
     """
-    asked: dict[str, str | None] = {}
-    for word in words:
-        name, given, target = word.strip().partition("=")
+    targets: dict[str, str | None] = {}
+    for word in requests:
+        name, equals, target = word.strip().partition("=")
         for module, command in registry.tracker(name).extras.items():
             if importlib.util.find_spec(module) is None:
                 raise QrlSuiteError(f"tracker '{name}' needs the package '{module}': {command}")
-        if given and not target:
+        if equals and not target:
             raise QrlSuiteError(
                 f"--track {word}: nothing follows '='; write --track {name}, or {name}=TARGET"
             )
-        asked[name] = target or None
-    return asked
+        targets[name] = target or None
+    return targets
 
 
-def ask(words: Sequence[str]) -> None:
+def ask(requests: Sequence[str]) -> None:
     """Ask for trackers, in this process and in the workers that it starts; the errors are those of `parse`."""
-    parse(words)
-    os.environ[TRACK] = "\n".join(words)
+    parse(requests)
+    os.environ[TRACK] = "\n".join(requests)
 
 
 @contextlib.contextmanager
-def asking(words: Sequence[str]) -> Iterator[None]:
+def asking(requests: Sequence[str]) -> Iterator[None]:
     """Ask for trackers while something is trained; without words, for those that the environment names."""
     before = os.environ.get(TRACK)
-    if words:
-        ask(words)
+    if requests:
+        ask(requests)
     try:
         yield
     finally:
@@ -92,12 +92,12 @@ class EventSink:
         One line for every tracker that was left out.
     """
 
-    def __init__(self, known: registry.Registry, words: Sequence[str] = ()) -> None:
+    def __init__(self, known: registry.Registry, requests: Sequence[str] = ()) -> None:
         self.known = known
         self.problems: list[str] = []
         self._failed: set[str] = set()
         self._asked: dict[str, Any] = {}
-        for word in words:
+        for word in requests:
             self._guarded(word, "its factory", functools.partial(self._build, word))
 
     def _build(self, word: str) -> None:
@@ -122,11 +122,11 @@ class EventSink:
             if method is not None:
                 yield name, functools.partial(method, *content.values())
 
-    def _guarded(self, name: str, what: str, call: Callable[[], Any]) -> None:
+    def _guarded(self, name: str, event: str, call: Callable[[], Any]) -> None:
         try:
             call()
         except Exception as error:
             self._failed.add(name)
-            message = f"tracker '{name}' failed in {what} and is left out: {registry.words(error)}"
+            message = f"tracker '{name}' failed in {event} and is left out: {registry.words(error)}"
             self.problems.append(message)
             log.warning(message)

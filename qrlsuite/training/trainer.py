@@ -69,14 +69,14 @@ def _building(kind: str, name: str) -> Iterator[None]:
 def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
     """Build the task's environment with a number of lanes."""
     spec = entry.task.environment
-    given = entry.task.environment_options
+    settings = entry.task.environment_options
     inner: LaneEnv
     with _building("environments", spec.name):
         if spec.vector is not None:
-            inner = specs.resolve(spec.vector)(given, lanes)
+            inner = specs.resolve(spec.vector)(settings, lanes)
         else:
             qrlsuite.register_environments()
-            inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(given))
+            inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(settings))
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 
@@ -125,9 +125,9 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         observations, _, terminated, truncated, _ = envs.step(policy(observations))
         if not (terminated | truncated).any():
             continue
-        lanes, sums, given = envs.take_finished()
+        lanes, sums, final_scores = envs.take_finished()
         first = lanes[unfinished[lanes]]
-        returns[first], scores[first] = sums[unfinished[lanes]], given[unfinished[lanes]]
+        returns[first], scores[first] = sums[unfinished[lanes]], final_scores[unfinished[lanes]]
         lengths[first] = played
         unfinished[lanes] = False
         if not unfinished.any():
@@ -161,14 +161,14 @@ class ModelBuilder:
 
     def __call__(self, out_dim: int) -> nn.Module:
         """Return a population of freshly initialized agents."""
-        spec, given = self.entry.model, self.entry.model_options
+        spec, options = self.entry.model, self.entry.model_options
         call = len(self.built)
         with _building("models", spec.name):
             build = specs.resolve(spec.build)
 
             def agent(streams: Streams) -> nn.Module:
-                made: nn.Module = build(self.observation_size, out_dim, given, streams.torch("init", call))
-                return made
+                model: nn.Module = build(self.observation_size, out_dim, options, streams.torch("init", call))
+                return model
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
@@ -178,7 +178,7 @@ class ModelBuilder:
             if spec.population is None:
                 together = population.stack(agents)
             else:
-                together = specs.resolve(spec.population)(agents, given)
+                together = specs.resolve(spec.population)(agents, options)
         if self.statistics is not None:
             self.statistics.attach(together)
         self.built.append(together)
@@ -199,8 +199,8 @@ class ModelBuilder:
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""
-        found = [getattr(module, "problem", None) for module in self.built]
-        return list(dict.fromkeys(f"model '{self.entry.model.name}' {text}" for text in found if text))
+        problems = [getattr(module, "problem", None) for module in self.built]
+        return list(dict.fromkeys(f"model '{self.entry.model.name}' {text}" for text in problems if text))
 
     def executions(self) -> dict[str, int]:
         """Return each agent's circuit executions so far, summed over its networks; empty without circuits."""

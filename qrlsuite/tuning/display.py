@@ -77,8 +77,8 @@ class TuneDisplay:
         """Return the least and the most core-seconds of a whole search, None where unknown, and what that rests on."""
         seeds = len(search.request.seeds)
         together = min(LARGEST_GROUP, math.ceil(seeds / self.workers))
-        found = speed.known(search.runs, search.results).estimate(search.base, together)
-        return found.range(search.planned * seeds * search.epochs), speed.BASES[found.basis]
+        estimate = speed.known(search.runs, search.results).estimate(search.base, together)
+        return estimate.range(search.planned * seeds * search.epochs), speed.BASES[estimate.basis]
 
     def trial(self, entry: Entry, work: Plan) -> None:
         """Show that a trial begins."""
@@ -95,17 +95,17 @@ class TuneDisplay:
         """Show where the trial at work stands."""
         if not self.bar.shown or self._work is None:
             return
-        asked = sum(search.asked for search in self.searches)
+        proposed = sum(search.asked for search in self.searches)
         work = self._work
         epochs = [int(snapshot.get(group.id, {}).get("epoch") or group.epoch) for group in work.groups]
         part = sum(epochs) / (len(epochs) * work.epochs) if epochs else 0.0
-        words = [f"trial {asked}/{sum(search.planned for search in self.searches)}"]
-        words += [f"epoch {min(epochs)}/{work.epochs}"] if epochs else []
-        words += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
+        parts = [f"trial {proposed}/{sum(search.planned for search in self.searches)}"]
+        parts += [f"epoch {min(epochs)}/{work.epochs}"] if epochs else []
+        parts += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
         left = self._left()
         if left is not None:
-            words.append(f"{duration(left)} left")
-        self.bar.update(asked - 1 + part, "tuning", "  ".join(words))
+            parts.append(f"{duration(left)} left")
+        self.bar.update(proposed - 1 + part, "tuning", "  ".join(parts))
 
     def _left(self) -> float | None:
         """Return the seconds left by the pace of the trials that were trained now; None before one was."""

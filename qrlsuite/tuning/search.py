@@ -43,7 +43,7 @@ Train = Callable[[Entry, Sequence[int], int], EntryStore]
 """Trains the missing ones of some seeds to an epoch and returns the entry's folder, finished or not."""
 
 
-def tuning_seeds(given: int | str | Iterable[int]) -> tuple[int, ...]:
+def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
     """Return the seeds that are meant, as `read_seeds` reads them, but that a number counts from 1,000,000.
 
     Raises
@@ -51,13 +51,14 @@ def tuning_seeds(given: int | str | Iterable[int]) -> tuple[int, ...]:
     OptionError
         If they are malformed, or a seed belongs to the protocol.
     """
-    seeds = tuple(read_seeds(given))
-    if isinstance(given, int) or (isinstance(given, str) and given.isdecimal()):
+    seeds = tuple(read_seeds(requested))
+    if isinstance(requested, int) or (isinstance(requested, str) and requested.isdecimal()):
         return tuple(TUNING_SEEDS + seed for seed in seeds)
     if seeds[0] < TUNING_SEEDS:
         raise OptionError(
-            f"--seeds {given}: tuning uses seeds from {TUNING_SEEDS} up, or its settings would be judged by the runs "
-            f"they were chosen on; write --seeds {len(seeds)} for {TUNING_SEEDS} to {TUNING_SEEDS + len(seeds) - 1}"
+            f"--seeds {requested}: tuning uses seeds from {TUNING_SEEDS} up, or its settings would be judged by the "
+            f"runs they were chosen on; write --seeds {len(seeds)} for {TUNING_SEEDS} to "
+            f"{TUNING_SEEDS + len(seeds) - 1}"
         )
     return seeds
 
@@ -275,13 +276,13 @@ class Search(Shown):
         StoreError
             If the file cannot be written.
         """
-        found = self.preset()
+        best_preset = self.preset()
         base = self.base
         comment = (
             f"Settings found by `qrlsuite tune` ({cell_text(base.task.file.ranking, self.request.objective)}); to use "
             f"them:\n  qrlsuite run --task {self.request.task} --model {base.model.name} --preset {path.name}"
         )
-        write_atomically(path, preset.dumps(found, comment).encode())
+        write_atomically(path, preset.dumps(best_preset, comment).encode())
         self.written = path
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

@@ -98,11 +98,11 @@ def grids() -> dict[str, Path]:
         for kind, item in registry.load()
         if kind == "tasks" and isinstance(item.spec, specs.TaskSpec)
     )
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in folders:
         for path in sorted(folder.glob("*.toml")):
-            found.setdefault(path.stem, path)
-    return found
+            paths.setdefault(path.stem, path)
+    return paths
 
 
 def load(name: str) -> GridFile:
@@ -157,27 +157,27 @@ def space(
         If nothing is left to vary, an option is unknown, or a value cannot be used.
     """
     sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
-    found: dict[str, list[Any] | Range] = {}
+    axes: dict[str, list[Any] | Range] = {}
     tables = grid.search if grid is not None else {}
     for algorithm in ("all", entry.algorithm.name):
         for family in ("all", entry.model.family):
             for word, values in tables.get(algorithm, {}).get(family, {}).items():
-                found[_full_name(word, sides, "search: ")] = values
+                axes[_full_name(word, sides, "search: ")] = values
     for setting in varied:
         name = _full_name(_word(setting), sides, "--vary ")
-        _forget(found, name)
-        found[name] = _values(name, setting.value)
+        _forget(axes, name)
+        axes[name] = _values(name, setting.value)
     for setting in fixed:
         if setting.side == "ansatz" and setting.name in getattr(sides["model"], "passes_on", ()):
-            _forget(found, f"model.{setting.name}")
+            _forget(axes, f"model.{setting.name}")
         elif setting.side not in ("environment", "ansatz") and (setting.side or _owned(setting.name, sides)):
-            _forget(found, _full_name(_word(setting), sides, setting.prefix))
-    if not found:
+            _forget(axes, _full_name(_word(setting), sides, setting.prefix))
+    if not axes:
         raise OptionError(
             f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: give --grid NAME, --grid FILE.toml "
             "or --vary 'lr=[1e-3, 5e-4]'"
         )
-    result = tuple(_dimension(name, values) for name, values in found.items())
+    result = tuple(_dimension(name, values) for name, values in axes.items())
     for dimension in result:
         _check(dimension, sides, entry)
     return result
@@ -209,11 +209,11 @@ def _full_name(word: str, sides: Mapping[str, type[Any]], prefix: str) -> str:
     return "+".join(parts)
 
 
-def _forget(found: dict[str, Any], name: str) -> None:
+def _forget(space: dict[str, Any], name: str) -> None:
     """Drop every dimension that shares an option with a name."""
-    for known in list(found):
+    for known in list(space):
         if set(known.split("+")) & set(name.split("+")):
-            del found[known]
+            del space[known]
 
 
 def parse_varied(word: str) -> Setting:
@@ -224,10 +224,10 @@ def parse_varied(word: str) -> Setting:
     OptionError
         If there is no `=` or no name.
     """
-    key, equals, given = word.partition("=")
+    key, equals, values_text = word.partition("=")
     if not equals or not key.strip():
         raise OptionError(f"--vary {word}: write a name and its values, --vary 'lr=[1e-3, 5e-4]'")
-    text = re.sub(r"(?<![\w.])\.(?=\d)", "0.", given.strip())
+    text = re.sub(r"(?<![\w.])\.(?=\d)", "0.", values_text.strip())
     value = options.parse_value(text)
     if not isinstance(value, list | dict) and not text.startswith(("[", "{")):
         value = [options.parse_value(part.strip()) for part in text.split(",") if part.strip()]
@@ -268,32 +268,32 @@ def _check(dimension: Dimension, sides: Mapping[str, type[Any]], entry: Entry) -
             raise OptionError(
                 f"{part}: no option of that name{nearest(name if side in sides else side, known)}"
             )
-        own = options.plain(entry.model_options if side == "model" else entry.algorithm_options)
+        current = options.plain(entry.model_options if side == "model" else entry.algorithm_options)
         for value in dimension.values if ends is None else (ends.low, ends.high):
-            options.build(sides[side], {**own, name: value}, f"a trial with {part} = {value!r}")
+            options.build(sides[side], {**current, name: value}, f"a trial with {part} = {value!r}")
 
 
 def base(space: Space, entry: Entry) -> Point:
     """Return the point of an entry's own values; of several options that vary as one, the first's."""
-    own = {
+    values = {
         "algorithm": options.plain(entry.algorithm_options),
         "model": options.plain(entry.model_options),
     }
     point = {}
     for dimension in space:
         side, _, name = dimension.name.partition("+")[0].partition(".")
-        point[dimension.name] = own[side][name]
+        point[dimension.name] = values[side][name]
     return point
 
 
 def settings(point: Mapping[str, Any]) -> list[Setting]:
     """Return a point as settings, as `--set` would give them."""
-    words = []
+    chosen = []
     for full, value in point.items():
         for part in full.split("+"):
             side, _, name = part.partition(".")
-            words.append(Setting(side, name, value))
-    return words
+            chosen.append(Setting(side, name, value))
+    return chosen
 
 
 def text(point: Mapping[str, Any]) -> str:

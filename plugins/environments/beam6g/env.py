@@ -158,11 +158,11 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
             If `options` has another key, or the support points cannot be used.
         """
         super().reset(seed=seed)
-        given = reset_options(options)
+        settings = reset_options(options)
         support = (
             self._simulator.draw([self.np_random], [1])
-            if given is None
-            else self._simulator.support(given)[None]
+            if settings is None
+            else self._simulator.support(settings)[None]
         )
         self._simulator.fill(self._tables, np.arange(1), support)
         self._support = support

@@ -56,7 +56,7 @@ class EpisodeGenerator:
         """Draw support points of `counts[g]` episodes from stream g: (sum of counts, degree, 2)."""
         return trajectory.sample(streams, counts, self.options.degree, self.options.rejection)
 
-    def support(self, given: ArrayLike, lanes: int | None = None) -> FloatArray:
+    def support(self, raw_points: ArrayLike, lanes: int | None = None) -> FloatArray:
         """Check support points given by a user and return them, (degree, 2) or (lanes, degree, 2).
 
         Raises
@@ -64,7 +64,7 @@ class EpisodeGenerator:
         OptionError
             If they have another shape, lie outside the field, or do not move.
         """
-        points = np.array(given, dtype=np.float64)
+        points = np.array(raw_points, dtype=np.float64)
         shape = (self.options.degree, 2) if lanes is None else (lanes, self.options.degree, 2)
         if points.shape != shape:
             raise OptionError(f"support_points must have the shape {shape}, not {points.shape}")

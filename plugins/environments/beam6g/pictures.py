@@ -103,13 +103,13 @@ def _beams(axes: Axes, world: BeamOptions, options: FieldOptions) -> None:
     places = (np.arange(options.resolution) + 0.5) * (physics.FIELD / options.resolution)
     x, y = np.meshgrid(places, places)
     model = physics.physics(world.physics)
-    found = []
+    lines = []
     for antenna in world.antennas:
         u, r2 = physics.offsets(x, y, antenna)
         lobes = model.intensity(u, r2, float(model.phases[options.beam]))
-        found.append(lobes * (r2 * r2 if model.fourth_power else r2))
+        lines.append(lobes * (r2 * r2 if model.fourth_power else r2))
     axes.imshow(
-        np.sqrt(np.clip(np.max(found, axis=0), 0, 1)),
+        np.sqrt(np.clip(np.max(lines, axis=0), 0, 1)),
         origin="lower",
         extent=(0.0, physics.FIELD, 0.0, physics.FIELD),
         cmap="cividis",

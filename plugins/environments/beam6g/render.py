@@ -78,8 +78,8 @@ def ground_truth(options: BeamOptions, resolution: int = 300) -> GroundTruth:
     places = (np.arange(resolution) + 0.5) * (FIELD / resolution)
     x, y = np.meshgrid(places, places)
     model = physics.physics(options.physics)
-    found = [physics.best_intensity(model, x, y, antenna) for antenna in options.antennas]
-    intensities, beams = (np.stack(part) for part in zip(*found))
+    per_antenna = [physics.best_intensity(model, x, y, antenna) for antenna in options.antennas]
+    intensities, beams = (np.stack(part) for part in zip(*per_antenna))
     antenna = intensities.argmax(axis=0)
     at_best = antenna[None]
     return GroundTruth(
@@ -113,7 +113,7 @@ def ground_truth_figure(options: BeamOptions, resolution: int = 500) -> Figure:
     draw_field(axes, options, truth)
     cell = FIELD / resolution
     for x, y, antenna in _regions(truth.antenna, cell, 0.02):
-        if min(np.hypot(x - place[0], y - place[1]) for place, _ in options.antennas) > 0.45:
+        if min(np.hypot(x - position[0], y - position[1]) for position, _ in options.antennas) > 0.45:
             axes.text(x, y, str(antenna), color=_INK, ha="center", va="center_baseline", fontsize=9, zorder=5)
     axes.set_title("Best antenna, and the intensity of its best beam", fontsize=11, color=_INK, loc="left")
     scale = figure.add_axes((0.06, 0.058, 0.4, 0.02))
@@ -255,7 +255,7 @@ def _regions(antenna: NDArray[np.intp], cell: float, least: float) -> list[tuple
     """
     from scipy import ndimage
 
-    found = []
+    regions = []
     for i in np.unique(antenna).tolist():
         labels, count = ndimage.label(antenna == i)
         for region in range(1, count + 1):
@@ -263,8 +263,8 @@ def _regions(antenna: NDArray[np.intp], cell: float, least: float) -> list[tuple
             if inside.mean() > least:
                 room = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
                 row, column = np.unravel_index(int(room.argmax()), room.shape)
-                found.append(((float(column) + 0.5) * cell, (float(row) + 0.5) * cell, i))
-    return found
+                regions.append(((float(column) + 0.5) * cell, (float(row) + 0.5) * cell, i))
+    return regions
 
 
 def _shaded(color: NDArray[np.float64], intensity: FloatArray) -> FloatArray:

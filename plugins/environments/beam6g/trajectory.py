@@ -177,7 +177,7 @@ def sample(
     and the valid ones are taken in order; so what a stream yields depends on nothing but the stream and its
     count. x: uniform in [0, 6], the first forced to 0, the last to 6, sorted. y: uniform in [0, 6].
     """
-    found: list[list[FloatArray]] = [[] for _ in streams]
+    accepted: list[list[FloatArray]] = [[] for _ in streams]
     missing = list(counts)
     growth = 2
     while waiting := [g for g, count in enumerate(missing) if count > 0]:
@@ -193,10 +193,10 @@ def sample(
         ends = np.cumsum(sizes)
         for g, start, end in zip(waiting, ends - sizes, ends):
             taken = start + np.flatnonzero(valid[start:end])[: missing[g]]
-            found[g].append(support[taken])
+            accepted[g].append(support[taken])
             missing[g] -= len(taken)
         growth *= 2
-    return np.concatenate([block for blocks in found for block in blocks])
+    return np.concatenate([block for blocks in accepted for block in blocks])
 
 
 def positions(support: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:

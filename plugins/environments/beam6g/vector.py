@@ -59,8 +59,8 @@ class BeamLanes(LaneEnv):
         qrlsuite.errors.OptionError
             If `options` has another key than `support_points`, or these cannot be used.
         """
-        given = reset_options(options)
-        support = None if given is None else self._simulator.support(given, self.num_envs)
+        settings = reset_options(options)
+        support = None if settings is None else self._simulator.support(settings, self.num_envs)
         if seed is not None or not self.streams:
             self.seed_from(seed)
         if self._support is None:

@@ -47,11 +47,11 @@ def check(
     if chosen and len(items) > 1:
         raise typer.BadParameter("--set is for one thing: name it, qrlsuite check KIND:NAME --set NAME=VALUE")
     if json_output:
-        found = [(item, _findings(item, chosen)) for item in items]
-        typer.echo(json.dumps([_plain(item, finding) for item, findings in found for finding in findings]))
+        results = [(item, _findings(item, chosen)) for item in items]
+        typer.echo(json.dumps([_plain(item, finding) for item, findings in results for finding in findings]))
     else:
-        found = _show(items, chosen)
-    if not all(finding.ok for _, findings in found for finding in findings):
+        results = _show(items, chosen)
+    if not all(finding.ok for _, findings in results for finding in findings):
         raise typer.Exit(1)
 
 
@@ -77,7 +77,7 @@ def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
 def _show(items: list[CheckTarget], settings: dict[str, Any]) -> list[tuple[CheckTarget, list[Finding]]]:
     """Check things one after another, with what is going on in the last line of a terminal."""
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    found = []
+    results = []
     with console.status("") as status:
 
         def announce(item: CheckTarget) -> Callable[[str], None]:
@@ -86,17 +86,17 @@ def _show(items: list[CheckTarget], settings: dict[str, Any]) -> list[tuple[Chec
         for item in items:
             with watching(announce(item)):
                 findings = _findings(item, settings)
-            found.append((item, findings))
+            results.append((item, findings))
             console.print(printable(item.title), style="bold")
             for finding in findings:
                 _print(console, finding)
-    broken = sum(not finding.ok for _, findings in found for finding in findings)
-    total = sum(len(findings) for _, findings in found)
+    broken = sum(not finding.ok for _, findings in results for finding in findings)
+    total = sum(len(findings) for _, findings in results)
     if broken:
         console.print(f"{broken} of {total} rules broken", style="bold red")
     else:
         console.print(f"all {total} rules hold", style="bold green")
-    return found
+    return results
 
 
 def _print(console: Any, finding: Finding) -> None:

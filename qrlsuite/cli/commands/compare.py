@@ -32,9 +32,11 @@ def compare(
 
     Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
-    found = api.compare(first, second, task=task, runs=runs, published=published, rule=rule)
+    comparison = api.compare(first, second, task=task, runs=runs, published=published, rule=rule)
     if json_output:
-        typer.echo(json.dumps(found.as_dict()))
+        typer.echo(json.dumps(comparison.as_dict()))
         return
-    Console().print(tables.comparison_table(found))
-    typer.echo("\n".join([found.legend, f"{found.headline}:", found.sentence, *found.remarks]))
+    Console().print(tables.comparison_table(comparison))
+    typer.echo(
+        "\n".join([comparison.legend, f"{comparison.headline}:", comparison.sentence, *comparison.remarks])
+    )

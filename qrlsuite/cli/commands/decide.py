@@ -159,7 +159,7 @@ def run(
     Example: qrlsuite decide run width.toml --workers 8
     """
     study = _study(path, runs)
-    where = execution_of(engine, workers, partition, time, engine_options, device)
+    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device)
     study.begin()
     console = Console(stderr=True, quiet=json_output, highlight=False)
     submitted: list[str] = []
@@ -167,7 +167,7 @@ def run(
         decision = study.look()
         while wanted := study.wanted(decision):
             for name, seeds in wanted.items():
-                outcome = _train(study, study.entries[name], seeds, where, json_output)
+                outcome = _train(study, study.entries[name], seeds, chosen_execution, json_output)
                 submitted += [outcome.submitted] if outcome.submitted is not None else []
             decision = study.look()
             if study.missing(decision) and study.wanted(decision) == wanted:
@@ -187,13 +187,13 @@ def run(
 
 
 def _train(
-    study: DecisionStudy, entry: Entry, seeds: Sequence[int], where: Execution, quiet: bool
+    study: DecisionStudy, entry: Entry, seeds: Sequence[int], chosen_execution: Execution, quiet: bool
 ) -> EngineOutcome:
     """Train what is missing of an entry's seeds."""
-    work = execution.plan(study.folder, entry, where, seeds, study.file.epochs)
+    work = execution.plan(study.folder, entry, chosen_execution, seeds, study.file.epochs)
     if not work.groups and not work.busy:
         return EngineOutcome()
-    return execution.train(work, where, RunDisplay(work, where.workers, quiet=quiet))
+    return execution.train(work, chosen_execution, RunDisplay(work, chosen_execution.workers, quiet=quiet))
 
 
 @app.command()

@@ -29,28 +29,28 @@ def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> 
     Example: qrlsuite doctor > report.txt
     """
     with Console(stderr=True).status("") as status:
-        found = diagnose(runs, lambda doing: status.update(Text(printable(doing))))
+        diagnosis = diagnose(runs, lambda doing: status.update(Text(printable(doing))))
     if json_output:
-        typer.echo(json.dumps({"ok": not found.broken, **dataclasses.asdict(found)}))
+        typer.echo(json.dumps({"ok": not diagnosis.broken, **dataclasses.asdict(diagnosis)}))
     else:
-        _print(found)
-    if found.broken:
+        _print(diagnosis)
+    if diagnosis.broken:
         raise typer.Exit(1)
 
 
-def _print(found: Diagnosis) -> None:
+def _print(diagnosis: Diagnosis) -> None:
 
     home = str(Path.home())
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    for name, text in rows(found.facts):
-        shown = printable(text.replace(home, "~") if len(home) > 1 else text)
-        lines = textwrap.wrap(shown, WIDTH - 14, break_long_words=False, break_on_hyphens=False) or ["-"]
+    for name, text in rows(diagnosis.facts):
+        full_line = printable(text.replace(home, "~") if len(home) > 1 else text)
+        lines = textwrap.wrap(full_line, WIDTH - 14, break_long_words=False, break_on_hyphens=False) or ["-"]
         for number, line in enumerate(lines):
             console.print(f"{'' if number else printable(name):<13} {line}")
     console.print()
-    for problem in found.broken:
+    for problem in diagnosis.broken:
         console.print(f"broken: {printable(problem)}", style="bold red")
-    for remark in found.remarks:
+    for remark in diagnosis.remarks:
         console.print(f"note: {printable(remark)}", style="yellow")
-    if not found.broken:
+    if not diagnosis.broken:
         console.print("everything that is needed works", style="bold green")

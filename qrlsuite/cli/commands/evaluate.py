@@ -53,14 +53,14 @@ def evaluate(
     format_ = "" if out is None else out.suffix.removeprefix(".").lower()
     if out is not None and format_ not in ("png", "pdf", "svg"):
         raise OptionError(f"--out {out}: the file's ending must be .png, .pdf or .svg")
-    found = evaluation.evaluate(
+    evaluations = evaluation.evaluate(
         runs, entries, task=task, best=best, episodes=episodes, seed=seed, progress=not json_output
     )
     if out is not None:
-        write_atomically(out, pictures.encode(found.figure(), format_))
+        write_atomically(out, pictures.encode(evaluations.figure(), format_))
     if json_output:
-        typer.echo(json.dumps({**found.as_dict(), "picture": None if out is None else str(out)}))
+        typer.echo(json.dumps({**evaluations.as_dict(), "picture": None if out is None else str(out)}))
         return
-    table_console().print(found)
+    table_console().print(evaluations)
     if out is not None:
         typer.echo(f"wrote {out}")

@@ -64,15 +64,15 @@ def export(
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
     lookup.check_tasks(runs, task)
     if everything:
-        found, refused = collect.collect(runs, task)
+        selected, refused = collect.collect(runs, task)
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
     else:
-        found = [
+        selected = [
             collect.find(runs, name, tasks=[task] if task else []) for name in dict.fromkeys(entries or [])
         ]
     written = []
-    for entry in found:
+    for entry in selected:
         try:
             folder = write(entry, out, force)
         except QrlSuiteError as error:
@@ -111,16 +111,16 @@ def _rliable(
 ) -> None:
     """Write rliable's arrays."""
     if file is None or across is None:
-        given, missing = (
+        option, missing = (
             ("--rliable", "--across TASK TASK") if across is None else ("--across", "--rliable FILE")
         )
-        raise OptionError(f"{given}: add {missing}")
+        raise OptionError(f"{option}: add {missing}")
     if task is not None:
         raise OptionError(f"--task {task}: --across names the tasks; leave it out")
     if file.suffix != ".npz":
         raise OptionError(f"--rliable {file}: the file's ending must be .npz")
-    found, refused = several.collected(runs, across, names)
-    shares = several.shares(found, across, refused=refused)
+    entries, refused = several.collected(runs, across, names)
+    shares = several.shares(entries, across, refused=refused)
     arrays: dict[str, Any] = shares.rliable()
     content = io.BytesIO()
     np.savez(content, **arrays)

@@ -45,15 +45,15 @@ def plugin(
 
     Example: qrlsuite new plugin acme-ring --kind ansatz
     """
-    made = scaffold.package(name, kind)
-    folder = scaffold.write(made, out)
+    files = scaffold.package(name, kind)
+    folder = scaffold.write(files, out)
     if json_output:
-        content = {"folder": str(folder), "files": sorted(made.files), "next": list(made.commands)}
+        content = {"folder": str(folder), "files": sorted(files.files), "next": list(files.commands)}
         typer.echo(json.dumps(content))
         return
     typer.echo(f"wrote {folder}:")
-    for path in made.files:
+    for path in files.files:
         typer.echo(f"  {path}")
     typer.echo("next:")
-    for line in (f"cd {shlex.quote(str(folder))}", "pip install -e '.[test]'", *made.commands):
+    for line in (f"cd {shlex.quote(str(folder))}", "pip install -e '.[test]'", *files.commands):
         typer.echo(f"  {line}")

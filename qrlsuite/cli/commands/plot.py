@@ -77,7 +77,7 @@ def plot(
     format_ = output.suffix.removeprefix(".").lower() if output is not None else "png"
     if format_ not in pictures.FORMATS:
         raise OptionError(f"--out {output}: the file's ending must be .png, .pdf or .svg")
-    own, world = _split(settings or [])
+    picture_settings, environment_settings = _split(settings or [])
     drawn = compose(
         kind,
         task or [],
@@ -86,8 +86,8 @@ def plot(
         min_seeds=min_seeds,
         runs=runs,
         published=published,
-        settings=own,
-        environment=world,
+        settings=picture_settings,
+        environment=environment_settings,
     )
     for line in drawn.left_out:
         typer.echo(f"left out: {line}", err=True)
@@ -101,18 +101,18 @@ def plot(
         typer.echo(f"wrote {path}")
 
 
-def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _split(settings: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Divide `--set` words into the picture's settings and the environment's options."""
-    own: dict[str, Any] = {}
-    world: dict[str, Any] = {}
-    for setting in map(parse_setting, words):
+    picture: dict[str, Any] = {}
+    environment: dict[str, Any] = {}
+    for setting in map(parse_setting, settings):
         if setting.side not in (None, "environment", "picture"):
             raise OptionError(
                 f"--set {setting.side}.{setting.name}: write {setting.name}=... for the picture or "
                 f"environment.{setting.name}=... for the task's environment"
             )
-        (world if setting.side == "environment" else own)[setting.name] = setting.value
-    return own, world
+        (environment if setting.side == "environment" else picture)[setting.name] = setting.value
+    return picture, environment
 
 
 def _print_settings(kind: str, rows: list[dict[str, Any]], json_output: bool) -> None:

@@ -87,22 +87,22 @@ def run(
 
     Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
     """
-    words = [options.parse_setting(word) for word in settings or []]
+    chosen = [options.parse_setting(word) for word in settings or []]
     if quick:
-        words = _quick_settings(model, words)
-    entry = entries.resolve(task, model, algorithm, words, preset)
+        chosen = _quick_settings(model, chosen)
+    entry = entries.resolve(task, model, algorithm, chosen, preset)
     if track:
         trackers.ask(track)
-    wanted = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
+    seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
     last = epochs or (QUICK_EPOCHS if quick else None)
-    where = execution_of(engine, workers, partition, time, engine_options, device)
-    execution.check_minutes(minutes, where)
-    work = execution.plan(runs, entry, where, wanted, last)
-    display = RunDisplay(work, where.workers, quiet=json_output)
+    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device)
+    execution.check_minutes(minutes, chosen_execution)
+    work = execution.plan(runs, entry, chosen_execution, seed_numbers, last)
+    display = RunDisplay(work, chosen_execution.workers, quiet=json_output)
     if not json_output:
-        display.expected = execution.expected(work, where)
+        display.expected = execution.expected(work, chosen_execution)
     try:
-        outcome = execution.train(work, where, display, minutes, confirmed=yes)
+        outcome = execution.train(work, chosen_execution, display, minutes, confirmed=yes)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     if outcome.submitted is not None:
@@ -115,9 +115,9 @@ def run(
         display.finished(summary)
 
 
-def _quick_settings(model: str, words: list[Any]) -> list[Any]:
+def _quick_settings(model: str, chosen: list[Any]) -> list[Any]:
     """Reduce the qubits of a circuit, unless they were set by hand."""
     names = options.field_names(specs.resolve(registry.model(model).options))
-    if "qubits" in names and not any(word.name == "qubits" for word in words):
-        return [options.Setting("model", "qubits", QUICK_QUBITS), *words]
-    return words
+    if "qubits" in names and not any(word.name == "qubits" for word in chosen):
+        return [options.Setting("model", "qubits", QUICK_QUBITS), *chosen]
+    return chosen

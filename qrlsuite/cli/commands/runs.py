@@ -66,21 +66,21 @@ def runs(
 
 def _list(folder: Path, task: str | None, json_output: bool) -> None:
 
-    found = survey(folder, task)
+    summaries = survey(folder, task)
     if json_output:
-        rows = [{**dataclasses.asdict(entry), "folder": str(entry.folder)} for entry in found]
+        rows = [{**dataclasses.asdict(entry), "folder": str(entry.folder)} for entry in summaries]
         typer.echo(json.dumps(rows))
         return
-    for entry in found:
+    for entry in summaries:
         for problem in entry.problems:
             typer.echo(f"damaged: {problem}", err=True)
-    if not found:
+    if not summaries:
         typer.echo(f"{folder} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
         return
     now = time.time()
     table = [
         ("task", "entry", "label", "seeds", "epochs", "size", "last activity"),
-        *(_row(e, now) for e in found),
+        *(_row(e, now) for e in summaries),
     ]
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
     for row in table:
@@ -132,22 +132,22 @@ def _delete(folder: Path, task: str | None, names: list[str], yes: bool, json_ou
     if not names:
         raise OptionError("name the entries to delete: qrlsuite runs lists them")
     stored = lookup.stored(entries(folder, task))
-    where = f"{folder}, task {task}" if task else folder
-    chosen = list(dict.fromkeys(lookup.choose(stored, name, where).store for name in names))
-    found = [look(store) for store in chosen]
-    for entry in found:
+    searched = f"{folder}, task {task}" if task else folder
+    chosen = list(dict.fromkeys(lookup.choose(stored, name, searched).store for name in names))
+    summaries = [look(store) for store in chosen]
+    for entry in summaries:
         count = sum(entry.seeds.values())
-        what = f"{entry.task}/{entry.name} ({entry.label}, {count} seed{'s' * (count != 1)})"
-        typer.echo(f"{size_text(entry.size):>7}  {printable(what)}", err=json_output)
+        description = f"{entry.task}/{entry.name} ({entry.label}, {count} seed{'s' * (count != 1)})"
+        typer.echo(f"{size_text(entry.size):>7}  {printable(description)}", err=json_output)
     if not yes and not typer.confirm("Delete this for good?", err=json_output):
         typer.echo("nothing was deleted", err=json_output)
         raise typer.Exit(1)
     queues, freed = Queues(), 0
-    for store, entry in zip(chosen, found):
+    for store, entry in zip(chosen, summaries):
         queued = queues.waiting(store) if entry.seeds.get("submitted") else None
         freed += delete(folder, store, queued)
     if json_output:
-        rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in found]
+        rows = [{"task": entry.task, "entry": entry.name, "size": entry.size} for entry in summaries]
         typer.echo(json.dumps({"deleted": rows, "freed": freed}))
     else:
         typer.echo(f"deleted, {size_text(freed)} freed")

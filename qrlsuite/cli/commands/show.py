@@ -56,45 +56,45 @@ def show(
     if manual is not None:
         typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
         return
-    kind, wanted = _kind(name, second)
+    kind, target = _kind(name, second)
     known = registry.load()
-    found = [k for k in registry.KINDS if (kind in (None, k)) and wanted in known.entries[k]]
-    if not found and kind is None:
-        folder = _entry_folder(runs, wanted)
+    kinds = [k for k in registry.KINDS if (kind in (None, k)) and target in known.entries[k]]
+    if not kinds and kind is None:
+        folder = _entry_folder(runs, target)
         if folder is not None:
             content = outline(EntryStore(folder))
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
-    if not found:
+    if not kinds:
         names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
-        raise UnknownNameError(f"nothing called '{wanted}'{nearest(wanted, names)}")
-    if len(found) > 1:
-        singulars = " or ".join(f"`show {registry.SINGULAR[k]} {wanted}`" for k in found)
-        raise UnknownNameError(f"'{wanted}' is several things; write {singulars}")
-    content = describe(found[0], wanted)
-    if found[0] == "significance_tests":
-        content["promises"] = rules.load(wanted).promise
-    if found[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
+        raise UnknownNameError(f"nothing called '{target}'{nearest(target, names)}")
+    if len(kinds) > 1:
+        singulars = " or ".join(f"`show {registry.SINGULAR[k]} {target}`" for k in kinds)
+        raise UnknownNameError(f"'{target}' is several things; write {singulars}")
+    content = describe(kinds[0], target)
+    if kinds[0] == "significance_tests":
+        content["promises"] = rules.load(target).promise
+    if kinds[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
         raise OptionError(
-            f"{registry.SINGULAR[found[0]]} '{wanted}': --qubits, --layers, --set and --figure draw an ansatz; options "
+            f"{registry.SINGULAR[kinds[0]]} '{target}': --qubits, --layers, --set and --figure draw an ansatz; options "
             "are changed where they are used, as in `qrlsuite run --set NAME=VALUE`"
         )
-    if found[0] == "ansatzes":
+    if kinds[0] == "ansatzes":
         size = (4 if qubits is None else qubits, 2 if layers is None else layers)
-        content["drawing"] = _draw(wanted, *size, settings or [], figure, content)
+        content["drawing"] = _draw(target, *size, settings or [], figure, content)
     typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
 
 
 def _hook(first: str, second: str | None) -> dict[str, str] | None:
     """Return a hook and its manual: `show hook register_models`, or `show register_models`."""
-    found = {row["name"]: row for row in hooks()}
+    by_name = {row["name"]: row for row in hooks()}
     if second is None:
-        return found.get(first)
+        return by_name.get(first)
     if first not in ("hook", "hooks"):
         return None
-    if second not in found:
-        raise UnknownNameError(f"unknown hook '{second}'{nearest(second, found)}")
-    return found[second]
+    if second not in by_name:
+        raise UnknownNameError(f"unknown hook '{second}'{nearest(second, by_name)}")
+    return by_name[second]
 
 
 def _kind(first: str, second: str | None) -> tuple[str | None, str]:
@@ -126,13 +126,13 @@ def _entry_folder(runs: Path, name: str) -> Path | None:
 
 
 def _draw(
-    name: str, qubits: int, layers: int, words: list[str], figure: Path | None, content: dict[str, Any]
+    name: str, qubits: int, layers: int, settings: list[str], figure: Path | None, content: dict[str, Any]
 ) -> str:
     """Draw an ansatz as text (and to a file), and add its resources to the content."""
     format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
     if figure is not None and format_ not in pictures.FORMATS:
         raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
-    chosen = {setting.name: setting.value for setting in map(parse_setting, words)}
+    chosen = {setting.name: setting.value for setting in map(parse_setting, settings)}
     drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
     content["resources"] = dataclasses.asdict(drawing.resources(drawn))
     if figure is not None:

@@ -27,13 +27,13 @@ def status(
 
     Example: qrlsuite status --task beam6g
     """
-    shown = [found.as_dict() for found in survey(runs, task)]
+    rows = [store_status.as_dict() for store_status in survey(runs, task)]
     if json_output:
-        typer.echo(json.dumps(shown))
+        typer.echo(json.dumps(rows))
         return
-    for row in shown:
+    for row in rows:
         _print(row)
-    if not shown:
+    if not rows:
         typer.echo(f"{runs} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
 
 
@@ -48,15 +48,15 @@ def _print(row: dict[str, Any]) -> None:
             f"  what was submitted may have left the queue, which was not asked: {printable(row['queue_problem'])}"
         )
     for group in row["groups"]:
-        words = [f"  {group['state']:<9}"]
-        words += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
-        words += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
-        words += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
+        parts = [f"  {group['state']:<9}"]
+        parts += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
+        parts += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
+        parts += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
         if isinstance(group["median_score"], int | float):
-            words.append(f"median score {group['median_score']:.3f}")
+            parts.append(f"median score {group['median_score']:.3f}")
         if group["seconds_left"] is not None and group["state"] == "running":
-            words.append(f"{duration(group['seconds_left'])} left")
-        words += [group["where"]] if group["where"] != "nobody" else []
-        words += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
-        words += [str(group["error"])] if group["error"] else []
-        typer.echo(printable("  ".join(words)))
+            parts.append(f"{duration(group['seconds_left'])} left")
+        parts += [group["where"]] if group["where"] != "nobody" else []
+        parts += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
+        parts += [str(group["error"])] if group["error"] else []
+        typer.echo(printable("  ".join(parts)))

@@ -118,8 +118,8 @@ def show(
     """
     execution = execution_of(engine, workers)
     study, members = _members(name, settings, models, only)
-    wanted = None if seeds is None else parse_seeds(seeds)
-    items = runner.survey(members, runs, execution, speed.known(runs), wanted, epochs)
+    seed_numbers = None if seeds is None else parse_seeds(seeds)
+    items = runner.survey(members, runs, execution, speed.known(runs), seed_numbers, epochs)
     overview = runner.Overview(study, items, execution.workers)
     if json_output:
         typer.echo(json.dumps(overview.as_dict()))
@@ -165,9 +165,9 @@ def run(
     execution = execution_of(engine, workers, partition, time, engine_options, device)
     limit = seconds(budget) if budget is not None else None
     study, members = _members(name, settings, models, only)
-    wanted = None if seeds is None else parse_seeds(seeds)
+    seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
-    items = runner.survey(members, runs, execution, speeds, wanted, epochs)
+    items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
     if limit is not None:
         runner.check_budget(items, limit, execution.workers)
     if dry_run:
@@ -182,7 +182,7 @@ def run(
         raise typer.Exit(130) from None
     drawn = studies.write(study, members, runs, format_)
     if json_output:
-        after = runner.survey(members, runs, execution, speed.known(runs), wanted, epochs)
+        after = runner.survey(members, runs, execution, speed.known(runs), seed_numbers, epochs)
         content = runner.Overview(study, after, execution.workers).as_dict()
         content |= {"trained": session.trained, "submitted": session.submitted}
         typer.echo(json.dumps(content | {"pictures": [each.as_dict() for each in drawn]}))
@@ -191,11 +191,11 @@ def run(
     for line in session.submitted:
         typer.echo(line)
     if left_over and not session.submitted:
-        words = ", ".join(
+        unfinished = ", ".join(
             f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})" for item in left_over[:4]
         )
         more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
-        typer.echo(f"the budget is used up; left: {words}{more}. The same command continues.")
+        typer.echo(f"the budget is used up; left: {unfinished}{more}. The same command continues.")
 
 
 @app.command()
@@ -236,7 +236,7 @@ def _members(
     name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
 ) -> tuple[Study, list[Member]]:
     """Load a study and resolve its entries."""
-    given = [options.parse_setting(word) for word in settings or []]
+    parsed = [options.parse_setting(word) for word in settings or []]
     mapped = {}
     for word in models or []:
         old, equals, new = (part.strip() for part in word.partition("="))
@@ -245,7 +245,7 @@ def _members(
         mapped[old] = new
     loaded = load(name)
     studies.check(loaded)
-    return loaded, runner.select(loaded, given, mapped, only or [])
+    return loaded, runner.select(loaded, parsed, mapped, only or [])
 
 
 def _dry_run(study: Study, steps: Sequence[dict[str, Any]], json_output: bool) -> None:
@@ -281,9 +281,9 @@ def _say(pictures: Sequence[Drawn]) -> None:
         lines: dict[str, list[str]] = {}
         for task, label, count in sorted(drawn.seeds, key=lambda point: -point[2]):
             begun = epochs.get((task, label))
-            words = (
+            state = (
                 counted(count, "seed") if count else f"left out, at epoch {begun}" if begun else "nothing yet"
             )
-            lines.setdefault(words, []).append(names[task, label])
-        for words, labels in lines.items():
-            typer.echo(f"  {words}: {', '.join(labels)}")
+            lines.setdefault(state, []).append(names[task, label])
+        for state, labels in lines.items():
+            typer.echo(f"  {state}: {', '.join(labels)}")

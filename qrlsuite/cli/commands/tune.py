@@ -141,16 +141,16 @@ def tune(
     if out is not None and (equal_budget is not None or out.suffix != ".toml"):
         raise OptionError(f"--out {out}: one file ending in .toml, for one model")
     limit = None if budget is None else seconds(budget)
-    words = tuple(options.parse_setting(word) for word in settings or [])
+    fixed = tuple(options.parse_setting(word) for word in settings or [])
     requests = []
     for name in equal_budget or [str(model)]:
-        first, *own = name.split()
+        first, *entry_settings = name.split()
         requests.append(
             search.Request(
                 task=task,
                 model=first,
                 algorithm=algorithm,
-                settings=(*(options.parse_setting(word) for word in own), *words),
+                settings=(*(options.parse_setting(word) for word in entry_settings), *fixed),
                 grid=None if grid is None else space.load(grid),
                 varied=tuple(space.parse_varied(word) for word in vary or []),
                 sampler=sampler.value,
@@ -220,8 +220,8 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
         if each.written is None:
             continue
         base = each.base
-        words = ["run", "--task", each.request.task, "--model", base.model.name]
+        arguments = ["run", "--task", each.request.task, "--model", base.model.name]
         if base.algorithm.name != base.task.file.default_algorithm:
-            words += ["--algorithm", base.algorithm.name]
-        line = command(*words, "--preset", str(each.written), runs=runs)
+            arguments += ["--algorithm", base.algorithm.name]
+        line = command(*arguments, "--preset", str(each.written), runs=runs)
         wide.print(f"next: {line}", markup=False, soft_wrap=True)

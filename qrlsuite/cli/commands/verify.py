@@ -54,13 +54,13 @@ def verify(
         transient=True,
     ) as bar:
         whole = bar.add_task("", total=len(folders))
-        for place, folder in enumerate(folders):
+        for index, folder in enumerate(folders):
 
-            def report(progress: RunProgress, place: int = place) -> None:
-                bar.update(whole, completed=place + progress.epoch / max(1, progress.epochs))
+            def report(progress: RunProgress, index: int = index) -> None:
+                bar.update(whole, completed=index + progress.epoch / max(1, progress.epochs))
 
-            bar.update(whole, description=Text(folder.name).plain, completed=place)
-            generator = np.random.default_rng([number, place])
+            bar.update(whole, description=Text(folder.name).plain, completed=index)
+            generator = np.random.default_rng([number, index])
             verdicts.append(checks.verify(folder, rerun, generator, report))
             if not json_output:
                 last = verdicts[-1]
