@@ -1,4 +1,4 @@
-"""The commands of the README's section Use run one after the other in an empty folder, on budgets of seconds."""
+"""The commands under "Every command once" run one after the other in an empty folder, on budgets of seconds."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ SMALL = {
 CIRCUIT = ("--set", "qubits=2", "--set", "layers=1")
 
 
-def commands() -> list[list[str]]:
-    text = (ROOT / "README.md").read_text().partition("\n## Use\n")[2].partition("\n## ")[0]
+def commands(page: str = "docs/start.md", section: str = "Every command once") -> list[list[str]]:
+    text = (ROOT / page).read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     (block,) = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
     return [shlex.split(line, comments=True)[1:] for line in block.splitlines()]
 
@@ -55,6 +55,12 @@ def test_the_examples_run_in_their_order(tmp_path: Path, monkeypatch: pytest.Mon
     for written in ("board.html", "curves.pdf"):
         assert (tmp_path / written).stat().st_size > 1000
     assert len(list((tmp_path / "entries" / "beam6g").iterdir())) == 1
+
+
+def test_the_readmes_first_comparison_runs_as_printed(tmp_path: Path) -> None:
+    for words in commands("README.md", "A first comparison"):
+        done = qrlsuite(*words, *SMALL.get(words[0], ()), cwd=tmp_path)
+        assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}{done.stderr}"
 
 
 def test_the_search_starts_as_printed(tmp_path: Path) -> None:
