@@ -1,4 +1,4 @@
-"""The suite from Python: what the commands do, as functions that return what they found.
+"""The suite from Python: the functions behind the commands; each returns its results as an object.
 
     from qrlsuite import api
 
@@ -9,8 +9,8 @@
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
 
-What they return shows itself: as a table in a notebook, and printed by rich in a terminal. Their errors are those of
-`qrlsuite.errors`; where a message names an option of a command, such as `--task`, the argument has the same name.
+Results print as tables, in a notebook and in a terminal (with rich). Errors are those of `qrlsuite.errors`; where a
+message names an option of a command, such as `--task`, the function's argument has the same name.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def compare(
     published: bool = False,
     rule: str | None = None,
 ) -> EntryComparison:
-    """Say whether the first of two entries outperforms the second, cell by cell of the task's ranking grid.
+    """Compare two entries in every cell of the task's ranking grid.
 
     Both are compared at equal numbers of seeds and equal horizons.
 
@@ -289,7 +289,7 @@ def train(
     """Train the missing seeds of an entry: a model and an algorithm on a task.
 
     Interrupt it at any time: every finished epoch is saved, and the same call continues, to the same bytes as if it
-    had not been interrupted. More seeds or epochs add to what is there; a call for what is there trains nothing.
+    had not been interrupted. More seeds or epochs extend earlier results; a repeated call trains nothing.
 
     Parameters
     ----------
@@ -444,7 +444,7 @@ def tune(
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> Search:
-    """Search settings with a small sample complexity, on seeds that entries are never judged by.
+    """Search for settings with a small sample complexity, on seeds reserved for tuning.
 
     Interrupt it at any time: the same call continues, and ends with the same preset as if it had never stopped.
 
@@ -530,12 +530,12 @@ def tune(
 
 @dataclass(frozen=True)
 class StudyRun(Shown):
-    """What is there of a study after it was run.
+    """The state of a study after `run_study`.
 
     Attributes
     ----------
     overview:
-        Every entry with what is there and what is missing.
+        Every entry with its finished and its missing seeds.
     pictures:
         Every picture with its `figure` and file (`path`), or the `problem` why there is none yet.
     trained:
@@ -583,7 +583,7 @@ def run_study(
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> StudyRun:
-    """Train what is missing of a study, the cheapest entry first, and draw its pictures from what is there.
+    """Train a study's missing seeds, the cheapest entry first, and draw its pictures.
 
     Entries are those that `train` trains, in the same folders: nothing is trained twice.
 

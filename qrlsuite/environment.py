@@ -1,4 +1,4 @@
-"""The environments' side of the core: vector environments whose lanes have random streams of their own.
+"""Lane environments: vector environments in which every lane has its own random stream.
 
 Lanes are seed-major: with S seeds and E environments each, lane = s * E + e.
 """

@@ -11,11 +11,11 @@ from collections.abc import Iterable, Sequence
 
 
 class QrlSuiteError(Exception):
-    """Something the user gave cannot be used; the message says what, where and what to type instead."""
+    """Invalid input; the message says what is wrong, where, and what to type instead."""
 
 
 class UnknownNameError(QrlSuiteError):
-    """A task, model, algorithm, ansatz, option or entry of that name does not exist."""
+    """No task, model, algorithm, ansatz, option or entry has that name."""
 
 
 class TaskError(QrlSuiteError):
@@ -23,11 +23,11 @@ class TaskError(QrlSuiteError):
 
 
 class OptionError(QrlSuiteError):
-    """An option has a value that it cannot have."""
+    """An option has an invalid value."""
 
 
 class CircuitError(OptionError):
-    """A circuit was described wrongly: a gate, wire, angle or parameter that there cannot be."""
+    """A circuit has an invalid gate, wire, angle or parameter."""
 
 
 class PluginError(QrlSuiteError):

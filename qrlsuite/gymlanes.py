@@ -1,4 +1,4 @@
-"""Any Gymnasium environment with discrete actions, in lanes: the form of environments without one of their own.
+"""Runs any Gymnasium environment with discrete actions in lanes, for environments that have no vector form.
 
 The state of an arbitrary environment cannot be copied. But an episode is fixed by the seed of its reset and by
 its actions, so these are what a checkpoint holds, and resuming plays them again.

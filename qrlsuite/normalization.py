@@ -1,4 +1,4 @@
-"""Normalizing observations: named ways that are stored with the environment's options.
+"""Normalization of observations; the choice is an option of the environment.
 
 Three are fixed before training, and the environment applies them. Running statistics are gathered while a seed trains,
 and training and validation need the same: they belong to the agent, which applies them itself

@@ -1,6 +1,6 @@
-"""Options: pydantic dataclasses, resolved from defaults, presets and `--set` words.
+"""Options of models, algorithms and environments: pydantic dataclasses, set by defaults, presets and `--set`.
 
-Every error names where the value came from, what is wrong with it, and what to type instead.
+Every error says where the value came from, what is wrong with it, and what to type instead.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
 
 @dataclass(frozen=True)
 class Setting:
-    """One word of `--set`: `side.name=value`, or `name=value` where the side is to be found.
+    """One `--set side.name=value`; without a side, the one that has such an option is found.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """Populations: S agents of one architecture as one module (S, B, in) -> (S, B, out).
 
 Every parameter has a leading axis S and keeps the name it has in one agent's module, so that slice s of a
-population's state is the state of agent s alone. The loss of a population is the sum of its agents' own mean
-losses: gradients do not mix, and one elementwise optimizer serves all.
+population's state is the state that agent s has when trained alone. The loss of a population is the sum of its
+agents' mean losses: gradients do not mix, and one elementwise optimizer serves all.
 """
 
 from __future__ import annotations

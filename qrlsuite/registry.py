@@ -1,4 +1,4 @@
-"""Discovery and look-up of everything that plugins register.
+"""Finds plugins, and looks up what they register.
 
 `load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not
 fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
@@ -63,7 +63,7 @@ class Registered:
 
 @dataclass
 class Plugin:
-    """An entry point, and what became of it.
+    """An entry point, and what loading it gave: specs or a problem.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Plugin:
 
 @dataclass(eq=False)
 class Registry:
-    """All registered specs by kind and name, every plugin, and what went wrong on the way."""
+    """All registered specs by kind and name, all plugins, and the problems met while loading them."""
 
     manager: pluggy.PluginManager
     entries: dict[str, dict[str, Registered]] = field(default_factory=lambda: {kind: {} for kind in KINDS})

@@ -1,4 +1,4 @@
-"""Named random streams, one family per seed, so that each agent is the agent it would have been alone.
+"""Named random streams per seed: training seeds together gives each the same result as training it alone.
 
 A stream's key is the first 128 bits of SHA-256 over (task hash, seed, stream name, index). Algorithm and model
 are deliberately not in the key: all entries of a task face the same validation episodes.

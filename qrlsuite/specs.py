@@ -1,4 +1,4 @@
-"""What a plugin hands over: a name, one line of summary, and *references* to code.
+"""Specs: what a plugin registers. A spec has a name, a one-line summary and *references* to code.
 
 A reference is a string `"package.module:Name"`. It is resolved only by the command that needs it, so that
 registering imports neither torch nor PennyLane nor Qiskit, and `qrlsuite list` answers at once.

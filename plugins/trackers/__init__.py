@@ -1,4 +1,4 @@
-"""The trackers of the suite itself; they enter by the same door as anyone's."""
+"""The built-in trackers, registered as a plugin's are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`--across TASK TASK ...`: an option that takes words up to the next option."""
+"""The option `--across TASK TASK ...`, which takes all words up to the next option."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that plugins bring: one that fails, or takes a name that is taken, is left out and reported."""
+"""Adds the commands of plugins; one that fails, or whose name is taken, is skipped and reported."""
 
 from __future__ import annotations
 

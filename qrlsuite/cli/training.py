@@ -1,4 +1,4 @@
-"""What the commands that train share: the options of engines, and time budgets as people write them."""
+"""Options of every command that trains: engines and time budgets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WorkersOption = Annotated[
     typer.Option("--workers", min=1, help="Processes, or array tasks; default: one per core, or 10 tasks."),
 ]
 EngineOption = Annotated[
-    str, typer.Option("--engine", help="Where the work is done (see `qrlsuite list engines`).")
+    str, typer.Option("--engine", help="The engine that runs the training (see `qrlsuite list engines`).")
 ]
 PartitionOption = Annotated[
     str | None, typer.Option("--partition", help="For --engine slurm: the partition.")
@@ -35,7 +35,7 @@ MinutesOption = Annotated[
     typer.Option(
         "--minutes",
         metavar="MINUTES",
-        help="Stop after this time with what is there, saved as by Ctrl-C; the same command continues.",
+        help="Stop after this many minutes and save, as Ctrl-C does; the same command continues.",
     ),
 ]
 TrackOption = Annotated[

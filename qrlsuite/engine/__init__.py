@@ -1,1 +1,1 @@
-"""Where groups of seeds run. Engines only decide that; the results folder is the one source of truth."""
+"""Engines: they run groups of seeds, here or on a cluster. All results are in the results folder."""

@@ -1,4 +1,4 @@
-"""What an engine is: something that takes groups of seeds and sees that `python -m qrlsuite.engine.worker` runs.
+"""The interface of engines: an engine runs `python -m qrlsuite.engine.worker` for every group of seeds.
 
 An engine decides only *where* groups run. Whatever it starts finds everything it needs in the entry's folder and
 leaves everything there, and may be started twice for the same group: the second finds the seeds claimed, or done.
@@ -26,7 +26,7 @@ Show = Callable[[Snapshot], None]
 
 @dataclass(frozen=True)
 class Work:
-    """What an engine is given: groups of one entry's seeds, to be trained to `epochs`, `workers` at a time."""
+    """Input of an engine: groups of one entry's seeds, to be trained to `epochs`, `workers` at a time."""
 
     store: EntryStore
     groups: Sequence[SeedGroup]
@@ -119,7 +119,7 @@ def create(name: str, option_values: Mapping[str, Any]) -> Engine:
 
 
 class Queues:
-    """The queues that seeds were handed to; one that does not answer is not asked again."""
+    """Queues of submitting engines; one that fails to answer is not asked again."""
 
     def __init__(self) -> None:
         self._engines: dict[str, Engine] = {}

@@ -1,4 +1,4 @@
-"""The engines of the suite itself; they enter by the same door as anyone's."""
+"""The built-in engines, registered as a plugin's are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The progress of training as it is shown: what is trained, how far it is, what is left, what it will take."""
+"""Shows the progress of training, and estimates the time that is left."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
 
 
 class _Clock:
-    """What one group's progress said, and when: how long its epochs, and the rounds of its first one, take."""
+    """Times one group's epochs, and the rounds of its first epoch, from its progress file."""
 
     def __init__(self) -> None:
         self.epoch, self.epoch_began = -1, 0.0
@@ -77,7 +77,7 @@ def _short(seconds: float) -> str:
 
 
 class CostEstimate:
-    """What is left, measured: from the rounds of the first epoch at first, then from whole epochs.
+    """Estimates the remaining time: from rounds during the first epoch, then from whole epochs.
 
     An epoch is never taken to be shorter than what the current one has taken so far.
     """

@@ -1,4 +1,4 @@
-"""Training what is missing of an entry: an engine, a plan, the engine at work, and how it ended.
+"""Trains the missing seeds of an entry: builds an engine, plans the groups, runs them, reports the outcome.
 
 Everything that trains goes through here: `run`, `tune` and `study` on the command line, and `qrlsuite.api`.
 """
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Execution:
-    """Where training is done: an engine, as many groups at a time as `workers`, and their device.
+    """How training is executed: by which engine, how many groups at a time, on which device.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Execution:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be trained of an entry.
+    """The seeds of an entry that are to be trained, and in which groups.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ def train(
     def show(snapshot: api.Snapshot) -> None:
         display.update(snapshot)
         if display.endless and not confirmed and minutes is None and display.console.is_terminal:
-            raise QrlSuiteError("stopped, for this takes more than a day: --yes starts it all the same")
+            raise QrlSuiteError("stopped: this takes more than a day; --yes starts it anyway")
         if minutes is not None and time.monotonic() - began >= 60 * minutes:
             raise _TimeIsUp
 

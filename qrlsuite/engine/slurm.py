@@ -1,4 +1,4 @@
-"""SLURM: every group a task of a job array. Submit and leave; the entry's folder says how far it is.
+"""The engine `slurm`: submits every group as a task of a job array, and returns.
 
 A task supervises one worker just as `local` does. Some time before its limit SLURM warns it; it then has the worker
 save and end, and puts itself back into the queue, where it continues from the checkpoint. The same happens when the

@@ -1,4 +1,4 @@
-"""How far everything in a results folder is: what our own files say, and the queues that seeds were handed to."""
+"""Progress of all entries of a results folder, from its files and from the queues of submitting engines."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What is to be run, and its identity: tasks, presets and entries."""
+"""Tasks, presets and entries: what is run, and its identity."""

@@ -1,4 +1,4 @@
-"""What is registered, and what a plugin can do, as plain values: for lists, manuals and scripts."""
+"""Descriptions of registered things and of hooks, as plain values for lists and scripts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def hooks() -> list[dict[str, str]]:
 
 
 def describe(kind: str, name: str) -> dict[str, Any]:
-    """Return what there is to say about a registered thing, as plain values.
+    """Return a registered thing's options, protocol or file, as plain values.
 
     Parameters
     ----------

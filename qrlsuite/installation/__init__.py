@@ -1,1 +1,1 @@
-"""What `qrlsuite doctor` finds out: what is installed, what works, and what to do about the rest."""
+"""Tests of the installation, for `qrlsuite doctor`."""

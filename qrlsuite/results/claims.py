@@ -1,4 +1,4 @@
-"""Claims: two workers never train the same seed, and the claim of a dead worker is taken over.
+"""Claims: files that keep two workers from training the same seed; a dead worker's claim is taken over.
 
 A claim is a file with host, process and seeds. Its holder refreshes the file's time every few seconds. On the
 holder's own host a claim lives exactly as long as the process. Elsewhere it is suspect when the file system's own

@@ -1,4 +1,4 @@
-"""How an entry is called on the command line: by name, label or hash, or the beginning of one of them."""
+"""Finds entries by name, label or hash, or by the beginning of one of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from qrlsuite.results.store import EntryStore
 
 
 class Named(Protocol):
-    """What has a name (`ddqn-mlp-90e7f8d4`), a label (`ddqn mlp width=64`) and a task."""
+    """Anything with a name (`ddqn-mlp-90e7f8d4`), a label (`ddqn mlp width=64`) and a task."""
 
     @property
     def name(self) -> str:
@@ -34,7 +34,7 @@ N = TypeVar("N", bound=Named)
 
 @dataclass(frozen=True)
 class Stored:
-    """An entry's folder, and what it is called by; its curves are not read.
+    """An entry's folder, name and label; its curves are not read.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Stored:
 
 
 def stored(stores: Iterable[EntryStore]) -> list[Stored]:
-    """Return what the entries in some folders are called by; a damaged one is called by its folder."""
+    """Return names and labels of entries' folders; a damaged entry is named by its folder."""
     entries = []
     for store in stores:
         name, task = store.path.name, store.path.parent.name

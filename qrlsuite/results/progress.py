@@ -1,4 +1,4 @@
-"""Where a group of seeds stands: written by its worker, read by any display."""
+"""Progress files: written by a group's worker, read by displays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from qrlsuite.results.store import EntryStore, write_atomically
 
 @dataclass
 class Progress:
-    """Where a group stands: what a progress display shows."""
+    """A group's progress: phase, epoch, rounds and scores."""
 
     phase: str = "starting"
     epoch: int = 0

@@ -1,4 +1,4 @@
-"""What a run was made with: versions, machine, code revision. Recorded per seed, never part of an identity."""
+"""Provenance of a run: versions, machine, code revision. Recorded per seed, never part of an identity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long training takes here: from what was measured, scaled by reference measurements where need be.
+"""Estimates training time on this machine, from measured epochs and reference measurements.
 
 A speed is the time of one epoch of one seed, training and validation, on one core, as its share of the group that
 it was trained in. That share depends on the size of the group: a small network alone takes thirty times as long as

@@ -63,7 +63,7 @@ def write_atomically(path: Path, content: bytes) -> None:
             raise
     except OSError as error:
         raise StoreError(
-            f"cannot write {path}: {error.strerror or error}; what was there is unchanged"
+            f"cannot write {path}: {error.strerror or error}; the old file is unchanged"
         ) from None
 
 
@@ -578,7 +578,7 @@ def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
     """
     if not runs.is_dir():
         raise StoreError(
-            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another"
+            f"there is no results folder {runs}: `qrlsuite run` creates one, --runs DIR selects another"
         )
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
     return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]

@@ -1,4 +1,4 @@
-"""What a results folder holds and how far it is: read from our own files only, on any machine that sees them."""
+"""Reads the state of a results folder: entries, seeds, groups, and checkpoints no longer needed."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
 
 
 def outline(store: EntryStore) -> dict[str, Any]:
-    """Return what an entry is and what its seeds were made with, as plain values; each origin once.
+    """Return an entry's options and the distinct provenances of its seeds, as plain values.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Numbers as tables, pictures and messages write them: steps, times, sizes and counts."""
+"""Formats steps, times, sizes and counts for tables, pictures and messages."""
 
 from __future__ import annotations
 

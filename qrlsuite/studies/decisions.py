@@ -249,7 +249,7 @@ def _next_block(file: PlanFile) -> int:
 
 
 class DecisionStudy:
-    """A plan at work in a results folder.
+    """A decision plan with its results folder.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Running a study: which entries lack what, in which order they are trained, and how much fits into a budget."""
+"""Runs a study: finds missing seeds, trains the cheapest entry first, keeps to a time budget."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from qrlsuite.studies.study import Member, Study
 
 @dataclass(frozen=True)
 class PendingEntry:
-    """An entry of a study: what is missing of it, and what that costs.
+    """An entry of a study with its missing seeds and their estimated cost.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class PendingEntry:
 
     @property
     def finished(self) -> int:
-        """Number of seeds that are there."""
+        """Number of finished seeds."""
         return len(self.plan.seeds) - len(self.plan.missing) - len(self.plan.busy)
 
     @property
@@ -81,7 +81,7 @@ class PendingEntry:
 
 @dataclass(frozen=True)
 class Overview(Shown):
-    """A study's entries: what is there of each, and how long the rest will take with some workers."""
+    """A table of a study's entries: finished seeds, missing seeds, and their estimated time."""
 
     study: Study
     items: Sequence[PendingEntry]

@@ -1,4 +1,4 @@
-"""Models of equal size: the option at which a model's parameter count is nearest to another entry's."""
+"""Finds the size option at which a model has as many parameters as another entry's."""
 
 from __future__ import annotations
 

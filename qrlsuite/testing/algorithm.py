@@ -1,4 +1,4 @@
-"""What an algorithm keeps to: seeds apart, exact resuming, and that it learns from its own interactions alone."""
+"""Rules of algorithms: seeds do not influence each other, resuming is exact, agents learn from their own data."""
 
 from __future__ import annotations
 

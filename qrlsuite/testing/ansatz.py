@@ -1,4 +1,4 @@
-"""What an ansatz keeps to: a pure function of its arguments whose every input and parameter matters."""
+"""Rules of ansatzes: a pure function of its arguments; every input and parameter has an effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a circuit backend keeps to: right values, right gradients, and seeds that do not influence each other."""
+"""Rules of circuit backends: correct values and gradients; seeds do not influence each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules for everything that is registered: its name, its references, its options, and how it is imported."""
+"""Rules of every registered thing: name, references, options, imports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REFERENCES = ("options", "build", "factory", "population", "vector", "entry_poin
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """What is checked: a spec, and where it comes from.
+    """The thing to be checked: a spec, its distribution and its settings.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def plugin_modules(distribution: str) -> tuple[str, ...]:
 
 
 def check_common(subject: Subject) -> tuple[list[Finding], bool]:
-    """Check what every registered thing keeps to; returns the findings and whether the rest can be checked."""
+    """Check the rules of every registered thing; returns the findings, and whether further rules can be checked."""
     rules = Checklist()
     rules.run("name", "unique among what is installed", lambda: _name(subject))
     usable = rules.run("references", "every reference leads to code", lambda: _references(subject))

@@ -1,8 +1,8 @@
-"""Whether what sets an angle of a circuit changes any expectation value, and why not.
+"""Finds inputs and parameters of a circuit that change no expectation value, and the likely cause.
 
 A scalar need not have an effect: RZ on a qubit in 0, or right before the measurement of Z, changes no expectation
 value. In the first and last layers of a circuit that repeats one pattern this is usual (the last RZ of Skolik, Jerbi
-& Dunjko, Quantum 6, 720, 2022, for one), and it breaks no rule. What follows is never the price of a pattern:
+& Dunjko, Quantum 6, 720, 2022, for one), and it breaks no rule. These do break one:
 
 - no expectation value depends on an input feature, at some size: the agent cannot see it;
 - none depends on any scalar of a parameter, at some size: the whole parameter is trained for nothing;

@@ -1,4 +1,4 @@
-"""What an engine keeps to, as far as it can be seen without starting anything."""
+"""Rules of engines, checked without starting anything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an environment keeps to: a right Gymnasium environment, and lanes that live for themselves."""
+"""Rules of environments: Gymnasium's interface, and lanes that do not influence each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a conformance check reports, and how it goes through its rules."""
+"""Findings of a conformance check: one per rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIZES: tuple[tuple[int, ...], ...] = ((0,), (3,), (1, 2), (4, 1, 3), (3, 0, 4, 2
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What one rule found.
+    """The result of one rule.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def watching(call: Callable[[str], None]) -> Iterator[None]:
 
 
 class Checklist:
-    """Goes through rules; a rule that raises is a finding, never an end.
+    """Runs rules one by one; a rule that raises becomes a finding.
 
     Attributes
     ----------

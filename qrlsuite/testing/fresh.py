@@ -1,4 +1,4 @@
-"""Plugins in a process of their own, as a worker or a new command meets them: what is imported, and what is found."""
+"""Loads plugins in a new process, as a worker does, and reports which modules that imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an algorithm that is checked runs on: a small environment, a linear model, and a group of seeds."""
+"""A small environment, a linear model and a group of seeds, on which algorithms are checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lanes of an environment that is checked: built as a run builds them, and played under given actions."""
+"""Builds lanes of an environment as a run does, and plays given actions in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model keeps to: its generator alone decides, gradients reach everything, and company changes nothing."""
+"""Rules of models: the generator decides initial values, gradients reach all parameters, seeds are independent."""
 
 from __future__ import annotations
 

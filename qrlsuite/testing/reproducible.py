@@ -1,4 +1,4 @@
-"""What lanes keep to so that results are reproducible: nothing but streams and actions decides what they show."""
+"""Rules of reproducible lanes: streams and actions alone decide observations and rewards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `qrlsuite check` is asked to check: a name, a kind and a name, a distribution, or a module."""
+"""Finds the targets of `qrlsuite check` by name, kind and name, distribution or module."""
 
 from __future__ import annotations
 

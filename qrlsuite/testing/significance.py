@@ -1,4 +1,4 @@
-"""What a significance rule keeps to: signs, by the evidence alone, and the same whoever is named first."""
+"""Rules of significance tests: valid signs, from the evidence alone, antisymmetric in the two entries."""
 
 from __future__ import annotations
 

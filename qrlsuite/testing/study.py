@@ -1,4 +1,4 @@
-"""What a study keeps to: a file whose entries a run takes, and whose pictures can be drawn."""
+"""Rules of studies: entries can be resolved, pictures can be drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a task keeps to: a file that says all there is to say, about things that exist."""
+"""Rules of tasks: a complete file, known names, scores in [0, 1]."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What things keep to that are registered by the path of their TOML file: tasks and studies."""
+"""Rules of TOML files of tasks and studies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a tracker keeps to: methods or hooks of the right names and arguments, that take what a run sends."""
+"""Rules of trackers: methods or hooks with the right names and arguments, which accept a run's events."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Training a group of seeds in one process, and what trained agents score."""
+"""Trains a group of seeds in one process, and evaluates trained agents."""

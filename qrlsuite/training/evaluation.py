@@ -1,4 +1,4 @@
-"""Trained agents, and reference policies beside them, on fresh episodes.
+"""Evaluates trained agents and reference policies on fresh episodes.
 
 Every episode is one random stream of its own, keyed by (task, evaluation seed, "evaluation", episode): all
 policies of a task, whatever the entry, meet the same episodes, and no training or validation episode is among

@@ -1,4 +1,4 @@
-"""One group of seeds in its entry's folder: train epoch by epoch, record, checkpoint.
+"""Trains one group of seeds epoch by epoch, and writes records and checkpoints to the entry's folder.
 
 Killed at any moment and resumed, a group ends with the same curves and parameters, byte for byte, as one never
 stopped: lines newer than the checkpoint are cut. `qrlsuite.training.trainer` trains; here is what is on disk of it.
@@ -28,7 +28,7 @@ CHECKPOINT_SECONDS = 60.0
 
 
 class GroupRun:
-    """The training of one group of seeds of an entry, with everything that is kept of it.
+    """The training of one group of seeds of an entry, with its files.
 
     Parameters
     ----------

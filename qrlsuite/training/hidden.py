@@ -1,8 +1,8 @@
-"""State that a model hides from torch: values outside of parameters, buffers and submodules.
+"""Finds state that a model keeps outside of parameters, buffers and submodules.
 
 A population (`qrlsuite.population`) stacks parameters and buffers, one slice per seed, and keeps everything else of
 the first seed's module. So a tensor in a plain attribute that is drawn per seed would be seed 1's for all of them, and
-one that a forward pass changes would be changed by all: a seed would not be the agent that it is alone.
+one that a forward pass changes would be changed by all: a seed would then give another result than when trained alone.
 """
 
 from __future__ import annotations

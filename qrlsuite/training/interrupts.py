@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as one interruption, which waits while results are being written."""
+"""Turns Ctrl-C and SIGTERM into KeyboardInterrupt, delayed while results are being written."""
 
 from __future__ import annotations
 

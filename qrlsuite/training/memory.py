@@ -1,4 +1,4 @@
-"""Whether the groups that are trained at a time fit into memory, seen before anything is begun.
+"""Checks, before training, that the groups fit into memory.
 
 Only the large arrays of the suite's own algorithms and models are counted, found by the names of their options; each is
 explained where it is counted. What is refused does therefore not fit; what is let through may still be large for

@@ -1,4 +1,4 @@
-"""Counting what environments do: rounds for the progress display, returns and scores of finished episodes."""
+"""Counts rounds, for the progress display, and returns and scores of finished episodes."""
 
 from __future__ import annotations
 

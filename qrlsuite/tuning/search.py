@@ -65,7 +65,7 @@ def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be searched.
+    """The input of a search.
 
     Attributes
     ----------
@@ -215,7 +215,7 @@ class Search(Shown):
 
     @property
     def path(self) -> Path:
-        """Where the preset file goes unless told otherwise: the name holds a digest of the request."""
+        """Default path of the preset file; its name holds a digest of the request."""
         request, base = self.request, self.base
         key = digest(
             {

@@ -1,4 +1,4 @@
-"""Each agent is the agent it would have been alone: bitwise, in any company, in any order."""
+"""Training seeds together gives each the same result as training it alone: bitwise, in any group and order."""
 
 from __future__ import annotations
 

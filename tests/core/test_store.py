@@ -164,7 +164,7 @@ def test_groups_are_even_and_keep_epochs_apart(train: Callable[..., Path]) -> No
 def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
     blocker = tmp_path / "file"
     blocker.write_text("")
-    with pytest.raises(StoreError, match=r"cannot write .*: Not a directory; what was there is unchanged"):
+    with pytest.raises(StoreError, match=r"cannot write .*: Not a directory; the old file is unchanged"):
         store.write_atomically(blocker / "x.json", b"{}")
 
 

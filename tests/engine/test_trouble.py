@@ -107,7 +107,7 @@ def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
     assert "Read-only file system" in only_line(more)
     other = qrlsuite(*words[:-4], "--set", "width=8", *runs)
     assert other.returncode == 2
-    assert "Read-only file system; what was there is unchanged" in only_line(other)
+    assert "Read-only file system; the old file is unchanged" in only_line(other)
     for command in (["runs"], ["status"], ["leaderboard"], ["runs", "gc"]):
         answer(*command, *runs)
     with pytest.raises(StoreError, match="Read-only file system"):

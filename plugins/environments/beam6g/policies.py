@@ -1,4 +1,4 @@
-"""Reference policies: what somebody does who knows where the user will be, which no agent does."""
+"""Reference policies, which know the user's next position; agents do not."""
 
 from __future__ import annotations
 

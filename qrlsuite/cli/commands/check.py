@@ -1,4 +1,4 @@
-"""`qrlsuite check`: does a plugin keep to the rules?"""
+"""`qrlsuite check`: test plugins against the suite's rules."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def check(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check plugins against the rules that the suite keeps to itself, one by one, with the likely cause.
+    """Test plugins against the suite's rules; a broken rule is shown with its likely cause.
 
-    Exit codes: 0 every rule holds, 1 a rule is broken, 2 there is nothing of that name.
+    Exit codes: 0 every rule holds, 1 a rule is broken, 2 nothing has that name.
 
     Examples: qrlsuite check my-model; qrlsuite check ansatz:ring --set depth=2; qrlsuite check my-distribution
     """

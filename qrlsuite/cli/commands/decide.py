@@ -183,7 +183,7 @@ def run(
     _show_status(study, decision)
     if missing := study.missing(decision):
         lacking = ", ".join(f"{counted(count, 'seed')} of {name}" for name, count in missing.items())
-        typer.echo(f"others train {lacking}: repeat this command when they are there")
+        typer.echo(f"others train {lacking}: repeat this command when they have finished")
 
 
 def _train(

@@ -1,4 +1,4 @@
-"""`qrlsuite doctor`: what is installed, what works, and what to do about the rest."""
+"""`qrlsuite doctor`: test the installation, and print what a bug report needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`qrlsuite evaluate`: what trained policies earn, against the optimal, the random and other known policies."""
+"""`qrlsuite evaluate`: play trained agents, beside reference policies such as the optimal and the random one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def evaluate(
     ] = 1000,
     seed: Annotated[
         int,
-        typer.Option("--seed", min=0, help="Another one gives other episodes, the same for all policies."),
+        typer.Option("--seed", min=0, help="Seed of the episodes, which are the same for all policies."),
     ] = 0,
     out: Annotated[
         Path | None,

@@ -1,4 +1,4 @@
-"""`qrlsuite export`: entries in the form in which they are published."""
+"""`qrlsuite export`: write entries as published files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,9 @@ def export(
         if not json_output:
             typer.echo(f"wrote {folder} ({counted(len(entry.seeds), 'seed')}, {size / 1000:.0f} kB)")
     if not written:
-        raise QrlSuiteError(f"{runs} holds no complete entry: qrlsuite runs --runs {runs} says what is there")
+        raise QrlSuiteError(
+            f"{runs} holds no complete entry: qrlsuite runs --runs {runs} lists what it holds"
+        )
     if json_output:
         typer.echo(json.dumps(written))
     else:

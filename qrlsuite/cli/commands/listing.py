@@ -1,4 +1,4 @@
-"""`qrlsuite list`: what is installed."""
+"""`qrlsuite list`: list tasks, models, algorithms and everything else that is registered."""
 
 from __future__ import annotations
 

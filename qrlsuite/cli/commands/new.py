@@ -1,4 +1,4 @@
-"""`qrlsuite new plugin`: a package to begin with."""
+"""`qrlsuite new plugin`: write a new plugin package."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ def plot(
     task: Annotated[
         list[str] | None,
         typer.Option(
-            "--task", help="Which task, where there are several; more than one where a picture can."
+            "--task",
+            help="The task, if the folder holds several; repeat --task for a picture of several tasks.",
         ),
     ] = None,
     entry: EntryOption = None,

@@ -83,7 +83,7 @@ def run(
     """Train the missing seeds of an entry (a model and an algorithm on a task).
 
     Stop with Ctrl-C at any time; the same command continues where it stopped. More --seeds or --epochs add to
-    what is there, and asking again for what is there does nothing.
+    earlier results; repeating a finished command does nothing.
 
     Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
     """

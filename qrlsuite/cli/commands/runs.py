@@ -1,4 +1,4 @@
-"""`qrlsuite runs`: what the results folder holds; `runs gc` removes checkpoints that are done with, `rm` entries."""
+"""`qrlsuite runs`: list the results folder; `runs gc` removes checkpoints no longer needed, `runs rm` entries."""
 
 from __future__ import annotations
 
@@ -37,12 +37,15 @@ def runs(
     task: TaskOption = None,
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="With gc: do it; without, it says what it would do. With rm: do not ask."),
+        typer.Option(
+            "--yes",
+            help="With gc: remove; without --yes, gc only lists. With rm: do not ask for confirmation.",
+        ),
     ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """List what is there: task, entry, seeds by status, epochs, size on disk, last activity.
+    """List the results folder: task, entry, seeds by status, epochs, size on disk, last activity.
 
     `rm` asks before it deletes, and deletes no entry that is being trained.
 

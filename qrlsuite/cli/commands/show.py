@@ -1,4 +1,4 @@
-"""`qrlsuite show`: everything about one thing."""
+"""`qrlsuite show`: print options, protocols, circuits and provenance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`qrlsuite status`: how far everything that has not finished is, wherever it runs."""
+"""`qrlsuite status`: show the progress of everything that is unfinished."""
 
 from __future__ import annotations
 

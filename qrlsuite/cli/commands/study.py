@@ -1,4 +1,4 @@
-"""`qrlsuite study`: a paper's experiments by name; what they need, what is there, and their pictures."""
+"""`qrlsuite study`: run a paper's experiments by name, and draw their pictures."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def show(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Show what a study would run, what of it is there, and how long the rest will take here.
+    """Show a study's entries: finished seeds, missing seeds, and the time the missing ones will take.
 
     Example: qrlsuite study show fig7
     """
@@ -139,7 +139,7 @@ def run(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")
+        bool, typer.Option("--dry-run", help="Print what would be trained, and train nothing.")
     ] = False,
     settings: SetOption = None,
     models: MapOption = None,
@@ -154,7 +154,7 @@ def run(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Train what is missing of a study, cheapest entry first, and draw its pictures from what is there.
+    """Train a study's missing seeds, cheapest entry first, and draw its pictures.
 
     Entries are those that `qrlsuite run` trains, in the same folders: nothing is trained twice. Stop with Ctrl-C at
     any time, or give a --budget; the same command continues.
@@ -208,7 +208,7 @@ def draw(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Draw a study's pictures from what is there, training nothing.
+    """Draw a study's pictures from finished seeds; trains nothing.
 
     Example: qrlsuite study draw fig6 --format pdf
     """

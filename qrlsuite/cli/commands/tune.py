@@ -1,4 +1,4 @@
-"""`qrlsuite tune`: find settings by sample complexity on seeds of their own, and write them to a preset file."""
+"""`qrlsuite tune`: search for settings with a small sample complexity, and write them to a preset file."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def tune(
         typer.Option("--trials", min=1, max=100_000, help="For random and tpe: how many settings."),
     ] = None,
     sampler_seed: Annotated[
-        int, typer.Option("--sampler-seed", min=0, help="For random and tpe: another one proposes others.")
+        int, typer.Option("--sampler-seed", min=0, help="For random and tpe: the seed of the proposals.")
     ] = 0,
     seeds: Annotated[
         str,
@@ -100,7 +100,7 @@ def tune(
     ] = "20",
     epochs: Annotated[
         int | None,
-        typer.Option("--epochs", min=1, help="Fewer for short trials; default: the task's protocol."),
+        typer.Option("--epochs", min=1, help="Epochs of each trial; default: the task's protocol."),
     ] = None,
     objective: Annotated[
         Goal,
@@ -111,7 +111,9 @@ def tune(
     budget: Annotated[
         str | None,
         typer.Option(
-            "--budget", metavar="TIME", help="Begin no trial that would not end within 30min, 2h, ..."
+            "--budget",
+            metavar="TIME",
+            help="Time for all trials, 30min or 2h; a trial that would take longer is not begun.",
         ),
     ] = None,
     out: Annotated[

@@ -1,4 +1,4 @@
-"""`qrlsuite leaderboard verify`: are published entries what they say?"""
+"""`qrlsuite leaderboard verify`: check published entries."""
 
 from __future__ import annotations
 
@@ -29,7 +29,11 @@ def verify(
     rerun: Annotated[int, typer.Option("--rerun", min=0, help="Seeds of each entry to train again.")] = 0,
     choice: Annotated[
         int | None,
-        typer.Option("--choice", min=0, help="Choose the same seeds again: a number that was printed."),
+        typer.Option(
+            "--choice",
+            min=0,
+            help="The number that an earlier check printed, to choose the same seeds again.",
+        ),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
