@@ -63,9 +63,6 @@ BUILT_IN = {
             f"{_ROOM}.export:export",
             "qrlsuite.cli.across:SeveralTasksCommand",
         ),
-        LazyCommand(
-            "import", "Import released result files as one entry.", f"{_ROOM}.import_:import_results"
-        ),
         LazyCommand("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
         LazyCommand("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
         LazyCommand("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),

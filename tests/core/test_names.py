@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_no_two_classes_share_a_name() -> None:
     places = defaultdict(list)
-    for folder in ("qrlsuite", "plugins", "leaderboard", "tasks"):
+    for folder in ("qrlsuite", "plugins", "leaderboard", "tasks", "extras"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.ClassDef):

@@ -24,7 +24,7 @@ from qrlsuite.plugins.circuits.native.program import (
 )
 
 if TYPE_CHECKING:
-    from qrlsuite.plugins.circuits.native.mean_field import Program as MeanFieldProgram
+    from qrlsuite.plugins.circuits.native.mean_field import MeanFieldProgram
 
 COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
 

@@ -43,7 +43,7 @@ from qrlsuite.plugins.circuits.native.program import AXIS_X, AXIS_Z, HADAMARD, N
 from qrlsuite.plugins.circuits.native.vectors import constant, load, splat, store, total
 
 __all__ = [
-    "Program",
+    "MeanFieldProgram",
     "aligned",
     "backward",
     "compile_circuit",
@@ -61,11 +61,11 @@ FIXED = {"X": AXIS_X, "CNOT": AXIS_X, "Z": AXIS_Z, "CZ": AXIS_Z}
 """Gates that are half turns, by axis. Controlled ones have a phase too: X = i RX(pi)."""
 
 Tables = namedtuple("Tables", "steps angles constants rotations factors blocks observables")
-"""A program's arrays, see `Program` for each, in the form that kernels take."""
+"""A program's arrays, see `MeanFieldProgram` for each, in the form that kernels take."""
 
 
 @dataclass(frozen=True)
-class Program:
+class MeanFieldProgram:
     """A compiled circuit.
 
     Attributes
@@ -93,7 +93,7 @@ class Program:
     observables: NDArray[np.int64]
 
 
-def compile_circuit(circuit: Circuit) -> Program:
+def compile_circuit(circuit: Circuit) -> MeanFieldProgram:
     """Compile a circuit description into one step per gate.
 
     Gates are never collected: CRX and CRY in a row drop correlations twice.
@@ -112,7 +112,7 @@ def compile_circuit(circuit: Circuit) -> Program:
             steps.append((ROTATE, control, operation.wires[-1], len(compiler.blocks) - 1, int(phase)))
             compiler.rotations += rotations
             compiler.blocks.append(len(compiler.rotations))
-    return Program(
+    return MeanFieldProgram(
         qubits=circuit.qubits,
         inputs=circuit.inputs,
         parameters=circuit.parameter_count,
@@ -137,17 +137,17 @@ def _rotations(compiler: Compiler, operation: Operation) -> list[tuple[int, int,
     return [*half_turn, (PHASE, compiler.angle(Angle(constant=math.pi / 2)), 1.0)]
 
 
-def tables(program: Program) -> Tables:
+def tables(program: MeanFieldProgram) -> Tables:
     """Return a program's arrays for the kernels."""
     return Tables(*(getattr(program, name) for name in Tables._fields))
 
 
-def scratch(program: Program, lanes: int, dtype: Any) -> Scratch:
+def scratch(program: MeanFieldProgram, lanes: int, dtype: Any) -> Scratch:
     """Allocate working memory: inputs (I, V); values and results are not needed."""
     return Scratch(*(aligned((count, lanes), dtype) for count in (program.inputs, 1, 1)))
 
 
-def record_rows(program: Program) -> tuple[int, int, int]:
+def record_rows(program: MeanFieldProgram) -> tuple[int, int, int]:
     """Return how many rows of lanes a chunk's record has: vectors, sines and cosines, blocks.
 
     The vectors are 3 rows per qubit, and 6 per step: those of its two qubits before it.

@@ -1,4 +1,4 @@
-"""Turning released result files into an entry: curves to compare with, which cannot be trained further.
+"""Turns released result files into an entry: learning curves to compare with, which cannot be trained further.
 
 An imported entry's identity is the task, the algorithm and the label under which it was imported; its model is called
 `imported`, so that it never meets an entry of this suite's own, and its label ends in "(imported)". Every file is one
@@ -22,8 +22,8 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import Task, digest
 from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.provenance import collect
-from qrlsuite.results.released import Released, read
 from qrlsuite.results.store import EntryStore, shortest, table_bytes, write_atomically, write_json
+from qrlsuite_released.unpickle import Released, read
 
 MODEL = "imported"
 _ANY = (0,)
@@ -32,7 +32,7 @@ _ANY = (0,)
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import did.
+    """The result of an import.
 
     Attributes
     ----------

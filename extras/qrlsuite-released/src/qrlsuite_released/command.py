@@ -1,4 +1,4 @@
-"""`qrlsuite import`: the result files that the paper's code wrote, as an entry to compare with."""
+"""`qrlsuite import`: import result files of the paper's released code as an entry."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.task import load
-from qrlsuite.results.imports import import_files
 from qrlsuite.results.seeds import format_seeds
+from qrlsuite_released.entries import import_files
 
 
 def import_results(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Pickled result files, one per run.")
     ],
-    task: Annotated[str, typer.Option("--task", help="The task on which they were made.")],
+    task: Annotated[str, typer.Option("--task", help="The task on which the files were made.")],
     algorithm: Annotated[
-        str | None, typer.Option("--algorithm", help="The algorithm that made them; default: the task's.")
+        str | None,
+        typer.Option("--algorithm", help="The algorithm that made the files; default: the task's."),
     ] = None,
     label: Annotated[
-        str | None, typer.Option("--label", help="What to call them; default: the name of their folder.")
+        str | None, typer.Option("--label", help="The entry's label; default: the name of the files' folder.")
     ] = None,
     quantum: Annotated[
         str | None,
@@ -38,8 +39,8 @@ def import_results(
 ) -> None:
     """Import released result files as the seeds of one entry, marked "(imported)" everywhere.
 
-    A pickle is a program: files are read in a process of their own with little memory, little time, and a closed list
-    of what they may contain; anything else is refused by name. Files that were imported before are left as they are.
+    A pickle is a program. Each file is read in its own process, with limited memory and time and a closed list of
+    names; a file that asks for anything else is refused. Files that were imported before are skipped.
 
     Example: qrlsuite import results/mlp/*.pkl --task beam6g --label "MLP of the paper"
     """
@@ -58,7 +59,7 @@ def import_results(
         typer.echo(json.dumps(content))
         return
     if done.known:
-        typer.echo(f"{done.known} of {len(files)} files were there already")
+        typer.echo(f"{done.known} of {len(files)} files were imported before")
     if done.new:
         typer.echo(f"imported {len(done.new)} runs as seeds {format_seeds(done.new)} of {done.store.path}")
     if done.differing:

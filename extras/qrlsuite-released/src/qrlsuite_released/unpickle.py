@@ -1,11 +1,10 @@
-"""Reading the result files that the paper's code wrote: the only place where a pickle is ever read.
+"""Reads result files of the paper's released code: the only module that reads a pickle.
 
-A pickle is a program. It is run here in a process of its own (`python -m qrlsuite.results.released FILE`) whose
-memory, time and files are limited, and in which it can reach nothing but a closed table of names: arrays, plain
-containers, `argparse.Namespace` and the rebuilding of tensors. Whatever else a file asks for is refused by name
-before anything is called. What comes back is JSON: validation scores, training returns, arguments, and the shapes of
-the model's tensors. The tensors themselves are not rebuilt: no model of this suite could hold them, and torch need
-not be imported.
+A pickle is a program. It is read in its own process (this file, run as a script) with limited memory, time and files.
+There it can reach a closed table of names only: arrays, plain containers, `argparse.Namespace` and the rebuilding of
+tensors. A file that names anything else is refused before anything is called. The answer is JSON: validation scores,
+training returns, arguments, and the shapes of the model's tensors. The tensors themselves are not rebuilt, so torch
+need not be imported.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ LARGEST = 10_000_000
 
 @dataclass(frozen=True)
 class Released:
-    """What a released result file holds.
+    """The content of a released result file.
 
     Attributes
     ----------
@@ -80,7 +79,7 @@ def read(path: Path) -> Released:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from None
-    command = [sys.executable, "-P", "-m", "qrlsuite.results.released", str(path)]
+    command = [sys.executable, "-P", __file__, str(path)]
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
         result = subprocess.run(
@@ -113,7 +112,7 @@ def read(path: Path) -> Released:
 
 
 class _Refused(Exception):
-    """What the user is told."""
+    """A refused file; the message says why."""
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import ast
 import collections
+import importlib
 import json
 import os
 import pickle
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,16 +19,29 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import load
 from qrlsuite.leaderboard.collect import collect
-from qrlsuite.results import imports, released
 from qrlsuite.results.claims import acquire
-from qrlsuite.results.imports import import_files
 from qrlsuite.results.store import EntryStore, entries, learning_curve
+from qrlsuite_released import entries as imports
+from qrlsuite_released import unpickle as released
+from qrlsuite_released.entries import import_files
 
 ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "extras" / "qrlsuite-released"
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plugin is loaded from its folder, by the entry point that its `pyproject.toml` declares."""
+    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
+    (module,) = project["entry-points"]["qrlsuite"].values()
+    known = registry.create(strict=True)
+    known.add_plugin(importlib.import_module(module), project["name"])
+    monkeypatch.setattr(registry, "load", lambda: known)
 
 
 def content(seed: int = 0, epochs: int = 6, **replaced: Any) -> dict[str, Any]:
@@ -132,7 +147,8 @@ def test_too_much_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "slow.pkl").write_bytes(slow)
     program = tmp_path / "limited.py"
     program.write_text(
-        "import sys; from qrlsuite.results import released as r; r.SECONDS = 1; sys.exit(r.main())"
+        f"import sys; sys.path.insert(0, {str(PACKAGE / 'src')!r}); from qrlsuite_released import unpickle as r; "
+        "r.SECONDS = 1; sys.exit(r.main())"
     )
     run = released.subprocess.run
 
@@ -184,7 +200,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     first = CliRunner().invoke(build(), [*words, "--json"])
     assert json.loads(first.output)["seeds"] == [0, 1, 2]
     again = CliRunner().invoke(build(), words)
-    assert "3 of 3 files were there already" in again.output
+    assert "3 of 3 files were imported before" in again.output
 
     (found,), refused = collect(tmp_path / "runs")
     assert refused == []
@@ -239,9 +255,9 @@ UNPICKLERS = {
 
 def test_nothing_else_reads_pickles() -> None:
     """Static: no unpickler is imported outside the fence, and no library is asked to unpickle."""
-    fence = ROOT / "qrlsuite" / "results" / "released.py"
+    fence = PACKAGE / "src" / "qrlsuite_released" / "unpickle.py"
     read = 0
-    for folder in ("qrlsuite", "plugins", "leaderboard", "tasks"):
+    for folder in ("qrlsuite", "plugins", "leaderboard", "tasks", "extras"):
         for path in (ROOT / folder).rglob("*.py"):
             read += 1
             for node in ast.walk(ast.parse(path.read_text())):
