@@ -1,0 +1,321 @@
+"""What a decision plan has come to: run it, and show it on a screen, on a page and as plain values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from qrlsuite.engine import execution
+from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.execution import Execution
+from qrlsuite.engine.terminal import Shown
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.results import speed
+from qrlsuite.results.text import counted, hours_range, hours_text
+from qrlsuite.statistics.planning import runs_at_difference
+from qrlsuite.statistics.sequential import Decision, PairDecision
+from qrlsuite.studies import decisions
+from qrlsuite.studies.decisions import DecisionStudy
+
+Hours = tuple[float, float]
+"""Least and most core-hours to be expected; both the same where they were measured on the entry's own seeds."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecisionOutcome(Shown):
+    """A plan with what it has decided so far.
+
+    Attributes
+    ----------
+    study:
+        The plan in its results folder.
+    decision:
+        Every pair with its verdict, p at each look, difference and interval.
+    submitted:
+        One line for each entry whose seeds were handed to a queue.
+    """
+
+    study: DecisionStudy
+    decision: Decision
+    submitted: tuple[str, ...] = ()
+
+    @property
+    def pairs(self) -> tuple[PairDecision, ...]:
+        """The planned pairs; `verdict` says in words what was decided of each."""
+        return self.decision.pairs
+
+    @property
+    def finished(self) -> bool:
+        """Whether every pair is decided or its last look was taken."""
+        return self.decision.finished
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        study, decision = self.study, self.decision
+        missing = study.missing(decision)
+        protocol = {name: entry.task.file.protocol.seeds for name, entry in study.entries.items()}
+        used = {name: len(study.seeds(name)) for name in study.entries}
+        closed = [name for name in study.entries if name not in decision.wanted]
+        saved = {name: protocol[name] - used[name] for name in closed if used[name]}
+        return {
+            "plan": study.file.name,
+            "hash": study.file.hash,
+            "finished": decision.finished,
+            "ended": study.ended,
+            "looks_taken": study.taken,
+            "reason": study.file.reason or None,
+            "pairs": [_pair_as_dict(decision, pair) for pair in decision.pairs],
+            "entries": [
+                {
+                    "name": name,
+                    "entry": entry.name,
+                    "seeds": used[name],
+                    "core_hours": study.hours(name),
+                    "wanted": decision.wanted.get(name),
+                    "missing": missing.get(name, 0),
+                }
+                for name, entry in study.entries.items()
+            ],
+            "next_core_hours": total_hours(study, missing),
+            "protocol_seeds": sum(protocol.values()),
+            "seeds_saved": sum(saved.values()),
+            "core_hours_saved": total_hours(study, saved),
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show `parts`."""
+        yield from self.parts()
+
+    def parts(self) -> Iterator[Text | Table]:
+        """Return what a screen shows: a question, a table of pairs, and lines about looks, needs and cost."""
+        study, decision, facts = self.study, self.decision, self.as_dict()
+        yield Text(f"{study.file.name}: {question(study)}", style="bold")
+        if not study.begun:
+            yield Text("not begun")
+        yield _table(study, decision, facts["pairs"])
+        if any(pair.p for pair in decision.pairs):
+            yield Text(
+                "B against A: how much longer B is below the thresholds, with a repeated confidence interval that "
+                f"holds at every look ({100 * (1 - study.file.alpha):g} percent for all pairs together). An early stop "
+                "overstates the difference."
+            )
+        for seeds, when in facts["looks_taken"].items():
+            yield Text(f"look at {seeds} seeds taken {when}")
+        if note := reason_note(study):
+            yield Text(note)
+        if study.ended:
+            yield Text(f"ended {study.ended}: open pairs stay open")
+        elif not decision.finished:
+            lacking = sum(each["missing"] for each in facts["entries"])
+            cost = _about(facts["next_core_hours"])
+            yield Text(f"next look: {counted(lacking, 'seed')} missing{cost}")
+        used, spent = (sum(each[key] for each in facts["entries"]) for key in ("seeds", "core_hours"))
+        saved, hours = facts["seeds_saved"], facts["core_hours_saved"]
+        more = hours and (min(map(abs, hours)), max(map(abs, hours)))
+        yield Text(
+            f"used {counted(used, 'seed')}, {hours_text(spent)} core-hours; the protocol has "
+            f"{facts['protocol_seeds']} seeds: {abs(saved)} {'saved' if saved >= 0 else 'more than that'} on "
+            f"entries that are decided{_about(more) if saved else ''}"
+        )
+
+
+def run(
+    study: DecisionStudy,
+    where: Execution,
+    quiet: bool = False,
+    again: Literal["command", "call"] = "command",
+    looked: Callable[[DecisionOutcome], None] | None = None,
+) -> DecisionOutcome:
+    """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
+
+    Parameters
+    ----------
+    where:
+        The engine.
+    quiet, again:
+        As for `RunDisplay`.
+    looked:
+        Called after each look.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the plan cannot be used or go on, or training failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+    """
+    study.begin()
+    submitted: list[str] = []
+    decision = study.look()
+    while wanted := study.wanted(decision):
+        for name, seeds in wanted.items():
+            work = execution.plan(study.folder, study.entries[name], where, seeds, study.file.epochs)
+            if not work.groups and not work.busy:
+                continue
+            outcome = execution.train(work, where, RunDisplay(work, where.workers, quiet, again))
+            submitted += [outcome.submitted] if outcome.submitted is not None else []
+        decision = study.look()
+        if study.missing(decision) and study.wanted(decision) == wanted:
+            break  # a queue or another process has the seeds
+        if looked is not None:
+            looked(DecisionOutcome(study, decision))
+    return DecisionOutcome(study, decision, tuple(submitted))
+
+
+def read(path: Path, runs: Path) -> DecisionOutcome:
+    """Return what a plan has decided so far; trains and writes nothing.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the plan or its results cannot be used.
+    """
+    study = DecisionStudy(decisions.load(path), str(path), runs)
+    return DecisionOutcome(study, study.decision())
+
+
+def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutcome], list[str]]:
+    """Return what the plans that have begun in a results folder have decided, and a line for each that is unreadable.
+
+    Parameters
+    ----------
+    tasks:
+        Only plans of these tasks; all where empty.
+    """
+    found, refused = [], []
+    for path in sorted((runs / decisions.FOLDER).glob("*/plan.toml")):
+        try:
+            outcome = read(path, runs)
+        except QrlSuiteError as error:
+            refused.append(str(error))
+            continue
+        task = next(iter(outcome.study.entries.values())).task.name
+        if outcome.study.begun and (not tasks or task in tasks):
+            found.append(outcome)
+    return found, refused
+
+
+def hours(study: DecisionStudy, name: str, seeds: int) -> Hours | None:
+    """Return the core-hours of so many seeds of an entry: measured on its own, else estimated; None where unknown."""
+    done = len(study.seeds(name))
+    if done:
+        own = seeds * study.hours(name) / done
+        return own, own
+    found = speed.known(study.folder, study.runs).estimate(study.entries[name], None)
+    span = found.range(abs(seeds) * study.file.epochs)
+    if span is None:
+        return None
+    low, high = (math.copysign(end / 3600, seeds) for end in span)
+    return low, high
+
+
+def total_hours(study: DecisionStudy, seeds: Mapping[str, int]) -> Hours | None:
+    """Return the core-hours of seeds of several entries together; None where one is unknown."""
+    known = [each for name, count in seeds.items() if (each := hours(study, name, count)) is not None]
+    if len(known) < len(seeds):
+        return None
+    return sum(low for low, _ in known), sum(high for _, high in known)
+
+
+def question(study: DecisionStudy) -> str:
+    """Return what a plan asks: `which needs fewer steps, A, B or C?`."""
+    names = list(study.entries)
+    return f"which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
+
+
+def reason_note(study: DecisionStudy) -> str:
+    """Return a warning with the reason given where a plan looks below 20 seeds; else an empty text."""
+    if study.plan.looks[0] >= 20:
+        return ""
+    return (
+        "NOTE: it looks below 20 seeds, where rare failures that have not occurred yet decide too much. Reason "
+        f"given: {study.file.reason}"
+    )
+
+
+def versus(pair: PairDecision) -> str:
+    """Return `A / B`."""
+    return f"{pair.first} / {pair.second}"
+
+
+def percent(value: float) -> str:
+    """Write a difference: `+12%`."""
+    return f"{100 * value:+.0f}%" if abs(value) < 100 else ("+inf" if value > 0 else "-100%")
+
+
+def difference_text(pair: PairDecision) -> tuple[str, str]:
+    """Return a pair's difference and its interval as text; empty where there is none."""
+    if not _finite(pair):
+        return "", ""
+    return percent(pair.difference), f"{percent(pair.interval[0])} to {percent(pair.interval[1])}"
+
+
+def needs_text(study: DecisionStudy, needs: Mapping[str, Any] | None) -> str:
+    """Say what an open pair needs, as `as_dict` gives it."""
+    if needs is None or study.ended:
+        return ""
+    words = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"
+    about = needs["seeds_at_this_difference"]
+    if about is None:
+        return words
+    last = study.plan.looks[-1]
+    return f"{words}; about {about if about <= 10 * last else f'over {10 * last}'} if the difference is as it looks"
+
+
+def _about(span: Hours | None) -> str:
+    return "" if span is None or not span[1] else f", about {hours_range(*span)} core-hours"
+
+
+def _finite(pair: PairDecision) -> bool:
+    return bool(pair.p) and all(math.isfinite(end) for end in (pair.difference, *pair.interval))
+
+
+def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
+    plan = decision.plan
+    needs = None
+    if pair.decided is None:
+        look = len(pair.p)
+        undecided = sum(not each.differs for each in decision.pairs)
+        needs = {
+            "seeds": plan.looks[look],
+            "level": plan.level(look, undecided),
+            "seeds_at_this_difference": runs_at_difference(decision, pair),
+        }
+    finite = _finite(pair)
+    return {
+        "first": pair.first,
+        "second": pair.second,
+        "verdict": pair.verdict,
+        "decided": None if pair.decided is None else str(pair.decided),
+        "seeds": pair.n_runs,
+        "p": list(pair.p),
+        "levels": list(pair.levels),
+        "difference": pair.difference if finite else None,
+        "interval": list(pair.interval) if finite else None,
+        "needs": needs,
+    }
+
+
+def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
+        table.add_column(column, overflow="fold")
+    for pair, facts in zip(decision.pairs, plain):
+        cells = (
+            versus(pair),
+            pair.verdict,
+            str(pair.n_runs),
+            *difference_text(pair),
+            f"{pair.p[-1]:.2g}" if pair.p else "",
+            needs_text(study, facts["needs"]),
+        )
+        table.add_row(*(Text(cell) for cell in cells))
+    return table
