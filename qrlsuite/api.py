@@ -8,6 +8,7 @@
     api.board("beam6g", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
+    api.decide("width.toml")
 
 Results print as tables, in a notebook and in a terminal (with rich). Errors are those of `qrlsuite.errors`; where a
 message names an option of a command, such as `--task`, the function's argument has the same name.
@@ -41,8 +42,10 @@ from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
 from qrlsuite.results import lookup, speed
 from qrlsuite.results.seeds import read_seeds
+from qrlsuite.studies import decided, decisions
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
+from qrlsuite.studies.decided import DecisionOutcome
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning import space
@@ -52,7 +55,7 @@ from qrlsuite.tuning.search import Request, Search, tuning_seeds
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
-__all__ = ["board", "compare", "evaluate", "load", "plot", "run_study", "train", "tune"]
+__all__ = ["board", "compare", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"]
 
 Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
@@ -420,6 +423,61 @@ def evaluate(
         raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
     names = [entries] if isinstance(entries, str) else list(entries)
     return evaluation.evaluate(Path(runs), names, task, best, episodes, seed, device, progress)
+
+
+def decide(
+    plan: str | PathLike[str],
+    *,
+    train: bool = True,
+    engine: str | Execution = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> DecisionOutcome:
+    """Compare entries with as many seeds as it takes, by a plan that `qrlsuite decide new` wrote.
+
+    Seeds are trained look by look, until every pair is decided or the plan's last look was taken. Interrupt it at any
+    time: the same call continues, and ends with the same decisions.
+
+    Parameters
+    ----------
+    plan:
+        The plan's file.
+    train:
+        False only reads what is decided so far.
+    engine, workers, device, runs:
+        As for `train`. The plan's seeds lie below `runs`/decisions.
+    progress:
+        Whether to show a bar on a terminal or in a notebook, and lines elsewhere.
+
+    Returns
+    -------
+    DecisionOutcome
+        With `pairs`, each with its `verdict`, `difference` (mean time below threshold of the second over that of the
+        first, minus 1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
+
+    Raises
+    ------
+    TaskError, OptionError
+        If the plan cannot be read or used, was changed after it began, or needs seeds that were trained already.
+    StoreError
+        If its results are damaged, or were changed after a look.
+    QrlSuiteError
+        If training failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> found = decide("width.toml", workers=8)  # doctest: +SKIP
+    >>> [(pair.first, pair.second, pair.verdict) for pair in found.pairs]  # doctest: +SKIP
+    [('mlp width=64', 'mlp width=16', 'mlp width=64 needs fewer')]
+    """
+    if not train:
+        return decided.read(Path(plan), Path(runs))
+    study = decisions.DecisionStudy(decisions.load(Path(plan)), str(plan), Path(runs))
+    return decided.run(study, _execution(engine, workers, device), not progress, "call")
 
 
 def tune(

@@ -5,24 +5,32 @@ from __future__ import annotations
 import base64
 import datetime
 import hashlib
+from collections.abc import Sequence
 from importlib import resources
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import qrlsuite
+from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard
-from qrlsuite.leaderboard.report import entries, sections
+from qrlsuite.leaderboard.report import entries, planned, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.studies.decided import DecisionOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
 SCRIPTS = ("plotly-basic.min.js", "page.js", "pairs.js", "figures.js")
 LONGEST_REASON = 600
 
 
-def render(board: Leaderboard, title: str = "Sample complexity leaderboard") -> str:
+def render(
+    board: Leaderboard,
+    title: str = "Sample complexity leaderboard",
+    plans: Sequence[DecisionOutcome] = (),
+    across: AcrossBoard | None = None,
+) -> str:
     """Return a leaderboard as one self-contained HTML page.
 
     It loads nothing: style, scripts, plotly.js and the learning curves are inside, and its content security
@@ -34,6 +42,10 @@ def render(board: Leaderboard, title: str = "Sample complexity leaderboard") -> 
         As `qrlsuite.leaderboard.board.build` returns it.
     title:
         The page's heading.
+    plans:
+        Decision plans, for a section of their own.
+    across:
+        A comparison over several tasks, for a section of its own.
     """
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
@@ -52,6 +64,8 @@ def render(board: Leaderboard, title: str = "Sample complexity leaderboard") -> 
             headline=sections.headline(boards, shown),
             sections=boards,
             entries=shown,
+            plans=[planned.view(plan) for plan in plans],
+            across=across,
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,

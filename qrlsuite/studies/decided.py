@@ -129,7 +129,7 @@ class DecisionOutcome(Shown):
 
 def run(
     study: DecisionStudy,
-    where: Execution,
+    chosen_execution: Execution,
     quiet: bool = False,
     again: Literal["command", "call"] = "command",
     looked: Callable[[DecisionOutcome], None] | None = None,
@@ -138,7 +138,7 @@ def run(
 
     Parameters
     ----------
-    where:
+    chosen_execution:
         The engine.
     quiet, again:
         As for `RunDisplay`.
@@ -157,10 +157,14 @@ def run(
     decision = study.look()
     while wanted := study.wanted(decision):
         for name, seeds in wanted.items():
-            work = execution.plan(study.folder, study.entries[name], where, seeds, study.file.epochs)
+            work = execution.plan(
+                study.folder, study.entries[name], chosen_execution, seeds, study.file.epochs
+            )
             if not work.groups and not work.busy:
                 continue
-            outcome = execution.train(work, where, RunDisplay(work, where.workers, quiet, again))
+            outcome = execution.train(
+                work, chosen_execution, RunDisplay(work, chosen_execution.workers, quiet, again)
+            )
             submitted += [outcome.submitted] if outcome.submitted is not None else []
         decision = study.look()
         if study.missing(decision) and study.wanted(decision) == wanted:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,11 +16,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from qrlsuite import registry
+from qrlsuite import api, registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
+from qrlsuite.errors import TaskError
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.specs import EngineSpec
 from tests.conftest import HANGS, TINY, Hold, results
@@ -189,6 +191,20 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         assert len(Scripted.trained) == 5, "nothing is trained twice"
 
 
+def test_python_decides_as_the_command_does() -> None:
+    write()
+    open_ = api.decide("widths.toml", train=False)
+    assert [pair.verdict for pair in open_.pairs] == ["open"] * 3
+    assert not Path("runs").exists()
+    found = api.decide("widths.toml", engine="scripted", progress=False)
+    assert found.finished
+    assert json.loads(json.dumps(found.as_dict())) == answer("status", "widths.toml")
+    assert "mlp width=16 needs fewer" in found._repr_html_()
+    assert api.decide("widths.toml", train=False).pairs == found.pairs
+    with pytest.raises(TaskError, match=r"plan nowhere.toml cannot be read"):
+        api.decide("nowhere.toml")
+
+
 def test_a_killed_worker_changes_no_byte(hold: Hold, tmp_path: Path) -> None:
     Path("tiny.toml").write_text(TINY)
     write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2,3", "--reason", "a test")
@@ -272,6 +288,9 @@ def test_a_new_plan_takes_the_first_unused_seeds() -> None:
     say("run", "widths.toml", "--engine", "scripted")
     assert answer("show", write(plan="again.toml"))["first_seed"] == 11000
     shown = say("show", "again.toml").stdout
+    assert re.search(r"at most 300 seeds: [\d.]+ to [\d.]+ core-hours", shown), (
+        "as little is known as elsewhere"
+    )
     assert "seeds 11000:11100; any false difference with probability 0.05 (3 pairs, pocock spending)" in shown
     assert "look at 20 seeds: different at p <= 0.0049 while all pairs are open" in shown
     assert "not begun" in shown

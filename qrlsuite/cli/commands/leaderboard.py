@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -27,9 +28,12 @@ from qrlsuite.cli.commands import verify
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import across as several
+from qrlsuite.leaderboard import board as boards
 from qrlsuite.leaderboard import latex, report, rules, tables
+from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
+from qrlsuite.studies import decided
 
 
 class Format(StrEnum):
@@ -76,7 +80,8 @@ def leaderboard(
 
     A second table ranks the same entries by mean time below threshold, with the differences in percent and the ranks
     that the decided pairs leave, at one error probability for all pairs (--alpha). --across compares entries that were
-    trained on several tasks with the same options.
+    trained on several tasks with the same options. The page also shows the plans of `qrlsuite decide` in the results
+    folder.
 
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """
@@ -86,7 +91,7 @@ def leaderboard(
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     if across is not None:
-        _across(across, task, entry or [], horizon, min_seeds, format_, rule, alpha, published, runs)
+        _across(across, task, entry or [], horizon, min_seeds, format_, output, rule, alpha, published, runs)
         return
     board = api.board(
         task,
@@ -103,16 +108,14 @@ def leaderboard(
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
+    if format_ is Format.html and _page(board, output, runs, [task] if task else []):
+        return
     if not board.sections:
         raise UnknownNameError(
             f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run; "
             "--published shows those that come with the suite"
         )
-    if format_ is Format.html:
-        path = output or runs / "leaderboard.html"
-        write_atomically(path, report.render(board).encode())
-        typer.echo(f"wrote {path}")
-    elif format_ is Format.markdown:
+    if format_ is Format.markdown:
         typer.echo(tables.markdown(board))
     elif format_ is Format.csv:
         typer.echo(tables.csv_text(board), nl=False)
@@ -128,6 +131,26 @@ def leaderboard(
             typer.echo(f"rule '{name}': {promise}")
 
 
+def _page(
+    board: Leaderboard,
+    output: Path | None,
+    runs: Path,
+    tasks: Sequence[str],
+    across: several.AcrossBoard | None = None,
+) -> bool:
+    """Write the page, with the decision plans of the tasks; returns whether there is anything to show."""
+    plans, unreadable = decided.in_folder(runs, tasks)
+    for line in unreadable:
+        typer.echo(f"left out: {line}", err=True)
+    if not board.sections and not plans:
+        return False
+    path = output or runs / "leaderboard.html"
+    shown = replace(board, refused=(*board.refused, *unreadable))
+    write_atomically(path, report.render(shown, plans=plans, across=across).encode())
+    typer.echo(f"wrote {path}")
+    return True
+
+
 def _across(
     across: Sequence[str],
     task: str | None,
@@ -135,16 +158,13 @@ def _across(
     horizon: int | None,
     min_seeds: int,
     format_: Format,
+    output: Path | None,
     rule: str | None,
     alpha: float,
     published: bool,
     runs: Path,
 ) -> None:
     """Compare entries over several tasks."""
-    if format_ is Format.html:
-        raise OptionError(
-            "--across: no page shows several tasks; --format table, markdown, json, csv or latex"
-        )
     if task is not None:
         raise OptionError(f"--across {across[0]}: leave --task {task} out, --across names the tasks")
     if rule is not None:
@@ -156,7 +176,10 @@ def _across(
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
-    if format_ is Format.table:
+    if format_ is Format.html:
+        single = boards.build(found, board.refused, horizon=horizon, alpha=alpha)
+        _page(single, output, runs, across, board)
+    elif format_ is Format.table:
         table_console(tables.WIDE).print(tables.across_table(board))
     elif format_ is Format.markdown:
         typer.echo(tables.across_markdown(board))

@@ -1,0 +1,200 @@
+"""Decision plans as the page shows them: verdicts, looks, and p against the levels that it was compared with."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from qrlsuite.leaderboard.report.encode import clean
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.studies.decided import (
+    DecisionOutcome,
+    difference_text,
+    needs_text,
+    question,
+    reason_note,
+    versus,
+)
+
+WIDTH, HEIGHT = 380, 230
+LEFT, RIGHT, TOP, BOTTOM = 46, 12, 12, 38
+"""Of the picture, in its own units: all of it, and the margins around the plot."""
+
+
+@dataclass(frozen=True)
+class PairLine:
+    """A pair of the table; `color` is that of its line in the picture."""
+
+    color: int
+    pair: str
+    verdict: str
+    seeds: int
+    difference: str
+    interval: str
+    needs: str
+
+
+@dataclass(frozen=True)
+class LookLine:
+    """A look: seeds of each entry, when it was taken, the share of alpha spent by then, its level, p of every pair.
+
+    Attributes
+    ----------
+    p:
+        For each pair its p, empty where it was closed before or the look was not taken; and whether it decided.
+    """
+
+    seeds: int
+    taken: str
+    spent: str
+    level: str
+    p: tuple[tuple[str, bool], ...]
+
+
+@dataclass(frozen=True)
+class DecisionPicture:
+    """p of every pair at each look, upwards by -log10, and the levels: SVG coordinates.
+
+    Attributes
+    ----------
+    band:
+        Points of the area between the levels while all pairs are open and while one is.
+    seeds, powers:
+        Ticks: position and text.
+    lines:
+        For each pair with a look: its color, the points of its line, and its dots (x, y, decided).
+    """
+
+    band: str
+    seeds: tuple[tuple[float, int], ...]
+    powers: tuple[tuple[float, str], ...]
+    lines: tuple[tuple[int, str, tuple[tuple[float, float, bool], ...]], ...]
+
+
+@dataclass(frozen=True)
+class PlanView:
+    """A plan, ready for the template."""
+
+    name: str
+    question: str
+    facts: tuple[tuple[str, str], ...]
+    note: str
+    pairs: tuple[PairLine, ...]
+    looks: tuple[LookLine, ...]
+    picture: DecisionPicture
+
+
+def view(outcome: DecisionOutcome) -> PlanView:
+    """Return a plan with its decisions for the template."""
+    study, plan = outcome.study, outcome.study.plan
+    plain = outcome.as_dict()
+    pairs = tuple(
+        PairLine(
+            color=index,
+            pair=clean(versus(pair)),
+            verdict=clean(pair.verdict),
+            seeds=pair.n_runs,
+            difference=difference_text(pair)[0].replace("-", "−"),
+            interval=difference_text(pair)[1].replace("-", "−"),
+            needs=needs_text(study, facts["needs"]).replace("<=", "≤"),
+        )
+        for index, (pair, facts) in enumerate(zip(outcome.pairs, plain["pairs"]))
+    )
+    return PlanView(
+        name=clean(study.file.name),
+        question=clean(question(study)),
+        facts=tuple((term, clean(value, 600)) for term, value in _facts(outcome, plain)),
+        note=clean(reason_note(study), 600),
+        pairs=pairs,
+        looks=tuple(_look(outcome, index) for index in range(len(plan.looks))),
+        picture=_picture(outcome),
+    )
+
+
+def _facts(outcome: DecisionOutcome, plain: dict[str, Any]) -> list[tuple[str, str]]:
+    study = outcome.study
+    entry = next(iter(study.entries.values()))
+    steps = study.file.epochs * entry.task.file.protocol.interactions
+    saved, used = plain["seeds_saved"], sum(each["seeds"] for each in plain["entries"])
+    if study.ended:
+        state = f"ended {_minute(study.ended)}, with open pairs"
+    elif outcome.finished:
+        state = "finished"
+    else:
+        state = f"goes on: next look at {max(outcome.decision.wanted.values())} seeds"
+    return [
+        ("State", state),
+        ("Task", f"{entry.task.name}, {steps} environment steps"),
+        ("Plan written", f"{study.file.written.astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC"),
+        ("Hash of the plan", study.file.hash),
+        (
+            "Seeds",
+            f"{format_seeds(study.file.block)}, {used} used" + (f", {saved} saved" if saved > 0 else ""),
+        ),
+        ("Any false difference", f"with probability {study.file.alpha:g} ({study.file.spending} spending)"),
+        ("Equal", f"within {100 * study.file.margin:g} percent"),
+    ]
+
+
+def _look(outcome: DecisionOutcome, index: int) -> LookLine:
+    plan, taken = outcome.study.plan, outcome.study.taken
+    seeds = plan.looks[index]
+    spent = 2 * plan.spending.spent([seeds / plan.looks[-1]], plan.alpha / 2)[0]
+    cells = []
+    for pair in outcome.pairs:
+        there = index < len(pair.p)
+        last = index == len(pair.p) - 1
+        cells.append((f"{pair.p[index]:.2g}" if there else "", there and last and pair.differs))
+    return LookLine(
+        seeds=seeds,
+        taken=_minute(taken[seeds]) if seeds in taken else "–",
+        spent=f"{spent:.3f}",
+        level=f"{plan.level(index, len(plan.family)):.4f}",
+        p=tuple(cells),
+    )
+
+
+def _picture(outcome: DecisionOutcome) -> DecisionPicture:
+    plan = outcome.study.plan
+    looks = range(len(plan.looks))
+    strict = [plan.level(look, len(plan.family)) for look in looks]
+    loose = [plan.level(look, 1) for look in looks]
+    smallest = min([*strict, *(p for pair in outcome.pairs for p in pair.p)])
+    top = max(3, math.ceil(-math.log10(smallest) + 0.2))
+
+    def x(seeds: float) -> float:
+        return round(LEFT + (WIDTH - LEFT - RIGHT) * seeds / plan.looks[-1], 1)
+
+    def y(p: float) -> float:
+        return round(HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * -math.log10(p) / top, 1)
+
+    def points(levels: Sequence[float], order: Sequence[int]) -> str:
+        return " ".join(f"{x(plan.looks[look])},{y(levels[look])}" for look in order)
+
+    lines = []
+    for color, pair in enumerate(outcome.pairs):
+        dots = tuple(
+            (x(seeds), y(p), pair.differs and look == len(pair.p) - 1)
+            for look, (seeds, p) in enumerate(zip(plan.looks, pair.p))
+        )
+        if dots:
+            lines.append((color, " ".join(f"{a},{b}" for a, b, _ in dots), dots))
+    return DecisionPicture(
+        band=f"{points(strict, looks)} {points(loose, looks[::-1])}",
+        seeds=tuple((x(seeds), seeds) for seeds in plan.looks),
+        powers=tuple(
+            (y(10.0**-power), "1" if power == 0 else f"{10.0**-power:g}") for power in range(top + 1)
+        ),
+        lines=tuple(lines),
+    )
+
+
+def _minute(when: str) -> str:
+    """Write a time of the log to the minute."""
+    try:
+        return f"{datetime.datetime.fromisoformat(when).astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC"
+    except ValueError:
+        return when

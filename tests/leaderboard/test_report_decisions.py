@@ -1,0 +1,130 @@
+"""The page's sections of decision plans and of several tasks."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite.cli.app import build
+from qrlsuite.leaderboard import across, board
+from qrlsuite.leaderboard.report import planned, render
+from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
+from qrlsuite.studies import decided, decisions
+from qrlsuite.studies.decided import DecisionOutcome
+from tests.conftest import TINY
+from tests.leaderboard import boards
+
+STARTS = {"mlp width=16": 5, "mlp width=8": 5, "mlp width=4": 14}
+"""The epoch from which the runs of an entry are good, one epoch earlier or later by turns."""
+
+
+def put(study: decisions.DecisionStudy, looks: int) -> DecisionOutcome:
+    """Leave the seeds of some looks in the plan's folder as workers would, and take the looks."""
+    study.begin()
+    decision = study.look()
+    for _ in range(looks):
+        for name, seeds in study.wanted(decision).items():
+            store = EntryStore.create(study.folder, study.entries[name])
+            for seed in seeds:
+                start = STARTS[name] + (seed + name.count("8")) % 2
+                folder = store.seed(seed)
+                rows = [{"epoch": epoch, "scores": [float(epoch >= start)] * 5} for epoch in range(1, 21)]
+                write_atomically(folder.table, table_bytes(rows))
+                lines = (json_line({"epoch": epoch, "cpu": 1.8}) for epoch in range(1, 21))
+                write_atomically(folder.timings, b"".join(lines))
+                record = {"status": "finished", "epochs": 20, "parameters": {}, "provenance": []}
+                folder.write_record({"plan": study.file.hash, **record})
+        decision = study.look()
+    return DecisionOutcome(study, decision)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results folder with a plan that is finished and one that is open; the task file lies beside it."""
+    folder = tmp_path_factory.mktemp("decisions")
+    task = folder / "tiny.toml"
+    task.write_text(TINY.replace("seeds = 4\nepochs = 3", "seeds = 100\nepochs = 20"))
+    put(decisions.write("three", str(task), list(STARTS), folder / "runs"), looks=2)
+    put(decisions.write("two", str(task), list(STARTS)[:2], folder / "runs"), looks=1)
+    return folder / "runs"
+
+
+def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -> None:
+    found, refused = decided.in_folder(runs)
+    assert refused == []
+    three, two = (planned.view(outcome) for outcome in found)
+    assert [line.verdict for line in three.pairs] == [
+        "equal within 10 percent",
+        "mlp width=16 needs fewer",
+        "mlp width=8 needs fewer",
+    ]
+    assert [(line.seeds, line.taken != "–") for line in three.looks] == [
+        (20, True),
+        (40, True),
+        (60, False),
+        (80, False),
+        (100, False),
+    ]
+    # Pocock's spending at a fifth of the runs: alpha x log(1 + (e - 1) / 5)
+    assert [line.spent for line in three.looks] == ["0.015", "0.026", "0.035", "0.043", "0.050"]
+    assert [bool(text) for text, _ in three.looks[1].p] == [True, False, False], "the others were closed"
+    assert [decided for _, decided in three.looks[0].p] == [False, True, True]
+    facts = dict(three.facts)
+    assert facts["State"] == "finished"
+    assert facts["Hash of the plan"] == found[0].study.file.hash
+    assert facts["Plan written"].endswith(" UTC")
+    assert facts["Seeds"] == "10000:10100, 100 used, 200 saved"
+    assert dict(two.facts)["State"] == "goes on: next look at 40 seeds"
+    assert "p ≤ 0.015 at 40 seeds" in two.pairs[0].needs
+    assert len(three.picture.lines) == 3
+    assert [len(dots) for _, _, dots in three.picture.lines] == [2, 1, 1]
+    other, _ = decided.in_folder(runs, ["beam6g"])
+    assert other == []
+
+
+def test_the_command_puts_plans_on_the_page(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs, tmp_path / "runs")
+    changed = tmp_path / "runs" / "decisions" / "two" / "plan.toml"
+    changed.write_text(changed.read_text().replace("alpha = 0.05", "alpha = 2"))
+    words = ["leaderboard", "--format", "html", "--runs", str(tmp_path / "runs")]
+    result = CliRunner().invoke(build(), words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "runs" / "leaderboard.html").read_text()
+    assert "three: which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in text
+    assert decided.in_folder(runs)[0][0].study.file.hash in text
+    assert re.search(r"plan.toml: alpha = 2.* is outside \(0, 1\)", text), "left out, with the reason"
+
+
+def test_times_of_the_log_are_written_to_the_minute() -> None:
+    assert planned._minute("2026-01-02T03:04:05+01:00") == "2026-01-02 02:04 UTC"
+    assert planned._minute("when it rained") == "when it rained"
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], runs: Path, width: int) -> None:
+    entries = []
+    for task in ("beam6g", "cartpole"):
+        entries += [replace(each, task=task, task_hash=task) for each in boards.graded(2, seeds=30)]
+    compared = across.compare(entries, ["beam6g", "cartpole"])
+    page = render(board.build(entries), plans=decided.in_folder(runs)[0], across=compared)
+    tab = opened(page, width=width)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert tab.locator("nav a[href='#decisions']").count() == 1
+    plans = tab.locator("#decisions article")
+    assert plans.count() == 2
+    assert "mlp width=16 needs fewer" in plans.first.inner_text()
+    assert plans.first.locator("circle").count() == 4
+    assert plans.first.locator("circle.closed").count() == 2
+    looks = plans.first.locator("details")
+    looks.locator("summary").click()
+    assert "0.026" in looks.inner_text()
+    table = tab.locator("#across tbody")
+    assert table.locator("tr").count() == 2
+    assert "model-0 width=1" in table.locator("tr").first.inner_text()
