@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite.statistics.ranking import reachable
+
 ROW = 30
 """Height of a line in pixels."""
 WIDTH = 150
@@ -79,14 +81,6 @@ def reduced(beats: NDArray[np.bool_], tiers: Sequence[float]) -> NDArray[np.bool
     through = down.astype(np.float32) @ reachable(down).astype(np.float32) > 0
     kept: NDArray[np.bool_] = beats & ~(down & through)
     return kept
-
-
-def reachable(relation: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return, shape (M, M), whether a chain of one or more steps leads from row to column."""
-    reach = relation.copy()
-    for _ in range(max(len(reach), 1).bit_length()):
-        reach |= reach.astype(np.float32) @ reach.astype(np.float32) > 0
-    return reach
 
 
 def _arc(start: int, end: int, longest: int, *, circle: bool) -> Arc:

@@ -41,7 +41,6 @@ from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, 
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.estimator import (
     at_cap,
-    printed,
     sample_complexity,
     unsettled,
 )
@@ -119,7 +118,6 @@ __all__ = [
     "outperformance",
     "paired_difference_rule",
     "power",
-    "printed",
     "probability_of_improvement",
     "rank",
     "rank_ranges",

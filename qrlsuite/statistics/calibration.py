@@ -137,11 +137,6 @@ class Rates:
         """Fraction of pairs in which either outperforms the other."""
         return self.first_wins + self.second_wins
 
-    @property
-    def winner_error(self) -> float:
-        """Monte-Carlo standard error of `winner`, for independent pairs."""
-        return float(np.sqrt(self.winner * (1 - self.winner) / self.n_pairs))
-
 
 def split_halves(
     entry: LearningCurves,
@@ -154,8 +149,8 @@ def split_halves(
 ) -> Rates:
     """Compare random halves of one entry's runs; every declared winner is false.
 
-    Splits of one entry share its runs, so `Rates.winner_error` does not apply: run this on several entries
-    and quote the spread over them. With an odd number of runs one is left out of each split. `tick` is called
+    Splits of one entry share its runs, so the pairs are not independent: run this on several entries and
+    quote the spread over them. With an odd number of runs one is left out of each split. `tick` is called
     after every pair, here and below.
 
     Raises

@@ -78,12 +78,3 @@ def at_cap(intervals: ArrayLike, horizon: int) -> BoolArray:
     """
     upper: BoolArray = np.asarray(intervals)[..., 1] >= whole(horizon, "horizon", at_least=1)
     return upper
-
-
-def printed(steps: int, *, is_unsettled: bool) -> str:
-    """Return S_hat as it is printed: `44000`, or `>= 44000` where it is a lower bound.
-
-    >>> printed(44000, is_unsettled=True)
-    '>= 44000'
-    """
-    return f">= {steps}" if is_unsettled else f"{steps}"

@@ -167,11 +167,17 @@ def _relation(
 
 def _circles(beats: BoolArray) -> BoolArray:
     """Return, shape (M, M), whether two entries can each be reached from the other (reflexive)."""
-    reach = beats | np.eye(len(beats), dtype=bool)
-    for _ in range(max(len(beats) - 1, 1).bit_length()):  # paths of doubled length each time
-        reach = reach.astype(np.float32) @ reach.astype(np.float32) > 0
+    reach = reachable(beats) | np.eye(len(beats), dtype=bool)
     circles: BoolArray = reach & reach.T
     return circles
+
+
+def reachable(relation: BoolArray) -> BoolArray:
+    """Return, shape (M, M), whether a chain of one or more steps of a relation leads from row to column."""
+    reach = relation.copy()
+    for _ in range(max(len(reach), 1).bit_length()):  # chains of doubled length each time
+        reach |= reach.astype(np.float32) @ reach.astype(np.float32) > 0
+    return reach
 
 
 def _tiers(beats: BoolArray, same: BoolArray, ranked: BoolArray) -> IntArray:

@@ -21,7 +21,6 @@ from qrlsuite.engine import api, local, worker
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
-from qrlsuite.installation import diagnosis
 from qrlsuite.options import build as build_options
 from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
@@ -253,7 +252,6 @@ def test_cores_are_counted_where_the_system_does_not_say_which_may_be_used(
     assert local.usable_cores() == len(os.sched_getaffinity(0))
     monkeypatch.delattr(os, "sched_getaffinity")
     assert local.usable_cores() == os.cpu_count()
-    assert diagnosis._machine(diagnosis.Diagnosis())["usable_cores"] == os.cpu_count()
 
 
 def test_a_process_is_told_from_a_later_one_where_there_is_no_proc(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,6 @@ from hypothesis.extra import numpy as hnp
 from qrlsuite.statistics import (
     Grid,
     at_cap,
-    printed,
     sample_complexity,
     unsettled,
 )
@@ -85,11 +84,6 @@ def test_unsettled_looks_at_the_last_epoch_only() -> None:
 def test_at_cap_looks_at_the_upper_percentile() -> None:
     intervals = [[[10.0, 200.0], [10.0, 199.9], [200.0, 200.0]]]
     assert at_cap(intervals, 200).tolist() == [[True, False, True]]
-
-
-def test_a_lower_bound_is_printed_as_one() -> None:
-    assert printed(44000, is_unsettled=False) == "44000"
-    assert printed(44000, is_unsettled=True) == ">= 44000"
 
 
 def test_thresholds_may_be_any_number_and_curves_too() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import textwrap
 from pathlib import Path
 
 import typer
@@ -13,14 +12,11 @@ from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import printable
-from qrlsuite.installation.diagnosis import Diagnosis, diagnose
-from qrlsuite.installation.report import rows
-
-WIDTH = 100
+from qrlsuite.installation import diagnose
 
 
 def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> None:
-    """Look at the installation, the machine, the plugins and the results folder, for a bug report.
+    """Test the installation, the plugins and the results folder, and print what a bug report needs.
 
     Imports every package that is needed and computes a circuit, which takes some seconds. Nothing is changed.
 
@@ -29,28 +25,18 @@ def doctor(runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> 
     Example: qrlsuite doctor > report.txt
     """
     with Console(stderr=True).status("") as status:
-        diagnosis = diagnose(runs, lambda doing: status.update(Text(printable(doing))))
+        diagnosis = diagnose(runs, lambda step: status.update(Text(printable(step))))
     if json_output:
         typer.echo(json.dumps({"ok": not diagnosis.broken, **dataclasses.asdict(diagnosis)}))
     else:
-        _print(diagnosis)
+        home = str(Path.home())
+        for name, text in diagnosis.facts.items():
+            typer.echo(f"{name:<10} {printable(text.replace(home, '~') if len(home) > 1 else text)}")
+        for problem in diagnosis.broken:
+            typer.secho(f"broken: {printable(problem)}", fg="red", bold=True)
+        for remark in diagnosis.remarks:
+            typer.secho(f"note: {printable(remark)}", fg="yellow")
+        if not diagnosis.broken:
+            typer.secho("everything that is needed works", fg="green", bold=True)
     if diagnosis.broken:
         raise typer.Exit(1)
-
-
-def _print(diagnosis: Diagnosis) -> None:
-
-    home = str(Path.home())
-    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    for name, text in rows(diagnosis.facts):
-        full_line = printable(text.replace(home, "~") if len(home) > 1 else text)
-        lines = textwrap.wrap(full_line, WIDTH - 14, break_long_words=False, break_on_hyphens=False) or ["-"]
-        for number, line in enumerate(lines):
-            console.print(f"{'' if number else printable(name):<13} {line}")
-    console.print()
-    for problem in diagnosis.broken:
-        console.print(f"broken: {printable(problem)}", style="bold red")
-    for remark in diagnosis.remarks:
-        console.print(f"note: {printable(remark)}", style="yellow")
-    if not diagnosis.broken:
-        console.print("everything that is needed works", style="bold green")
