@@ -16,6 +16,11 @@ from typing import Any
 
 import pytest
 
+from tests.commands import HANGS as HANGS  # tests take it from here
+from tests.commands import Command
+
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles the suite again
+sys.dont_write_bytecode = False
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored,
 # and so would every command that a test interrupts
 
@@ -170,7 +175,7 @@ class Hold:
         self.environment = installed(self.site)
         self._seen = 0
 
-    def wait(self, *processes: subprocess.Popen[str]) -> None:
+    def wait(self, *processes: subprocess.Popen[str] | Command) -> None:
         """Return when one more worker of these commands is held."""
         while len(list(self.site.glob("held-*"))) <= self._seen:
             assert all(process.poll() is None for process in processes), "it ended before a worker was held"
@@ -187,10 +192,6 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
     held = Hold(tmp_path)
     yield held
     held.release()
-
-
-HANGS = 3600
-"""Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
 
 
 @pytest.fixture

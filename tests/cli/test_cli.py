@@ -1,4 +1,4 @@
-"""The command line as a user meets it: a real process, its output, its exit codes."""
+"""The command line as a user meets it: a process, its output, its exit codes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,8 @@ import pytest
 from qrlsuite.cli import main
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
+from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, install, installed, most_epochs, results
-
-
-def qrlsuite(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=HANGS, check=False)
 
 
 @pytest.fixture
@@ -76,12 +72,7 @@ def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, ho
     assert qrlsuite(*words("straight")).returncode == 0
     straight = next((tmp_path / "straight" / "tiny").iterdir())
     stopped = tmp_path / "stopped" / "tiny" / straight.name
-    process = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words("stopped")],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=hold.environment,
-    )
+    process = start(*words("stopped"), env=hold.environment)
     hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
     _, message = process.communicate(timeout=HANGS)
@@ -96,12 +87,7 @@ def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, ho
 def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: Path, hold: Hold) -> None:
     runs = str(tmp_path / "runs")
     words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs]
-    first = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words, "--seeds", "0:2", "--workers", "1"],
-        stderr=subprocess.DEVNULL,
-        text=True,
-        env=hold.environment,
-    )
+    first = start(*words, "--seeds", "0:2", "--workers", "1", env=hold.environment)
     hold.wait(first)
     other = qrlsuite(*words, "--seeds", "3", "--epochs", "2")
     assert other.returncode == 0, other.stderr
@@ -116,9 +102,9 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
 def test_minutes_stop_a_run_as_ctrl_c_does(task: str, tmp_path: Path) -> None:
     words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "1", "--workers", "1"]
     runs = ["--runs", str(tmp_path / "runs")]
-    done = qrlsuite(*words, *runs, "--epochs", "1000000", "--minutes", "0.1")
+    done = qrlsuite(*words, *runs, "--epochs", "1000000", "--minutes", "0.02")
     assert done.returncode == 0, done.stderr
-    assert "stopped after 0.1 min, at epoch " in done.stderr
+    assert "stopped after 0.02 min, at epoch " in done.stderr
     assert "The same command continues from there" in " ".join(done.stderr.split())
     (entry,) = (tmp_path / "runs" / "tiny").iterdir()
     assert EntryStore(entry).finished([0], 1_000_000) == set()
@@ -136,18 +122,18 @@ def test_what_comes_next_works_as_it_is_printed(task: str, tmp_path: Path) -> No
     words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "1", "--epochs", "1"]
     own = Path(sys.executable).parent
     without = os.pathsep.join(p for p in os.environ["PATH"].split(os.pathsep) if p != str(own))
+    printed = []
     for path, program in ((os.environ["PATH"], "qrlsuite"), (without, str(own / "qrlsuite"))):
         env = {**os.environ, "PATH": path}
-        done = subprocess.run(
-            [sys.executable, "-m", "qrlsuite", *words, "--runs", str(folder)],
-            capture_output=True, text=True, check=True, env=env, cwd=tmp_path,
-        )  # fmt: skip
+        done = qrlsuite(*words, "--runs", str(folder), env=env, cwd=tmp_path)
         lines = [
             line.removeprefix("next: ") for line in done.stderr.splitlines() if line.startswith("next: ")
         ]
         assert [shlex.split(line)[0] for line in lines] == [program, program]
-        for line in lines:
+        printed.append([shlex.split(line)[1:] for line in lines])
+        for line in lines if program != "qrlsuite" else lines[:1]:
             subprocess.run(line, shell=True, check=True, env=env, cwd=tmp_path, capture_output=True)
+    assert printed[0] == printed[1]
     assert list(folder.glob("*.png"))
 
 
@@ -185,10 +171,7 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         (["--model", "mlp", "--device", "cuda:99"], "device = 'cuda:99'"),
         (["--model", "vqc-pennylane", "--set", "device=default.qubitt"], "did you mean 'default.qubit'?"),
     ):
-        done = subprocess.run(
-            [sys.executable, "-m", "qrlsuite", "run", "--task", task, *words, *runs, "--seeds", "2"],
-            capture_output=True, text=True, check=False, env=installed(site),
-        )  # fmt: skip
+        done = qrlsuite("run", "--task", task, *words, *runs, "--seeds", "2", env=installed(site))
         assert done.returncode == 2, done.stderr
         lines = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
         assert len(lines) == 1, done.stderr

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,6 +23,7 @@ from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import TaskError
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.specs import EngineSpec
+from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 
 STARTS = {
@@ -208,28 +208,14 @@ def test_python_decides_as_the_command_does() -> None:
 def test_a_killed_worker_changes_no_byte(hold: Hold, tmp_path: Path) -> None:
     Path("tiny.toml").write_text(TINY)
     write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2,3", "--reason", "a test")
-    words = [
-        sys.executable,
-        "-m",
-        "qrlsuite",
-        "decide",
-        "run",
-        "widths.toml",
-        "--workers",
-        "1",
-        "--json",
-        "--runs",
-    ]
-    process = subprocess.Popen([*words, "killed"], stdout=subprocess.PIPE, text=True, env=hold.environment)
+    words = ("decide", "run", "widths.toml", "--workers", "1", "--json", "--runs")
+    process = start(*words, "killed", env=hold.environment)
     hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
     process.communicate(timeout=HANGS)
     assert process.returncode == 130
     assert not list(Path("killed").glob("**/epochs.parquet"))
-    resumed, straight = (
-        json.loads(subprocess.run([*words, runs], check=True, capture_output=True).stdout)
-        for runs in ("killed", "straight")
-    )
+    resumed, straight = (json.loads(qrlsuite(*words, runs).stdout) for runs in ("killed", "straight"))
     assert resumed["pairs"] == straight["pairs"]
     assert resumed["finished"]
     hash_ = answer("show", "widths.toml", "--runs", "killed")["hash"]

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.runner import PendingEntry, cheapest_first, check_budget, fitting, survey
 from qrlsuite.studies.study import parse
+from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 
 STUDY = """
@@ -145,8 +145,8 @@ REDUCED = {"interactions": 80, "environments": 4, "validation_episodes": 4, "ste
 def reduced(name: str, folder: Path) -> str:
     """Write a study of the suite with small models, and the same tasks at a protocol of moments; returns its path."""
     text = Path(registry.study(name).path).read_text()
-    for start, grid in SIZES.items():
-        text = re.sub(rf"{re.escape(start)}[^]]*\]", grid, text)
+    for beginning, grid in SIZES.items():
+        text = re.sub(rf"{re.escape(beginning)}[^]]*\]", grid, text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
 
     def task(match: re.Match[str]) -> str:
@@ -385,25 +385,19 @@ def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_pat
 
 def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_path: Path, hold: Hold) -> None:
     runs = tmp_path / "runs"
-    words = [sys.executable, "-m", "qrlsuite", "study", "run", widths, "--only", "width=16"]
+    words = ["study", "run", widths, "--only", "width=16"]
     words += ["--epochs", "8", "--seeds", "2", "--workers", "1", "--runs"]
-    process = subprocess.Popen(
-        [*words, str(runs)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=hold.environment,
-    )
+    process = start(*words, str(runs), env=hold.environment)
     hold.wait(process)
     os.kill(process.pid, signal.SIGINT)
     out, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130, message
     assert "every finished epoch is saved. The same command continues" in message
     assert "study-widths-curves.png" in out
+    assert not list(runs.glob("tiny/*/seed-*/epochs.parquet"))
+    for folder in (runs, tmp_path / "straight"):
+        assert qrlsuite(*words, str(folder)).returncode == 0
     (folder,) = (runs / "tiny").iterdir()
-    assert not list(folder.glob("seed-*/epochs.parquet"))
-    subprocess.run([*words, str(runs)], check=True, capture_output=True)
-    subprocess.run([*words, str(tmp_path / "straight")], check=True, capture_output=True)
     (straight,) = (tmp_path / "straight" / "tiny").iterdir()
     assert all(results(folder, seed) == results(straight, seed) for seed in (0, 1))
 

@@ -6,8 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
-from tests.cli.test_cli import qrlsuite
+from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold
 from tests.core.test_tuning import SETTINGS, finish, varied, without_hours
 
@@ -29,18 +27,12 @@ def task(tmp_path: Path) -> str:
 
 
 def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
-    """Start a command in a session of its own and send it a signal once some seed has begun to learn."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "qrlsuite", *words],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env=hold.environment,
-    )
+    """Start a command and send it a signal once some seed has begun to learn."""
+    process = start(*words, env=hold.environment)
     hold.wait(process)
     os.kill(process.pid, sign)
     _, message = process.communicate(timeout=HANGS)
-    return process.returncode, message
+    return process.wait(), message
 
 
 def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path: Path, hold: Hold) -> None:

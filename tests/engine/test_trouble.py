@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,14 +19,9 @@ from qrlsuite.errors import StoreError
 from qrlsuite.results import claims
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.store import EntryStore
+from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 from tests.engine.stress import finished
-
-
-def qrlsuite(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "qrlsuite", *words]
-    every = {**os.environ, **environment}
-    return subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=False, env=every)
 
 
 @pytest.fixture
@@ -116,11 +110,8 @@ def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
 
 def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> None:
     """Both begin before either has claimed anything; between them, every seed is trained once."""
-    command = [sys.executable, "-m", "qrlsuite", *words, "--epochs", "6", "--runs", str(tmp_path / "runs")]
-    both = [
-        subprocess.Popen([*command, "--workers", w], stderr=subprocess.PIPE, text=True, env=hold.environment)
-        for w in ("1", "2")
-    ]
+    command = [*words, "--epochs", "6", "--runs", str(tmp_path / "runs")]
+    both = [start(*command, "--workers", w, env=hold.environment) for w in ("1", "2")]
     while all(process.poll() is None for process in both):  # one ends, for the seeds are held by the other
         time.sleep(0.02)
     hold.release()
@@ -131,7 +122,7 @@ def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> N
     assert "Traceback" not in text
     entry = finished(tmp_path / "runs", 2, 6)
     if entry is None:  # one refused a group for a seed of it that the other trained
-        assert subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode == 0
+        assert qrlsuite(*command).returncode == 0
         entry = finished(tmp_path / "runs", 2, 6)
     assert entry is not None
     for seed in (0, 1):

@@ -1,0 +1,285 @@
+"""Commands that start at once: forks of a process that has imported everything.
+
+A command of `start` or `qrlsuite` is a process of its own, with its own folder, environment, output, signals and
+workers, as one typed into a shell. Only the seconds of imports are paid once, by a process that waits to be forked.
+Tests of how a process starts (what it imports, from where, with which interpreter) use `subprocess`.
+
+This file is also the program of that process, `python -P commands.py SOCKET`, for whatever interpreter.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import importlib
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any
+
+PRELOADED = (
+    "matplotlib.figure",
+    "qrlsuite.cli",
+    "qrlsuite.engine.local",
+    "qrlsuite.engine.worker",
+    "qrlsuite.leaderboard",
+    "qrlsuite.plugins.circuits.native.cpu",
+    "qrlsuite.training.group",
+    "scipy.interpolate",
+    "torch",
+)
+HANGS = 3600
+"""Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
+
+
+class Fork:
+    """A process that calls `program`, with the methods of `subprocess.Popen` that the local engine uses."""
+
+    def __init__(self, program: Callable[[], object]) -> None:
+        self.returncode: int | None = None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python 3.12 warns of threads, of which there are none
+            self.pid = os.fork()
+        if self.pid == 0:
+            code = 1
+            try:
+                for number, handler in (
+                    (signal.SIGINT, signal.default_int_handler),
+                    (signal.SIGTERM, signal.SIG_DFL),
+                ):
+                    signal.signal(number, handler)
+                code = int(program() or 0)  # type: ignore[call-overload]
+            except SystemExit as end:
+                if isinstance(end.code, str):
+                    print(end.code, file=sys.stderr)
+                code = end.code if isinstance(end.code, int) else int(end.code is not None)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                with contextlib.suppress(OSError, ValueError):  # closed by the command, or nobody reads
+                    sys.stdout.flush()
+                    sys.stderr.flush()
+                os._exit(code)
+
+    def poll(self) -> int | None:
+        """Return the exit code of a process that has ended."""
+        if self.returncode is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self.returncode = os.waitstatus_to_exitcode(status) if pid else None
+        return self.returncode
+
+    def wait(self, timeout: float = HANGS) -> int:
+        """Return the exit code when the process has ended, or raise `subprocess.TimeoutExpired`."""
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("fork", timeout)
+            time.sleep(0.01)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        os.kill(self.pid, signal.SIGKILL)
+
+
+def _worker(
+    filters: list[Any],
+    command: list[str],
+    *,
+    env: Mapping[str, str],
+    stdout: IO[bytes],
+    preexec_fn: Callable[[], None],
+    **rest: object,
+) -> Fork:
+    """Stand in for the `subprocess.Popen` of the local engine."""
+
+    def program() -> int:
+        from qrlsuite.engine import worker
+
+        os.setsid()
+        preexec_fn()
+        os.dup2(stdout.fileno(), 1)
+        os.dup2(stdout.fileno(), 2)
+        os.environ.update(env)
+        warnings.filters[:] = filters  # type: ignore[index]
+        return worker.main(command[command.index("qrlsuite.engine.worker") + 1 :])
+
+    return Fork(program)
+
+
+def _command(words: list[str], folder: str, env: dict[str, str]) -> None:
+    """Be `python -W error -m qrlsuite WORDS` in a forked process."""
+    from qrlsuite import cli, registry
+    from qrlsuite.engine import local
+
+    registry.load.cache_clear()  # importing Gymnasium has loaded the plugins that were asked for then
+    filters = list(warnings.filters)
+    local.subprocess = SimpleNamespace(  # type: ignore[assignment]
+        Popen=functools.partial(_worker, filters),
+        DEVNULL=subprocess.DEVNULL,
+        TimeoutExpired=subprocess.TimeoutExpired,
+    )
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(env)
+    sys.path[:0] = [path for path in env.get("PYTHONPATH", "").split(os.pathsep) if path]
+    sys.argv = ["qrlsuite", *words]
+    warnings.simplefilter("error")
+    cli.main()
+
+
+def _answer(request: int, out: int, err: int, reply: int) -> None:
+    """Run one command to its end, in a process between it and the one that serves."""
+
+    def program() -> None:
+        os.close(reply)
+        os.setsid()
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(out, 1)
+        os.dup2(err, 2)
+        with open(request) as file:
+            asked = json.load(file)
+        _command(asked["words"], asked["folder"], asked["env"])
+
+    command = Fork(program)
+    os.write(reply, f"{command.pid}\n".encode())
+    os.write(reply, f"{command.wait()}\n".encode())
+
+
+def serve(control: int) -> None:
+    """Fork a command for every request, until the other end of the socket is closed."""
+    for name in PRELOADED:
+        importlib.import_module(name)
+    requests = socket.socket(fileno=control)
+    running: list[Fork] = []
+    while True:
+        message, files, _, _ = socket.recv_fds(requests, 1, 4)
+        running = [process for process in running if process.poll() is None]
+        if not message:
+            return
+        running.append(Fork(functools.partial(_answer, *files)))
+        for file in files:
+            os.close(file)
+
+
+@functools.cache
+def _server(python: str) -> socket.socket:
+    ours, theirs = socket.socketpair()
+    one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    process = subprocess.Popen(
+        [python, "-P", __file__, str(theirs.fileno())],
+        env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **one},
+        stdin=subprocess.DEVNULL,
+        pass_fds=[theirs.fileno()],
+        start_new_session=True,
+    )
+    theirs.close()
+
+    def stop() -> None:
+        ours.close()
+        process.wait()
+
+    atexit.register(stop)
+    return ours
+
+
+class Command:
+    """A started command, with the methods of `subprocess.Popen` that tests use; its output waits in files."""
+
+    def __init__(
+        self,
+        words: list[str],
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+        python: str = sys.executable,
+    ) -> None:
+        self.returncode: int | None = None
+        self._printed: tuple[str, ...] = ()
+        self._out, self._err = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - until the end
+        asked = {
+            "words": words,
+            "folder": str(cwd or Path.cwd()),
+            "env": dict(os.environ if env is None else env),
+        }
+        with tempfile.TemporaryFile() as request:
+            request.write(json.dumps(asked).encode())
+            request.seek(0)
+            self._reply, reply = os.pipe()
+            files = [request.fileno(), self._out.fileno(), self._err.fileno(), reply]
+            socket.send_fds(_server(python), [b"."], files)
+            os.close(reply)
+        self.pid = int(self._line(HANGS))
+
+    def _line(self, timeout: float) -> str:
+        """Return the next line of the reply, or nothing where there is none in time."""
+        if not select.select([self._reply], [], [], timeout)[0]:
+            return ""
+        line = b""
+        while not line.endswith(b"\n"):
+            part = os.read(self._reply, 1)
+            assert part, "the process that starts commands has ended"
+            line += part
+        return line.decode()
+
+    def poll(self) -> int | None:
+        """Return the exit code of a command that has ended."""
+        if self.returncode is None and (line := self._line(0)):
+            self.returncode = int(line)
+            os.close(self._reply)
+            self._printed = tuple(_content(file) for file in (self._out, self._err))
+        return self.returncode
+
+    def wait(self, timeout: float = HANGS) -> int:
+        """Return the exit code when the command has ended."""
+        if self.returncode is None:
+            assert select.select([self._reply], [], [], timeout)[0], "the command hangs"
+        code = self.poll()
+        assert code is not None
+        return code
+
+    def communicate(self, timeout: float = HANGS) -> tuple[str, str]:
+        """Wait for the end; return what was printed, and the messages."""
+        self.wait(timeout)
+        return self._printed[0], self._printed[1]
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+
+def _content(file: IO[bytes]) -> str:
+    with file:
+        file.seek(0)
+        return file.read().decode()
+
+
+def start(*words: str, env: Mapping[str, str] | None = None, cwd: Path | None = None) -> Command:
+    """Start `qrlsuite WORDS` and go on."""
+    return Command(list(words), env, cwd)
+
+
+def qrlsuite(
+    *words: str, env: Mapping[str, str] | None = None, cwd: Path | None = None, python: str = sys.executable
+) -> subprocess.CompletedProcess[str]:
+    """Run `qrlsuite WORDS` to its end."""
+    command = Command(list(words), env, cwd, python)
+    out, err = command.communicate()
+    assert command.returncode is not None
+    return subprocess.CompletedProcess(["qrlsuite", *words], command.returncode, out, err)
+
+
+if __name__ == "__main__":
+    serve(int(sys.argv[1]))
