@@ -121,10 +121,10 @@ def _worker(
     return Fork(program)
 
 
-def _command(words: list[str], folder: str, env: dict[str, str]) -> None:
-    """Be `python -W error -m qrlsuite WORDS` in a forked process."""
+def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -> int:
+    """Be `python -W error -m qrlsuite WORDS`, or a worker, in a forked process."""
     from qrlsuite import cli, registry
-    from qrlsuite.engine import local
+    from qrlsuite.engine import local, worker
 
     registry.load.cache_clear()  # importing Gymnasium has loaded the plugins that were asked for then
     filters = list(warnings.filters)
@@ -139,21 +139,23 @@ def _command(words: list[str], folder: str, env: dict[str, str]) -> None:
     sys.path[:0] = [path for path in env.get("PYTHONPATH", "").split(os.pathsep) if path]
     sys.argv = ["qrlsuite", *words]
     warnings.simplefilter("error")
+    if program == "worker":
+        return worker.main(words)
     cli.main()
+    return 0
 
 
 def _answer(request: int, out: int, err: int, reply: int) -> None:
     """Run one command to its end, in a process between it and the one that serves."""
 
-    def program() -> None:
+    def program() -> int:
         os.close(reply)
         os.setsid()
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.dup2(out, 1)
         os.dup2(err, 2)
         with open(request) as file:
-            asked = json.load(file)
-        _command(asked["words"], asked["folder"], asked["env"])
+            return _command(**json.load(file))
 
     command = Fork(program)
     os.write(reply, f"{command.pid}\n".encode())
@@ -206,11 +208,13 @@ class Command:
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
         python: str = sys.executable,
+        program: str = "qrlsuite",
     ) -> None:
         self.returncode: int | None = None
         self._printed: tuple[str, ...] = ()
         self._out, self._err = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - until the end
         asked = {
+            "program": program,
             "words": words,
             "folder": str(cwd or Path.cwd()),
             "env": dict(os.environ if env is None else env),
@@ -259,6 +263,9 @@ class Command:
     def send_signal(self, number: int) -> None:
         os.kill(self.pid, number)
 
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
 
 def _content(file: IO[bytes]) -> str:
     with file:
@@ -269,6 +276,11 @@ def _content(file: IO[bytes]) -> str:
 def start(*words: str, env: Mapping[str, str] | None = None, cwd: Path | None = None) -> Command:
     """Start `qrlsuite WORDS` and go on."""
     return Command(list(words), env, cwd)
+
+
+def start_worker(*words: str, env: Mapping[str, str] | None = None) -> Command:
+    """Start `python -m qrlsuite.engine.worker WORDS` and go on."""
+    return Command(list(words), env, program="worker")
 
 
 def qrlsuite(

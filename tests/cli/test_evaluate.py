@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
-from tests.cli.test_cli import qrlsuite
+from tests.commands import qrlsuite
 
 
 def test_table_json_and_picture(train: Callable[..., Path], tmp_path: Path) -> None:

@@ -139,6 +139,9 @@ STUDIES = (
 )
 SIZES = {"qubits = [": "qubits = [2, 3]", "layers = [": "layers = [1, 2]", "width = [": "width = [4, 8]"}
 """Grids of sizes, and what they become."""
+QUOTED = r'"[^"]*"'
+LONG_LIST = re.compile(rf"\[\s*(?:{QUOTED},\s*){{9,}}(?:{QUOTED})?\s*\]")
+"""Ten names and more, of tasks; every fifth is kept."""
 REDUCED = {"interactions": 80, "environments": 4, "validation_episodes": 4, "steps": 20}
 
 
@@ -148,6 +151,7 @@ def reduced(name: str, folder: Path) -> str:
     for beginning, grid in SIZES.items():
         text = re.sub(rf"{re.escape(beginning)}[^]]*\]", grid, text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
+    text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::5])}]", text)
 
     def task(match: re.Match[str]) -> str:
         content = Path(registry.task(match[1]).path).read_text()

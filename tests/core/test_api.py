@@ -16,7 +16,7 @@ from qrlsuite.engine import execution
 from qrlsuite.engine.display import Bar
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
 from qrlsuite.results.seeds import read_seeds
-from tests.cli.test_cli import qrlsuite as command
+from tests.commands import qrlsuite as command
 from tests.conftest import results
 from tests.core.test_dependencies import ALL
 

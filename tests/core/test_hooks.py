@@ -20,6 +20,7 @@ from qrlsuite.cli.extensions import add_commands
 from qrlsuite.experiment.catalog import hooks
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
+from tests.commands import qrlsuite
 from tests.conftest import install, installed
 
 NAMES = [row["name"] for row in hooks()]
@@ -96,13 +97,7 @@ def register_commands(app):
 
 
 def suite(site: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "qrlsuite", *words],
-        env=installed(site) | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return qrlsuite(*words, env=installed(site) | environment)
 
 
 def test_broken_distributions_are_named_and_the_rest_works(tmp_path: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +16,7 @@ from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from qrlsuite.training.trainer import Trainer
+from tests.commands import Command, start_worker
 from tests.conftest import HANGS, most_epochs, results
 
 EPOCHS = 6
@@ -98,30 +97,28 @@ def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
     assert results(straight, 0) == results(torn, 0)
 
 
-def test_sigkill_at_random_moments(train: Callable[..., Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
+def test_sigkill_at_random_moments(kills: int, train: Callable[..., Path]) -> None:
     """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
     entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
-    command = [sys.executable, "-c", "from qrlsuite.training import group; group.CHECKPOINT_SECONDS = 0.0\n"]
-    command[-1] += "from qrlsuite.engine import worker; raise SystemExit(worker.main())"
-    command += [str(entry), "--seeds", "0:3", "--epochs"]
+    words = (str(entry), "--seeds", "0:3", "--epochs")
+    env = {**os.environ, "QRLSUITE_CHECKPOINT_SECONDS": "0"}
     dice = random.Random(1)
-    for _ in range(6):
-        process = subprocess.Popen(
-            [*command, "1000000"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+    for _ in range(kills):
+        process = start_worker(*words, "1000000", env=env)
         _wait_for_claim(entry, process)
-        time.sleep(dice.uniform(0.0, 0.6))
+        time.sleep(dice.uniform(0.0, 0.3))
         os.kill(process.pid, signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
     epochs = 1 + most_epochs(entry)
-    subprocess.run([*command, str(epochs)], check=True)
+    assert start_worker(*words, str(epochs), env=env).wait() == 0
     straight = train("straight", [0, 1, 2], epochs)
     for seed in range(3):
         assert results(straight, seed) == results(entry, seed)
         assert [row["epoch"] for row in EntryStore(entry).seed(seed).epochs()] == list(range(1, epochs + 1))
 
 
-def _wait_for_claim(entry: Path, process: subprocess.Popen[bytes]) -> None:
+def _wait_for_claim(entry: Path, process: Command) -> None:
     while not any(claim.pid == process.pid for claim in claims(EntryStore(entry))):
         assert process.poll() is None
         time.sleep(0.02)
@@ -129,21 +126,11 @@ def _wait_for_claim(entry: Path, process: subprocess.Popen[bytes]) -> None:
 
 def test_sigterm_saves_and_exits_130(train: Callable[..., Path]) -> None:
     entry = train("runs", [0, 1], 1)
-    command = [
-        sys.executable,
-        "-m",
-        "qrlsuite.engine.worker",
-        str(entry),
-        "--seeds",
-        "0:2",
-        "--epochs",
-        "100000",
-    ]
-    process = subprocess.Popen(command)
+    process = start_worker(str(entry), "--seeds", "0:2", "--epochs", "100000")
     while len(EntryStore(entry).seed(0).epochs()) < 3:
         assert process.poll() is None
         time.sleep(0.1)
-    process.terminate()
+    process.send_signal(signal.SIGTERM)
     assert process.wait(HANGS) == 130
     assert checkpoint.headers(EntryStore(entry))[0].epoch >= 3
     assert not list((entry / "claims").glob("*.json"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.tasks import variants
 from qrlsuite.training import group
 from qrlsuite.training.trainer import build_envs
+from tests.commands import qrlsuite
 from tests.conftest import results
 from tests.environments.strangers import HERE
 
@@ -39,9 +39,8 @@ PRESETS = [
 
 
 def cli(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "qrlsuite", *words]
     environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(cwd)}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    return qrlsuite(*words, cwd=cwd, env=environment)
 
 
 @pytest.mark.parametrize("name", registry.load().names("tasks"))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.cli.commands.tune import LARGE
-from tests.cli.test_cli import qrlsuite
+from tests.commands import qrlsuite
 
 ROOT = Path(__file__).parents[2]
 SMALL = {

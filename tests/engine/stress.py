@@ -26,11 +26,12 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore, read_lines
+from tests import commands
+from tests.commands import Command
 from tests.conftest import TINY, results
 
 
@@ -69,66 +70,8 @@ def finished(runs: Path, seeds: int, epochs: int) -> Path | None:
     return None
 
 
-class Fork:
-    """A process that calls `program`, with the methods of `subprocess.Popen` that are used here."""
-
-    def __init__(self, program: Callable[[], int]) -> None:
-        self.code: int | None = None
-        self.pid = os.fork()
-        if self.pid == 0:
-            code = 1
-            try:
-                code = program()
-            except SystemExit as end:
-                code = end.code if isinstance(end.code, int) else int(end.code is not None)
-            finally:
-                os._exit(code)
-
-    def poll(self) -> int | None:
-        return self.wait(0.0)
-
-    def wait(self, timeout: float | None = None) -> int | None:
-        if self.code is None:
-            pid, status = os.waitpid(self.pid, 0 if timeout is None else os.WNOHANG)
-            self.code = os.waitstatus_to_exitcode(status) if pid else None
-        return self.code
-
-    def send_signal(self, number: int) -> None:
-        os.kill(self.pid, number)
-
-
-def forked_worker(command: list[str], *, stdout: Any, preexec_fn: Callable[[], None], **rest: object) -> Fork:
-    """Stand in for the `subprocess.Popen` of `LocalEngine`."""
-
-    def program() -> int:
-        from qrlsuite.engine import worker
-
-        os.setsid()
-        preexec_fn()
-        os.dup2(stdout.fileno(), 1)
-        os.dup2(stdout.fileno(), 2)
-        return worker.main(command[command.index("qrlsuite.engine.worker") + 1 :])
-
-    return Fork(program)
-
-
-def start_forked(command: list[str]) -> Fork:
-    def program() -> int:
-        from qrlsuite import cli
-        from qrlsuite.engine import local
-
-        os.environ.update(environment())
-        sys.argv = command[2:]
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
-            os.dup2(nowhere.fileno(), 2)
-        local.subprocess = SimpleNamespace(  # type: ignore[assignment]
-            Popen=forked_worker, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired
-        )
-        cli.main()
-        return 0
-
-    return Fork(program)
+def start_forked(command: list[str]) -> Command:
+    return commands.start(*command[3:], env=environment())
 
 
 def start(command: list[str]) -> subprocess.Popen[bytes]:
@@ -175,7 +118,7 @@ def disturbed(
 def undisturbed(task: Path, runs: Path, seeds: int, epochs: int, workers: int) -> Path:
     """Run the command to its end; returns the entry's folder."""
     while True:
-        subprocess.run(words(task, runs, seeds, epochs, workers), check=True, stdout=subprocess.DEVNULL)
+        assert commands.qrlsuite(*words(task, runs, seeds, epochs, workers)[3:]).returncode == 0
         entry = finished(runs, seeds, epochs)
         if entry is not None:  # else a worker of a killed command was still saving
             return entry
@@ -197,8 +140,6 @@ def main() -> None:
     parser.add_argument("--pause", type=float, default=3.0, help="seconds between kills, at most")
     parser.add_argument("--forked", action="store_true", help="start processes by forking")
     given = parser.parse_args()
-    if given.forked:
-        import qrlsuite.training.group  # noqa: F401 - what the forks are to have
     dice = random.Random(0)
     total: Counter[str] = Counter()
     began = time.monotonic()

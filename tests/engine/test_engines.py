@@ -26,7 +26,8 @@ from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
-from tests.conftest import HANGS, Hold, results
+from tests.commands import qrlsuite, start
+from tests.conftest import Hold, results
 
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
@@ -298,17 +299,18 @@ class Library(ctypes.CDLL):
 
 pathlib.Path.read_text, os.readlink, ctypes.CDLL = read_text, readlink, Library
 """
-"""For the start of every Python process: what Linux has and other systems, macOS among them, do not."""
+"""Loaded with the plugins of a command: what Linux has and other systems, macOS among them, do not."""
 
 
 def test_a_killed_run_goes_on_where_the_system_lacks_what_linux_has(
     hold: Hold, tiny_task: str, train: Callable[..., Path], tmp_path: Path
 ) -> None:
-    (hold.site / "sitecustomize.py").write_text(WITHOUT_LINUX)
+    plugin = hold.site / "holding.py"
+    plugin.write_text(WITHOUT_LINUX + plugin.read_text())
     runs = tmp_path / "runs"
-    command = [sys.executable, "-m", "qrlsuite", "run", "--task", tiny_task, "--model", "mlp"]
+    command = ["run", "--task", tiny_task, "--model", "mlp"]
     command += ["--set", "width=16", "--seeds", "1", "--epochs", "3", "--runs", str(runs)]
-    first = subprocess.Popen(command, env=hold.environment, stdout=subprocess.DEVNULL)
+    first = start(*command, env=hold.environment)
     hold.wait(first)
     (entry,) = (runs / "tiny").iterdir()
     first.kill()  # nothing tells the worker that its parent is gone: it looks, saves and gives the seed back
@@ -316,6 +318,6 @@ def test_a_killed_run_goes_on_where_the_system_lacks_what_linux_has(
     while list((entry / "claims").glob("*.json")):
         time.sleep(0.05)
     hold.release()
-    second = subprocess.run(command, env=hold.environment, capture_output=True, text=True, timeout=HANGS)
+    second = qrlsuite(*command, env=hold.environment)
     assert second.returncode == 0, second.stderr
     assert results(entry, 0) == results(train("alone", [0]), 0)

@@ -33,10 +33,10 @@ def words(tmp_path: Path) -> list[str]:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 200 kB of its own."""
+    """A disk of 48 kB of its own: twelve pages, two seeds need nine at once."""
     path = tmp_path / "disk"
     path.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(path)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(path)]
     done = subprocess.run(mount, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         pytest.skip(f"a small tmpfs cannot be mounted here: {done.stderr.strip()}")
@@ -64,16 +64,16 @@ def only_line(done: subprocess.CompletedProcess[str]) -> str:
 
 def test_a_full_disk(disk: Path, words: list[str], train: Callable[..., Path]) -> None:
     runs = ["--runs", str(disk / "runs"), "--workers", "1"]
-    full = qrlsuite(*words, *runs, "--epochs", "250")
+    full = qrlsuite(*words, *runs, "--epochs", "60")
     assert full.returncode == 2
     assert "finished epochs are kept" in only_line(full)
     assert "No space left on device" in only_line(full)
     for command in ("runs", "status", "leaderboard"):
         answer(command, "--runs", str(disk / "runs"))
     remount(disk, "size=20m")
-    resumed = qrlsuite(*words, *runs, "--epochs", "250")
+    resumed = qrlsuite(*words, *runs, "--epochs", "60")
     assert resumed.returncode == 0, resumed.stderr
-    straight, entry = train("straight", [0, 1], 250), finished(disk / "runs", 2, 250)
+    straight, entry = train("straight", [0, 1], 60), finished(disk / "runs", 2, 60)
     assert entry is not None
     for seed in (0, 1):
         assert results(entry, seed) == results(straight, seed)

@@ -175,10 +175,10 @@ def test_other_content_is_named(value: Any, message: str, tmp_path: Path) -> Non
         released.read(write(tmp_path / "other.pkl", value))
 
 
-@pytest.mark.parametrize("data", [b"", b"hello", b"\x80\x04", pickle.dumps(content())[:-100]])
-def test_what_is_no_pickle_is_named(data: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("data", [b"", b"hello", b"\x80\x04", None], ids=["empty", "text", "start", "cut"])
+def test_what_is_no_pickle_is_named(data: bytes | None, tmp_path: Path) -> None:
     path = tmp_path / "no.pkl"
-    path.write_bytes(data)
+    path.write_bytes(pickle.dumps(content())[:-100] if data is None else data)
     with pytest.raises(StoreError, match="not a readable pickle"):
         released.read(path)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from tests.commands import qrlsuite
 from tests.conftest import HANGS
 
 ROOT = Path(__file__).parents[2]
@@ -23,12 +24,16 @@ TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
 PIP = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
 
 
+def environment() -> dict[str, str]:
+    """Return an environment in which everything that is installed is loaded."""
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "QRLSUITE_LOAD_PLUGINS")}
+
+
 def run(*words: str | Path, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "QRLSUITE_LOAD_PLUGINS")}
     done = subprocess.run(
         [str(word) for word in words],
         cwd=cwd,
-        env=env,
+        env=environment(),
         capture_output=True,
         text=True,
         check=False,
@@ -97,8 +102,15 @@ class Installation:
     def pip(self, *words: str | Path) -> None:
         run(sys.executable, "-m", "pip", "--python", self.python, *words, cwd=self.folder)
 
+    def script(self, *words: str) -> str:
+        """Run the installed command as a shell does; returns what it prints."""
+        return run(self.folder / "venv" / "bin" / "qrlsuite", *words, cwd=self.folder).stdout
+
     def qrlsuite(self, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-        return run(self.folder / "venv" / "bin" / "qrlsuite", *words, cwd=self.folder, code=code)
+        """Run a command in a fork of a process of this installation."""
+        done = qrlsuite(*words, env=environment(), cwd=self.folder, python=str(self.python))
+        assert done.returncode == code, f"{words}\n{done.stdout}{done.stderr}"
+        return done
 
     def listed(self) -> dict[str, set[str]]:
         """Return the names that are registered by distributions other than the suite, by kind."""
@@ -128,7 +140,7 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
         "tasks": {"channel-hop"},
         "trackers": {"acme-log"},
     }
-    assert installed.qrlsuite("rzz-cost", "--qubits", "3", "--layers", "2").stdout == "12\n"
+    assert installed.script("rzz-cost", "--qubits", "3", "--layers", "2") == "12\n"
     assert "RZZ" in installed.qrlsuite("show", "ansatz", "rzz-ring", "--qubits", "3").stdout
 
 
