@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test docs install install-dev
+.PHONY: quickstart test test-long docs install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite run --task beam6g --model mlp --quick --epochs 5 --minutes 2 --runs $(RUNS)
@@ -18,9 +18,14 @@ quickstart: install
 test: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
-	cd $(VENV) && MYPYPATH=wheel bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
+	mkdir -p $(VENV)/package/qrlsuite
+	ln -sfn $(CURDIR)/qrlsuite/* $(CURDIR)/plugins $(CURDIR)/leaderboard $(CURDIR)/tasks $(VENV)/package/qrlsuite
+	cd $(VENV) && MYPYPATH=package bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15
+
+# What is long by nature, before a release: CONTRIBUTING.md says what, and when it last passed.
+test-long: install-dev
+	$(BIN)/python -m pytest -q -m long --durations=0
 
 # Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
 docs: install-dev
@@ -28,10 +33,14 @@ docs: install-dev
 	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 install: $(BIN)/python
+	rm -f $(VENV)/editable
 	$(BIN)/pip install --quiet .
 
-install-dev: $(BIN)/python
+install-dev: $(VENV)/editable
+
+$(VENV)/editable: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --editable '.[dev,docs]'
+	touch $@
 
 # The CPU build of torch first: a plain install would bring gigabytes of CUDA packages. With an NVIDIA GPU,
 # install the torch of your choice into $(VENV) before anything else; it is kept.

@@ -445,6 +445,19 @@ print(v.tolist())
 """
 
 
+def test_a_later_process_starts_from_the_cache() -> None:
+    circuit = ansatz("cz", qubits=2, layers=1)
+    parameters = {
+        name: torch.ones(p.shape, dtype=torch.float64, requires_grad=True)
+        for name, p in circuit.parameters.items()
+    }
+    values = expectations(circuit, torch.ones(3, 2, dtype=torch.float64), parameters, backend="native")
+    values.sum().backward()  # compiled now, if not before
+    later = subprocess.run([sys.executable, "-c", CALL], capture_output=True, text=True, check=True)
+    assert (later.stdout, later.stderr) == (f"{values.tolist()}\n", "")
+
+
+@pytest.mark.long
 def test_two_processes_may_compile_at_once_and_later_ones_start_from_the_cache(tmp_path: Path) -> None:
     env = {**os.environ, "QRLSUITE_CACHE": str(tmp_path)}
     both = [

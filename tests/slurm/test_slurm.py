@@ -41,7 +41,7 @@ def _slurm() -> str | None:
     return None
 
 
-pytestmark = pytest.mark.skipif(_slurm() is not None, reason=_slurm() or "")
+pytestmark = [pytest.mark.long, pytest.mark.skipif(_slurm() is not None, reason=_slurm() or "")]
 
 SEEDS, GROUPS = 8, 8
 
