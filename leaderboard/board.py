@@ -515,6 +515,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "parameters": {
             "classical": entry.parameters[0],
             "quantum": entry.parameters[1],
+            "fixed": entry.fixed,
             "networks": entry.networks,
         },
         "seeds": len(entry.seeds),

@@ -268,6 +268,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         model=identity["model"],
         parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
         networks=parameters.get("networks"),
+        fixed=int(parameters.get("fixed", 0)),
         curves=values,
         seeds=tuple(run.seed for run in kept),
         left_out=tuple(run.seed for run in runs if len(run.scores) < length),

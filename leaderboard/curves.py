@@ -29,6 +29,8 @@ class EntryCurves:
     ----------
     parameters:
         Trainable numbers of one agent: classical, and of circuits.
+    fixed:
+        Numbers of one agent that stay as drawn.
     networks:
         The networks that `parameters` are summed over, all that are trained. None in records of older versions, which
         counted the first alone, see `first_network_alone`.
@@ -95,6 +97,7 @@ class EntryCurves:
     color: int | None = None
     records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     networks: int | None = None
+    fixed: int = 0
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -138,7 +141,8 @@ class EntryCurves:
         return {
             "task": self.task,
             "entry": f"{self.label} ({self.name})",
-            "parameters": f"{classical} + {quantum} quantum" if quantum else f"{classical}",
+            "parameters": (f"{classical} + {quantum} quantum" if quantum else f"{classical}")
+            + self.fixed_text,
             "seeds": f"{n_runs}" + (f", {len(self.left_out)} unfinished left out" if self.left_out else ""),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
@@ -155,6 +159,11 @@ class EntryCurves:
     def _repr_html_(self) -> str:
         rows = (f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts.items())
         return f"<table>{''.join(rows)}</table>"
+
+    @property
+    def fixed_text(self) -> str:
+        """What follows the trainable numbers where others stay as drawn: ` (240 fixed)`."""
+        return f" ({self.fixed} fixed)" if self.fixed else ""
 
     @property
     def legend(self) -> str:

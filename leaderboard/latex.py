@@ -96,7 +96,7 @@ def _cells(row: TimeRow, of: Row) -> tuple[str, ...]:
         row.rank_text.replace("-", "--"),
         _JOINED[row.joined],
         escaped(row.entry.label),
-        f"{classical} + {quantum} q" if quantum else str(classical),
+        (f"{classical} + {quantum} q" if quantum else str(classical)) + row.entry.fixed_text,
         f"{len(row.entry.seeds)}" + r"$^\dagger$" * row.few,
         tier_text(of),
         f"{bound}{thousands(complexity.steps)} ({thousands(complexity.low)}--{thousands(complexity.high)}{cap})",

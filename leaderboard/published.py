@@ -91,6 +91,7 @@ class PublishedEntry:
             model=identity["model"],
             parameters=(count["classical"], count["quantum"]),
             networks=count.get("networks"),
+            fixed=count.get("fixed", 0),
             curves=self.curves,
             seeds=self.seeds,
             left_out=(),
@@ -170,8 +171,9 @@ def _read(folder: Path) -> PublishedEntry:
         folder,
         "provenance is not a list of records",
     )
-    for family in ("classical", "quantum"):
-        count = published["parameters"][family]
+    counts = {"fixed": 0, **published["parameters"]}
+    for family in ("classical", "quantum", "fixed"):
+        count = counts[family]
         _require(type(count) is int and 0 <= count < 10**12, folder, f"{family} parameters: {count!r}")
     networks = published["parameters"].get("networks", 1)
     _require(type(networks) is int and 0 <= networks < 10**6, folder, f"networks: {networks!r}")

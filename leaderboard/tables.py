@@ -50,7 +50,7 @@ def cells(section: Section, row: Row) -> tuple[str, ...]:
         tier_text(row),
         row.rests_on.text if row.rests_on is not None else "-",
         entry.label,
-        f"{classical} + {quantum} q" if quantum else str(classical),
+        (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text,
         f"{len(entry.seeds)}" + "*" * row.provisional,
         row.reference.text,
         f"{row.median_score:.3f}",
@@ -90,6 +90,8 @@ def notes(section: Section) -> list[str]:
         lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
     if any(row.entry.parameters[1] for row in section.rows):
         lines.append("q: quantum parameters")
+    if any(row.entry.fixed for row in section.rows):
+        lines.append("fixed: parameters that stay as they were drawn, beside the trained ones")
     alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
     if alone:
         lines.append(
@@ -297,6 +299,7 @@ def csv_text(board: Leaderboard) -> str:
                 **row,
                 "parameters_classical": count["classical"],
                 "parameters_quantum": count["quantum"],
+                "parameters_fixed": count["fixed"],
                 "networks": count["networks"],
                 **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
                 "interval_low": low,

@@ -85,11 +85,11 @@ def register_models(register: Callable[[specs.ModelSpec], None]) -> None:
         def register_models(register):
             register(
                 ModelSpec(
-                    name="fourier",
+                    name="waves",
                     summary="Random Fourier features and a linear layer",
                     family="classical",
-                    options="my_package.fourier:Options",
-                    build="my_package.fourier:build",
+                    options="my_package.waves:Options",
+                    build="my_package.waves:build",
                 )
             )
     """

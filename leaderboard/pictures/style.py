@@ -106,7 +106,7 @@ def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
 def parameters_text(entry: EntryCurves) -> str:
     """Write parameter counts: `387`, or `73 + 240` with the quantum ones second."""
     classical, quantum = entry.parameters
-    return f"{classical} + {quantum}" if quantum else f"{classical}"
+    return (f"{classical} + {quantum}" if quantum else f"{classical}") + entry.fixed_text
 
 
 def heading(entries: Sequence[EntryCurves]) -> str:

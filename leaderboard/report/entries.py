@@ -77,7 +77,7 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Name", clean(entry.name)),
         ("Algorithm", clean(entry.algorithm)),
         ("Model", clean(entry.model)),
-        ("Parameters", f"{classical:,} classical, {quantum:,} quantum{_networks(entry)}"),
+        ("Parameters", f"{classical:,} classical, {quantum:,} quantum{entry.fixed_text}{_networks(entry)}"),
         ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),

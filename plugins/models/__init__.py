@@ -1,4 +1,4 @@
-"""The built-in function approximators: a multilayer perceptron, and hybrid variational quantum circuits."""
+"""The built-in function approximators: multilayer perceptron, Fourier features, hybrid variational quantum circuits."""
 
 from __future__ import annotations
 
@@ -16,15 +16,25 @@ CIRCUITS = {
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp` and the `vqc-*` models."""
+    """Register `mlp`, `fourier` and the `vqc-*` models."""
     register(
         ModelSpec(
             name="mlp",
-            summary="Multilayer perceptron; options: width, depth, activation, init",
+            summary="Multilayer perceptron; options: width, depth, activation, init, input_scale",
             family="classical",
             options="qrlsuite.plugins.models.mlp:MLPOptions",
             build="qrlsuite.plugins.models.mlp:build",
             population="qrlsuite.plugins.models.mlp:population",
+        )
+    )
+    register(
+        ModelSpec(
+            name="fourier",
+            summary="Fourier features, trained or random, and a linear layer; options: frequencies, bandwidth, train",
+            family="classical",
+            options="qrlsuite.plugins.models.fourier:FourierOptions",
+            build="qrlsuite.plugins.models.fourier:build",
+            population="qrlsuite.plugins.models.fourier:population",
         )
     )
     for backend, summary in CIRCUITS.items():

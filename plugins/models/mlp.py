@@ -17,11 +17,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
+from qrlsuite.options import Since
 from qrlsuite.population import linear
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "relu": torch.relu,
     "tanh": torch.tanh,
+    "sin": torch.sin,
     "none": lambda x: x,
 }
 
@@ -32,13 +34,21 @@ class MLPOptions:
 
     width: Annotated[int, Field(ge=1, le=4096, description="units of each hidden layer")] = 64
     depth: Annotated[int, Field(ge=1, le=16, description="number of hidden layers")] = 2
-    activation: Annotated[Literal["relu", "tanh", "none"], Field(description="after each hidden layer")] = (
-        "relu"
-    )
+    activation: Annotated[
+        Literal["relu", "tanh", "sin", "none"], Field(description="after each hidden layer")
+    ] = "relu"
     init: Annotated[
-        Literal["torch", "he"],
-        Field(description="torch: uniform(-1/sqrt(in), 1/sqrt(in)), as released; he: normal(0, sqrt(2/in))"),
+        Literal["torch", "he", "siren"],
+        Field(
+            description="torch: uniform(-1/sqrt(in), 1/sqrt(in)), as released; he: normal(0, sqrt(2/in)); siren, for "
+            "activation sin: uniform(-sqrt(6/in), sqrt(6/in)), in the first layer uniform(-1/in, 1/in)"
+        ),
     ] = "torch"
+    input_scale: Annotated[
+        float,
+        Field(gt=0, allow_inf_nan=False, description="factor on the observation"),
+        Since("0.2.0"),
+    ] = 1.0
 
 
 class MLP(nn.Module):
@@ -51,16 +61,16 @@ class MLP(nn.Module):
     def __init__(self, sizes: Sequence[int], options: MLPOptions, generator: torch.Generator) -> None:
         super().__init__()
         self.layers = len(sizes) - 1
-        self.activation = options.activation
+        self.options = options
         for i, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
-            weight, bias = initial_layer(fan_in, fan_out, options.init, generator)
+            weight, bias = initial_layer(fan_in, fan_out, options.init, generator, first=i == 0)
             self.register_parameter(f"w{i}", nn.Parameter(weight))
             self.register_parameter(f"b{i}", nn.Parameter(bias))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, in) to (B, out)."""
         state = {name: p[None] for name, p in self.named_parameters()}
-        return _forward(x[None], state, self.layers, self.activation)[0]
+        return _forward(x[None], state, self.layers, self.options)[0]
 
 
 class MLPPopulation(nn.Module):
@@ -69,29 +79,38 @@ class MLPPopulation(nn.Module):
     def __init__(self, modules: Sequence[MLP]) -> None:
         super().__init__()
         self.layers = modules[0].layers
-        self.activation = modules[0].activation
+        self.options = modules[0].options
         for name, _ in modules[0].named_parameters():
             stacked = torch.stack([m.get_parameter(name).detach() for m in modules])
             self.register_parameter(name, nn.Parameter(stacked))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        return _forward(x, dict(self.named_parameters()), self.layers, self.activation)
+        return _forward(x, dict(self.named_parameters()), self.layers, self.options)
 
 
-def initial_layer(fan_in: int, fan_out: int, init: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw a layer's weight (fan_out, fan_in) and bias (fan_out,) as `torch.nn.Linear` or He et al. do."""
+def initial_layer(
+    fan_in: int, fan_out: int, init: str, generator: torch.Generator, first: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Draw a layer's weight (fan_out, fan_in) and bias (fan_out,).
+
+    `torch` is what `torch.nn.Linear` does, `he` is of He et al. (2015), `siren` of Sitzmann et al. (2020, section 3.2;
+    the factor that they put on the input is an option of its own here), where the `first` layer is another one.
+    """
     bound = 1.0 / math.sqrt(fan_in)
     if init == "he":
         weight = torch.randn((fan_out, fan_in), generator=generator) * math.sqrt(2.0 / fan_in)
         return weight, torch.zeros(fan_out)
-    weight = (torch.rand((fan_out, fan_in), generator=generator) * 2.0 - 1.0) * bound
+    width = bound if init == "torch" else 1.0 / fan_in if first else math.sqrt(6.0 / fan_in)
+    weight = (torch.rand((fan_out, fan_in), generator=generator) * 2.0 - 1.0) * width
     bias = (torch.rand(fan_out, generator=generator) * 2.0 - 1.0) * bound
     return weight, bias
 
 
-def _forward(x: Tensor, state: dict[str, Tensor], layers: int, activation: str) -> Tensor:
-    function = ACTIVATIONS[activation]
+def _forward(x: Tensor, state: dict[str, Tensor], layers: int, options: MLPOptions) -> Tensor:
+    function = ACTIVATIONS[options.activation]
+    if options.input_scale != 1.0:
+        x = x * options.input_scale
     for i in range(layers):
         x = linear(x, state[f"w{i}"], state[f"b{i}"])
         if i < layers - 1:

@@ -25,8 +25,8 @@ from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
 from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
-from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.options import field_names, without_later
+from qrlsuite.errors import OptionError, QrlSuiteError, nearest
+from qrlsuite.options import Since, field_names, without_later
 from qrlsuite.plugins.circuits.options import PennyLaneOptions, QiskitOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
@@ -60,6 +60,24 @@ class VQCOptions:
     dtype: Annotated[
         Literal["float32", "float64"], Field(description="precision of parameters and circuit values")
     ] = "float32"
+    train: Annotated[
+        str,
+        Field(
+            description="which parameters of the circuit learn, beside the linear layers: all, one by name (scaling or "
+            "weights), or linear: none; others stay as drawn"
+        ),
+        Since("0.2.0"),
+    ] = "all"
+    init_scale: Annotated[
+        float,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="factor on the initial values of parameters that multiply inputs: iqp, cx and cz draw their "
+            "scalings from [0, init_scale 2 pi)",
+        ),
+        Since("0.2.0"),
+    ] = 1.0
 
     @field_validator("ansatz_options")
     @classmethod
@@ -83,9 +101,20 @@ class VQCOptions:
         Raises
         ------
         UnknownNameError, OptionError
-            If there is no such ansatz, it has no such size or option, or the backend cannot compute it.
+            If there is no such ansatz, it has no such size, option or parameter, or the backend cannot compute it.
         """
         circuit = build_circuit(self)
+        if self.train not in ("all", "linear", *circuit.parameters):
+            choices = ("all", "linear", *circuit.parameters)
+            raise OptionError(
+                f"train = '{self.train}': the circuit of ansatz '{self.ansatz}' has no such parameter"
+                f"{nearest(self.train, choices)}"
+            )
+        if self.init_scale != 1.0 and not _scales(circuit):
+            raise OptionError(
+                f"init_scale = {self.init_scale:g}: the circuit of ansatz '{self.ansatz}' multiplies no input by a "
+                "parameter"
+            )
         if circuit.mean_field and not registry.circuit_backend(self.backend).mean_field:
             raise OptionError(mean_field_refusal(self.backend))
 
@@ -193,7 +222,12 @@ class _Hybrid(nn.Module):
         self._copies = 0
         self.input = _Affine(state["input.weight"], state["input.bias"])
         self.circuit = nn.ParameterDict(
-            {name: nn.Parameter(state[f"circuit.{name}"]) for name in runner.circuit.parameters}
+            {
+                name: nn.Parameter(
+                    state[f"circuit.{name}"], requires_grad=runner.options.train in ("all", name)
+                )
+                for name in runner.circuit.parameters
+            }
         )
         self.output = _Affine(state["output.weight"], state["output.bias"])
         self.register_buffer("shot_key", state["shot_key"])
@@ -285,6 +319,11 @@ def build_circuit(options: VQCOptions) -> Circuit:
     return ansatz(options.ansatz, options.qubits, options.layers, **given)
 
 
+def _scales(circuit: Circuit) -> set[str]:
+    """Return the names of the parameters that multiply inputs."""
+    return {a.scale.parameter for operation in circuit for a in operation.angles if a.scale is not None}
+
+
 def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Generator) -> VQC:
     """Build one agent's model with every random number drawn from `generator`.
 
@@ -309,6 +348,8 @@ def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Gene
     for name, parameter in circuit.parameters.items():
         uniform = torch.rand(parameter.shape, generator=generator)
         state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
+        if name in _scales(circuit):
+            state[f"circuit.{name}"] *= options.init_scale
     state["output.weight"], state["output.bias"] = initial_layer(
         len(circuit.observables), out_dim, "torch", generator
     )

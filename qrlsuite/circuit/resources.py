@@ -69,6 +69,61 @@ def shift_evaluations(circuit: Circuit) -> int:
     )
 
 
+LARGEST_RANK = 12
+"""Qubits that gates connect up to which `jacobian_rank` is quick: seconds."""
+
+
+def jacobian_rank(circuit: Circuit, seed: int = 0) -> int | None:
+    """Return how many directions of its parameters change what a circuit computes, to first order.
+
+    It is the rank of the Jacobian of all expectation values by all parameters, at random parameters as they are drawn
+    initially and at more than enough random inputs of a standard normal distribution. What is missing to the number of
+    parameters are scalars without effect, such as a last RZ, and those that others can stand for.
+
+    Parameters
+    ----------
+    seed:
+        Of the random parameters and inputs.
+
+    Returns
+    -------
+    int or None
+        None where gates connect more than `LARGEST_RANK` qubits, which takes too long.
+    """
+    if not circuit.mean_field and max(map(len, circuit.components())) > LARGEST_RANK:
+        return None
+    if circuit.parameter_count == 0:
+        return 0
+    import torch
+
+    from qrlsuite.circuit.api import create_backend
+
+    outputs = len(circuit.observables)
+    points = -(-2 * circuit.parameter_count // outputs) + 8
+    source = torch.Generator().manual_seed(seed)
+    x = torch.randn(points, 1, circuit.inputs, generator=source, dtype=torch.float64)
+    leaves = {}
+    for name, parameter in circuit.parameters.items():
+        drawn = torch.rand(parameter.shape, generator=source, dtype=torch.float64)
+        drawn = parameter.low + (parameter.high - parameter.low) * drawn
+        # every point is a seed of its own, so that one backward pass gives all points' gradients
+        leaves[name] = drawn.expand(points, *parameter.shape).clone().requires_grad_()
+    values = create_backend("native", circuit)(x, leaves)
+    if not values.requires_grad:
+        return 0
+    rows = []
+    for output in range(outputs):
+        found = torch.autograd.grad(
+            values[..., output].sum(), list(leaves.values()), retain_graph=True, materialize_grads=True
+        )
+        rows.append(torch.cat([gradient.reshape(points, -1) for gradient in found], dim=1))
+    return int(torch.linalg.matrix_rank(torch.cat(rows), rtol=RANK_TOLERANCE))
+
+
+RANK_TOLERANCE = 1e-10
+"""Singular values below this part of the largest one are rounding."""
+
+
 def gate_name(operation: Operation) -> str:
     """Return the name of a gate, with a `C` in front where it has an extra control."""
     return operation.gate if operation.control is None else f"C{operation.gate}"

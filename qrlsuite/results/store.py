@@ -362,7 +362,8 @@ class SeedStore:
 def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return the trainable numbers of an entry's agents, from the `run.json` of its seeds.
 
-    They are `classical` and `quantum`, summed over `networks`: all that are trained. Records without `networks` are of
+    They are `classical` and `quantum`, summed over `networks`: all that are trained; `fixed` are numbers of these
+    networks that stay as drawn, where there are some. Records without `networks` are of
     older versions, which counted the first network alone; they stand only where no newer one is there.
     """
     per_run = [dict(record.get("parameters", {})) for record in records]

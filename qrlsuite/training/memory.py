@@ -38,6 +38,7 @@ def group_bytes(entry: Entry, seeds: int) -> int:
 
     - a network of width w and depth d: (d - 1) w^2 parameters per seed; of these the network, Adam's two moments and
       (with a replay buffer) the target network, each with the copies for checkpoints, and the gradients;
+    - D Fourier frequencies: per sample 2 D features, and their products with the weights of two actions or more;
     - the replay buffer: S x buffer rows of two observations, action, reward and whether the episode went on, copied
       for checkpoints;
     - an epoch's draws from it: S x rounds x B in float64;
@@ -50,6 +51,8 @@ def group_bytes(entry: Entry, seeds: int) -> int:
     if "width" in model:
         weights = (int(model["depth"]) - 1) * int(model["width"]) ** 2
         total += 4 * seeds * weights * ((4 if "buffer" in algorithm else 3) * COPIES + 1)
+    if "frequencies" in model:
+        total += 4 * seeds * batch * int(model["frequencies"]) * (2 + 2 * 2)
     if "buffer" in algorithm:
         total += 4 * seeds * int(algorithm["buffer"]) * (2 * OBSERVATION + 3) * COPIES
         total += 8 * seeds * entry.task.file.protocol.rounds * batch
@@ -60,6 +63,8 @@ def group_bytes(entry: Entry, seeds: int) -> int:
 
 def _states(name: str, model: dict[str, Any], lanes: int, batch: int) -> int:
     """Return the bytes of circuit states, `batch` of the lanes belonging to one seed."""
+    if model["ansatz_options"].get("entangled", True) is not True:
+        return 0  # no state of several qubits
     amplitudes = 1 << int(model["qubits"])
     if name == "vqc-native":
         kept = lanes * amplitudes * (16 if model["dtype"] == "float64" else 8)
@@ -111,7 +116,8 @@ def require(entry: Entry, groups: Sequence[Sequence[int]], workers: int, free: i
         advice = f"train fewer at a time, first --seeds {first}{fewer}; what is trained stays and counts"
     else:
         advice = (
-            "not even one seed fits: give the model fewer qubits or units, or the algorithm a smaller buffer"
+            "not even one seed fits: give the model fewer qubits or units or frequencies, or the algorithm a smaller "
+            "buffer"
         )
     raise OptionError(
         f"'{entry.label}': training {sum(sizes)} seeds at a time takes {size_text(needed)} of memory or more, and "

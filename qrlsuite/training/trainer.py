@@ -157,7 +157,8 @@ class ModelBuilder:
         self.streams = streams
         self.statistics = statistics
         self.built: list[nn.Module] = []
-        self.parameters: list[tuple[int, int]] = []  # classical and quantum numbers of each network built
+        # classical, quantum and fixed numbers of each network built
+        self.parameters: list[tuple[int, int, int]] = []
 
     def __call__(self, out_dim: int) -> nn.Module:
         """Return a population of freshly initialized agents."""
@@ -174,7 +175,8 @@ class ModelBuilder:
             two = first, Streams(first.task_hash, first.seed + 1)
             hidden.require_none(lambda which: agent(two[which]), self.observation_size, spec.name)
             agents = [agent(streams) for streams in self.streams]
-            self.parameters.append(population.count_parameters(agents[0]))
+            fixed = population.count_fixed(agents[0])
+            self.parameters.append((*population.count_parameters(agents[0]), fixed))
             if spec.population is None:
                 together = population.stack(agents)
             else:
@@ -187,15 +189,17 @@ class ModelBuilder:
     def trained(self) -> dict[str, int]:
         """Return the trainable numbers of one agent, `classical` and `quantum`, summed over its trained `networks`.
 
-        A network that needs no gradients, as a target network that was built here and frozen, does not count.
+        Where numbers of these networks stay as drawn, they are counted as `fixed`. A network that needs no gradients,
+        as a target network that was built here and frozen, does not count.
         """
         counted = [
             numbers
             for numbers, module in zip(self.parameters, self.built)
             if any(parameter.requires_grad for parameter in module.parameters())
         ]
-        classical, quantum = (sum(numbers[family] for numbers in counted) for family in (0, 1))
-        return {"classical": classical, "quantum": quantum, "networks": len(counted)}
+        classical, quantum, fixed = (sum(numbers[kind] for numbers in counted) for kind in range(3))
+        found = {"classical": classical, "quantum": quantum, "networks": len(counted)}
+        return {**found, "fixed": fixed} if fixed else found
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""

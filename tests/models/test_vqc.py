@@ -246,7 +246,8 @@ def test_exact_models_do_not_count_passes():
 def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     own = set(options.field_names(VQCOptions))
     assert own == {
-        "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype"
+        "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype", "train",
+        "init_scale",
     }  # fmt: skip
     for name in BACKENDS:
         backend_options = registry.circuit_backend(name).options

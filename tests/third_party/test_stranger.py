@@ -135,7 +135,7 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
         "ansatzes": {"rzz-ring"},
         "circuit_backends": {"damped"},
         "environments": {"channel-hop"},
-        "models": {"fourier", "vqc-damped"},
+        "models": {"waves", "vqc-damped"},
         "significance_tests": {"half"},
         "tasks": {"channel-hop"},
         "trackers": {"acme-log"},
@@ -153,7 +153,7 @@ def test_it_passes_its_own_test(installed: Installation) -> None:
     """As its author runs it; the slow kinds are left to `qrlsuite check acme-qrl`, with the same rules."""
     shutil.copytree(Path(__file__).parent / "acme-qrl" / "tests", installed.folder / "tests")
     words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
-    words += ("-k", "fourier or half or log")
+    words += ("-k", "waves or half or log")
     assert "3 passed" in run(*words, cwd=installed.folder).stdout
 
 
@@ -214,7 +214,7 @@ def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> N
 
 def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Installation) -> None:
     budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "ranked")
-    for model in ("fourier", "mlp"):
+    for model in ("waves", "mlp"):
         installed.qrlsuite("run", "--task", "channel-hop", "--model", model, *budget)
 
     def board() -> dict[str, Any]:
@@ -223,7 +223,7 @@ def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Install
         return {row["label"]: row for row in section["rows"]}
 
     before = board()
-    assert set(before) == {"ddqn fourier features=24", "ddqn mlp width=64"}
+    assert set(before) == {"ddqn waves features=24", "ddqn mlp width=64"}
     assert {row["tier"] for row in before.values()} <= {1, 2}  # decided: 20 seeds each
     assert "not installed" not in installed.qrlsuite("leaderboard", "--runs", "ranked").stdout
 
@@ -232,19 +232,16 @@ def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Install
     assert board() == before
     table = " ".join(installed.qrlsuite("leaderboard", "--runs", "ranked").stdout.split())
     assert (
-        "not installed here: environment 'channel-hop', model 'fourier'; ranked from the stored curves"
-        in table
+        "not installed here: environment 'channel-hop', model 'waves'; ranked from the stored curves" in table
     )
     circuits = installed.qrlsuite("leaderboard", "--runs", "circuits", "--format", "markdown").stdout
     assert "ansatz 'rzz-ring'" in circuits
-    assert "fourier" in installed.qrlsuite("runs", "--runs", "ranked").stdout
-    compared = installed.qrlsuite("compare", "fourier", "mlp", "--runs", "ranked").stdout
-    assert "fourier" in compared
+    assert "waves" in installed.qrlsuite("runs", "--runs", "ranked").stdout
+    compared = installed.qrlsuite("compare", "waves", "mlp", "--runs", "ranked").stdout
+    assert "waves" in compared
 
-    gone = installed.qrlsuite(
-        "run", "--task", "channel-hop", "--model", "fourier", "--runs", "ranked", code=2
-    )
+    gone = installed.qrlsuite("run", "--task", "channel-hop", "--model", "waves", "--runs", "ranked", code=2)
     assert "unknown task 'channel-hop'" in gone.stderr
-    gone = installed.qrlsuite("run", "--task", "beam6g", "--model", "fourier", "--runs", "ranked", code=2)
-    assert "unknown model 'fourier'" in gone.stderr
+    gone = installed.qrlsuite("run", "--task", "beam6g", "--model", "waves", "--runs", "ranked", code=2)
+    assert "unknown model 'waves'" in gone.stderr
     installed.qrlsuite("run", "--task", "cartpole", "--model", "mlp", *TINY, "--runs", "others")

@@ -60,7 +60,7 @@ EXCHANGE = 4
 FIXED = {"X": AXIS_X, "CNOT": AXIS_X, "Z": AXIS_Z, "CZ": AXIS_Z}
 """Gates that are half turns, by axis. Controlled ones have a phase too: X = i RX(pi)."""
 
-Tables = namedtuple("Tables", "steps angles constants rotations factors blocks observables")
+MeanFieldTables = namedtuple("MeanFieldTables", "steps angles constants rotations factors blocks observables")
 """A program's arrays, see `MeanFieldProgram` for each, in the form that kernels take."""
 
 
@@ -137,9 +137,9 @@ def _rotations(compiler: Compiler, operation: Operation) -> list[tuple[int, int,
     return [*half_turn, (PHASE, compiler.angle(Angle(constant=math.pi / 2)), 1.0)]
 
 
-def tables(program: MeanFieldProgram) -> Tables:
+def tables(program: MeanFieldProgram) -> MeanFieldTables:
     """Return a program's arrays for the kernels."""
-    return Tables(*(getattr(program, name) for name in Tables._fields))
+    return MeanFieldTables(*(getattr(program, name) for name in MeanFieldTables._fields))
 
 
 def scratch(program: MeanFieldProgram, lanes: int, dtype: Any) -> Scratch:

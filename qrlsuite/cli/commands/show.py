@@ -11,6 +11,7 @@ import typer
 
 from qrlsuite import circuit, registry
 from qrlsuite.circuit import drawing
+from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
@@ -134,7 +135,14 @@ def _draw(
         raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
     chosen = {setting.name: setting.value for setting in map(parse_setting, settings)}
     drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
-    content["resources"] = dataclasses.asdict(drawing.resources(drawn))
+    counted = dataclasses.asdict(drawing.resources(drawn))
+    content["resources"] = {}
+    for what, count in counted.items():
+        content["resources"][what] = count
+        if what == "parameters":
+            rank = jacobian_rank(drawn)
+            text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
+            content["resources"]["jacobian_rank"] = text if rank is None else rank
     if figure is not None:
         write_atomically(figure, pictures.encode(drawing.draw_figure(drawn), format_))
         content["figure"] = str(figure)

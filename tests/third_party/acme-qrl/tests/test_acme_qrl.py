@@ -3,7 +3,7 @@ from qrlsuite.testing import assert_conforms
 
 EVERYTHING = [
     ("ansatz", "rzz-ring"),
-    ("model", "fourier"),
+    ("model", "waves"),
     ("environment", "channel-hop"),
     ("task", "channel-hop"),
     ("circuit-backend", "damped"),

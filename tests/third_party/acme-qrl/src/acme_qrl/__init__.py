@@ -21,7 +21,7 @@ def register_ansatzes(register):
 def register_models(register):
     register(
         specs.ModelSpec(
-            name="fourier",
+            name="waves",
             summary="trained Fourier features, the classical relative of re-uploading circuits",
             family="classical",
             options="acme_qrl.model:Options",

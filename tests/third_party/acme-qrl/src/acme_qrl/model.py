@@ -10,7 +10,7 @@ from torch import nn
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options of `fourier`."""
+    """Options of `waves`."""
 
     features: Annotated[int, Field(ge=1, description="number of frequencies")] = 24
     scale: Annotated[float, Field(gt=0, description="spread of the initial frequencies")] = 3.0
