@@ -50,7 +50,7 @@ from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning import space
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.search import Request, Search, tuning_seeds
+from qrlsuite.tuning.search import Request, Search, default_sampler, split_model, tuning_seeds
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
@@ -482,18 +482,19 @@ def decide(
 
 def tune(
     task: str,
-    model: str,
+    model: str | Sequence[str],
     *,
     algorithm: str | None = None,
     options: Mapping[str, Any] | None = None,
     vary: Mapping[str, Any] | None = None,
     grid: str | None = None,
-    sampler: Literal["grid", "one-at-a-time", "random", "tpe"] = "grid",
+    sampler: Literal["halving", "grid", "one-at-a-time", "random", "tpe"] | None = None,
     trials: int | None = None,
+    core_hours: float | None = None,
     sampler_seed: int = 0,
     seeds: Seeds = 20,
     epochs: int | None = None,
-    objective: Literal["cell", "area"] = "cell",
+    objective: Literal["time", "cell", "area"] = "time",
     minutes: float | None = None,
     out: str | PathLike[str] | None = None,
     engine: str | Execution = "local",
@@ -501,31 +502,40 @@ def tune(
     device: str = "cpu",
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
-) -> Search:
-    """Search for settings with a small sample complexity, on seeds reserved for tuning.
+) -> list[Search]:
+    """Search settings with which models learn in few steps, on seeds that entries are never judged by.
 
-    Interrupt it at any time: the same call continues, and ends with the same preset as if it had never stopped.
+    Interrupt it at any time: the same call continues, and ends with the same presets as if it had never stopped.
 
     Parameters
     ----------
-    task, model, algorithm, engine, workers, device, runs:
+    task, algorithm, engine, workers, device, runs:
         As for `train`. Trials lie below `runs`/tuning.
+    model:
+        A model, with settings if need be (`"mlp width=16"`); or several, which get equal budgets.
     options:
         Values that all trials share; they are not varied.
     vary:
         What is varied: lists of values, or ranges: `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`.
     grid:
-        What is varied by a grid's name (`paper`) or a grid file's path; `vary` replaces options of it.
+        What is varied by a grid's name (`paper`) or a grid file's path; `vary` replaces options of it. Without it
+        `halving` varies the options that models and algorithms mark as `Tuned`.
     sampler:
-        All combinations, one option at a time, at random, or Optuna's TPE.
-    trials, sampler_seed:
-        For `random` and `tpe`: how many settings, and which.
+        Successive halving, all combinations, one option at a time, at random, or Optuna's TPE. None takes all
+        combinations of what `vary` or `grid` list, and halving without them.
+    trials:
+        How many settings: for `random` and `tpe` in all, for `halving` per varied option (8 by default).
+    core_hours:
+        For `halving`, instead of `trials`: as many settings as this many core-hours of each model hold.
+    sampler_seed:
+        For `random` and `tpe`: another one proposes other settings.
     seeds:
-        Runs of each trial: a number counts from seed 1,000,000.
+        Runs of each trial, with `halving` of each in the last rung: a number counts from seed 1,000,000.
     epochs:
         Of each trial; None takes the task's protocol.
     objective:
-        What is minimized: S_hat at the task's reference `cell`, or its mean over the ranking grid (`area`).
+        What is minimized: M, the mean number of steps below the task's thresholds (`time`), S_hat at the task's
+        reference `cell`, or its mean over the ranking grid (`area`).
     minutes:
         Begin no trial that would not end within this time. Every call gets it anew.
     out:
@@ -535,9 +545,9 @@ def tune(
 
     Returns
     -------
-    Search
-        With `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None where no trial
-        has finished, or some are `pending` in another process or a queue.
+    list of Search
+        One per model, with `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None
+        where the search is not over.
 
     Raises
     ------
@@ -550,8 +560,8 @@ def tune(
 
     Examples
     --------
-    >>> found = tune("beam6g", "mlp", vary={"lr": [1e-3, 5e-4]}, seeds=20)  # doctest: +SKIP
-    >>> entry = train("beam6g", "mlp", preset=str(found.written))  # doctest: +SKIP
+    >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
+    >>> entry = train("beam6g", "mlp", preset=str(small.written))  # doctest: +SKIP
     """
     preset = None if out is None else Path(out)
     if preset is not None and preset.suffix != ".toml":
@@ -564,26 +574,33 @@ def tune(
     varied = {
         name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
     }
-    request = Request(
-        task=task,
-        model=model,
-        algorithm=algorithm,
-        settings=tuple(from_mapping(options)),
-        grid=None if grid is None else space.load(grid),
-        varied=tuple(from_mapping(varied)),
-        sampler=sampler,
-        trials=trials,
-        sampler_seed=sampler_seed,
-        seeds=tuning_seeds(seeds),
-        epochs=epochs,
-        objective=objective,
-    )
-    searches = tuning_runner.build([request], Path(runs))
+    requests = []
+    for text in [model] if isinstance(model, str) else model:
+        name, own = split_model(text)
+        request = Request(
+            task=task,
+            model=name,
+            algorithm=algorithm,
+            settings=(*from_mapping(options), *own),
+            grid=None if grid is None else space.load(grid),
+            varied=tuple(from_mapping(varied)),
+            sampler=sampler or default_sampler(grid or vary),
+            trials=trials,
+            core_hours=core_hours,
+            sampler_seed=sampler_seed,
+            seeds=tuning_seeds(seeds),
+            epochs=epochs,
+            objective=objective,
+        )
+        requests.append(request)
+    if not requests or (preset is not None and len(requests) > 1):
+        raise OptionError("model: give at least one model, and with `out` only one")
+    searches = tuning_runner.build(requests, Path(runs))
     display = TuneDisplay(searches, chosen_execution.workers, not progress, "call")
     display.begin()
     budget = None if minutes is None else 60 * minutes
     tuning_runner.run(searches, Path(runs), chosen_execution, display, budget, preset)
-    return searches[0]
+    return searches
 
 
 @dataclass(frozen=True)

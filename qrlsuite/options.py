@@ -10,7 +10,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import pydantic
 import pydantic_core
@@ -50,6 +50,39 @@ class Since:
             raise PluginError(
                 f"Since({self.version!r}): write the version that brought the option, such as 0.2.0"
             )
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Marks an option that `qrlsuite tune` searches, with the range in which the search begins.
+
+    ::
+
+        lr: Annotated[float, Field(gt=0, description="..."), Tuned(2e-4, 1e-2)] = 5e-4
+
+    Values are drawn log-uniformly. Where the best one lies at an end of the range, the search goes on beyond it, as far
+    as the option admits.
+
+    Attributes
+    ----------
+    low, high:
+        0 < low < high.
+    family:
+        Tuned only for models of this family; None for all.
+
+    Raises
+    ------
+    PluginError
+        If that is no such range.
+    """
+
+    low: float
+    high: float
+    family: Literal["classical", "quantum"] | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low < self.high < math.inf:
+            raise PluginError(f"Tuned({self.low!r}, {self.high!r}): give a range with 0 < low < high")
 
 
 def field_names(cls: type[Any]) -> list[str]:
@@ -258,10 +291,8 @@ def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
     PluginError
         If one has no default.
     """
-    if is_dataclass(cls) and not hasattr(cls, "__pydantic_fields__"):
-        cls = pydantic.dataclasses.dataclass(cls, frozen=vars(cls)["__dataclass_params__"].frozen)
     added = {}
-    for name, info in (getattr(cls, "model_fields", None) or getattr(cls, "__pydantic_fields__", {})).items():
+    for name, info in _pydantic_fields(cls).items():
         for mark in info.metadata:
             if isinstance(mark, Since):
                 if info.is_required():
@@ -271,6 +302,19 @@ def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
                 default = info.get_default(call_default_factory=True)
                 added[name] = mark.version, pydantic_core.to_jsonable_python(default)
     return added
+
+
+def tuned(cls: type[Any]) -> dict[str, Tuned]:
+    """Return the marks of every option marked `Tuned`, by name."""
+    fields_of = _pydantic_fields(cls)
+    return {n: mark for n, info in fields_of.items() for mark in info.metadata if isinstance(mark, Tuned)}
+
+
+def _pydantic_fields(cls: type[Any]) -> Mapping[str, pydantic.fields.FieldInfo]:
+    """Return what pydantic knows of every option, of a plain dataclass too."""
+    if is_dataclass(cls) and not hasattr(cls, "__pydantic_fields__"):
+        cls = pydantic.dataclasses.dataclass(cls, frozen=vars(cls)["__dataclass_params__"].frozen)
+    return getattr(cls, "model_fields", None) or getattr(cls, "__pydantic_fields__", {})
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,22 @@ class TuningRecord(_Table):
     """How settings were found, and what it took; None is what is not known."""
 
     task: Annotated[str | None, Field(max_length=80)] = None
-    objective: Literal["cell", "area"] | None = None
+    objective: Literal["time", "cell", "area"] | None = None
     value: Annotated[
-        float | None, Field(ge=0, description="S_hat of the settings found, in steps, on the tuning seeds")
+        float | None, Field(ge=0, description="objective of the settings found, in steps, on the tuning seeds")
     ] = None
     sampler: Annotated[str | None, Field(max_length=40)] = None
     trials: Annotated[int | None, Field(ge=1, description="settings that were tried")] = None
     planned: Annotated[int | None, Field(ge=1, description="settings that were to be tried")] = None
     seeds: Annotated[str | None, Field(max_length=10_000, description="as --seeds reads them")] = None
+    runs: Annotated[int | None, Field(ge=1, description="of all trials together, a seed each")] = None
+    budget: Annotated[
+        str | None, Field(max_length=200, description="what the search was allowed; equal for models tuned together")
+    ] = None
+    rungs: Annotated[
+        tuple[tuple[int, int], ...] | None,
+        Field(description="successive halving: settings and seeds of each rung, the last one's seeds fresh"),
+    ] = None
     epochs: Annotated[int | None, Field(ge=1, description="of every trial")] = None
     steps: Annotated[int | None, Field(ge=0, description="environment steps of all trials together")] = None
     space: Annotated[dict[str, Any] | None, Field(description="what every option was chosen from")] = None
@@ -155,7 +163,8 @@ def record_of(
         if content.get(name) != value
     )
     record = EntryTuning(**tuning.model_dump(), preset=source, changed=tuple(changed))
-    return record.model_dump(mode="json")
+    unknown = {name for name in ("runs", "budget", "rungs") if getattr(record, name) is None}
+    return record.model_dump(mode="json", exclude=unknown)  # version 0.1.0 reads records without these keys only
 
 
 def dumps(preset: PresetFile, comment: str = "") -> str:

@@ -1,7 +1,8 @@
-"""Tuning: choosing settings by sample complexity, on seeds that no entry is judged by.
+"""Tuning: choosing settings by how fast they learn, on seeds that no entry is judged by.
 
 - `space`: search grids, and the settings that they span.
 - `samplers`: in which order settings are tried: a whole grid, parts of it, or a model's proposals.
 - `objective`: what a trial is worth.
+- `halving`: the same setting on few seeds, then on more: models' budgets made equal.
 - `search`: trial by trial, each an ordinary set of runs; and the preset file that comes out.
 """

@@ -13,10 +13,9 @@ from qrlsuite.engine.display import Bar
 from qrlsuite.engine.execution import Plan
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
-from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
+from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
 from qrlsuite.tuning.objective import cell_text
-from qrlsuite.tuning.samplers import NAMES
 from qrlsuite.tuning.search import Search, Trial, merit_text
 from qrlsuite.tuning.space import text
 
@@ -51,10 +50,8 @@ class TuneDisplay:
         bases: dict[str, None] = {}
         for search in self.searches:
             request, base = search.request, search.base
-            seeds = len(request.seeds)
             lines = [
-                f"{base.label} on {base.task.name}: {search.planned} trials ({NAMES[request.sampler]}), each "
-                f"{seeds} seeds ({format_seeds(request.seeds)}) x {search.epochs} epochs, "
+                f"{base.label} on {base.task.name}: {search.plan_text} x {search.epochs} epochs, "
                 f"{steps_text(search.steps)} steps in all",
                 *(f"  {dimension.name}: {_short(dimension.plain())}" for dimension in search.space),
                 f"  minimized: {cell_text(base.task.file.ranking, request.objective)}",
@@ -78,7 +75,7 @@ class TuneDisplay:
         seeds = len(search.request.seeds)
         together = min(LARGEST_GROUP, math.ceil(seeds / self.workers))
         estimate = speed.known(search.runs, search.results).estimate(search.base, together)
-        return estimate.range(search.planned * seeds * search.epochs), speed.BASES[estimate.basis]
+        return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
 
     def trial(self, entry: Entry, work: Plan) -> None:
         """Show that a trial begins."""
@@ -120,9 +117,11 @@ class TuneDisplay:
         if trial is None or (self.again == "call" and self.bar.shown):
             return
         best = "  best so far" if search.best is trial else ""
-        several = f"{search.base.model.name}  " if len(self.searches) > 1 else ""
+        several = f"{search.base.label}  " if len(self.searches) > 1 else ""
+        rung = f"rung {trial.rung + 1} " if search.request.sampler == "halving" else ""
         self.console.print(
-            f"{several}trial {trial.number}/{search.planned}  {text(trial.point)}: {merit_text(trial)}{best}",
+            f"{several}{rung}trial {len(search.trials)}/{search.planned}  {text(trial.point)}: "
+            f"{merit_text(trial)}{best}",
             markup=False,
             soft_wrap=True,
         )

@@ -1,4 +1,4 @@
-"""What a trial is worth: sample complexity on the tuning seeds."""
+"""What a trial is worth: the steps that it takes to learn, on the tuning seeds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.statistics import sample_complexity, unsettled
+from qrlsuite.statistics.times import times_below
 
-Objective = Literal["cell", "area"]
+Objective = Literal["time", "cell", "area"]
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,10 @@ class Merit:
     Attributes
     ----------
     objective:
-        Which of the two is minimized.
+        Which of the three is minimized.
+    time:
+        M: environment steps that a run spends below threshold up to the horizon, mean over runs and the thresholds of
+        the task's ranking grid (`qrlsuite.statistics.times`).
     cell:
         S_hat at the task's reference cell, environment steps.
     area:
@@ -36,6 +40,7 @@ class Merit:
     """
 
     objective: Objective
+    time: float
     cell: int
     area: float
     unsettled: bool
@@ -45,13 +50,13 @@ class Merit:
     @property
     def value(self) -> float:
         """The objective, environment steps."""
-        return float(self.cell) if self.objective == "cell" else self.area
+        return {"time": self.time, "cell": float(self.cell), "area": self.area}[self.objective]
 
     @property
     def order(self) -> tuple[float, float, float]:
         """Sorts trials from best to worst."""
-        first, second = (self.cell, self.area) if self.objective == "cell" else (self.area, self.cell)
-        return (first, second, -self.score)
+        second = float(self.cell) if self.objective == "area" else self.area
+        return (self.value, second, -self.score)
 
     @property
     def signal(self) -> float:
@@ -71,13 +76,16 @@ def merit(
     """
     at_cell = sample_complexity(curves, ranking.reference_grid, steps_per_epoch)
     everywhere = sample_complexity(curves, ranking.grid, steps_per_epoch)
+    times = times_below(curves, ranking.grid, steps_per_epoch)
+    parts = {"time": times.size, "cell": 1, "area": everywhere.size}
     return Merit(
         objective=objective,
+        time=float(times.mean()),
         cell=int(at_cell[0, 0]),
         area=float(everywhere.mean()),
         unsettled=bool(unsettled(curves, ranking.reference_grid)[0, 0]),
         score=float(curves.mean()),
-        quantum=float(steps_per_epoch) / (1 if objective == "cell" else everywhere.size),
+        quantum=float(steps_per_epoch) / parts[objective],
     )
 
 
@@ -85,6 +93,8 @@ def cell_text(ranking: RankingSection, objective: Objective) -> str:
     """Say in words what is minimized."""
     cell = ranking.reference
     level = f"epsilon {cell.epsilon:g}" if cell.epsilon is not None else f"return {cell.threshold:g}"
+    if objective == "time":
+        return f"M, the mean number of steps below threshold over the task's {len(ranking.grid.levels)} thresholds"
     if objective == "cell":
         return f"S_hat at {level}, delta {cell.delta:g}"
     return f"mean of S_hat over the {ranking.grid.size} cells of the ranking grid"

@@ -1,4 +1,4 @@
-"""Running searches: of two models an equal number of trials, in turns, until all are over or a budget is spent."""
+"""Running searches: of several models with equal budgets, in turns, until all are over or the time is up."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning.display import TuneDisplay
+from qrlsuite.tuning.halving import Halving
 from qrlsuite.tuning.search import FOLDER, Request, Search
 
 
 def build(requests: Sequence[Request], runs: Path) -> list[Search]:
-    """Build searches; of two, the larger grid is sampled down to the number of combinations of the smaller.
+    """Build searches; of several grids, larger ones are sampled down to the number of combinations of the smallest.
+
+    By `halving` each has as many settings per varied option, or as many core-hours.
 
     Parameters
     ----------
@@ -27,11 +30,13 @@ def build(requests: Sequence[Request], runs: Path) -> list[Search]:
     Raises
     ------
     OptionError
-        If a sampler other than a grid gives them different numbers of trials.
+        If `random`, `tpe` or `one-at-a-time` gives them different numbers of trials.
     QrlSuiteError
         If a name, an option or a value of a request cannot be used.
     """
-    built = [Search(request, runs) for request in requests]
+    built = [Halving(r, runs) if r.sampler == "halving" else Search(r, runs) for r in requests]
+    if any(isinstance(search, Halving) for search in built):
+        return built
     fewest = min(search.planned for search in built)
     for i, search in enumerate(built):
         if search.planned == fewest:
@@ -39,8 +44,8 @@ def build(requests: Sequence[Request], runs: Path) -> list[Search]:
         if search.request.sampler != "grid":
             counts = " and ".join(str(each.planned) for each in built)
             raise OptionError(
-                f"--equal-budget: sampler '{search.request.sampler}' gives {counts} trials; --sampler random --trials "
-                f"{fewest} gives both as many"
+                f"sampler '{search.request.sampler}' gives these models {counts} trials; --sampler random --trials "
+                f"{fewest} gives each as many"
             )
         built[i] = Search(dataclasses.replace(search.request, sampler="random", trials=fewest), runs)
     return built
@@ -83,7 +88,7 @@ def run(
     finally:
         display.close()
     for search in searches:
-        if search.best is not None and not search.pending:
+        if search.presentable:
             search.write(out or search.path)
     return complete
 

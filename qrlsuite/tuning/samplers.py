@@ -17,6 +17,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, neares
 from qrlsuite.tuning.space import Dimension, Point, Space
 
 NAMES = {
+    "halving": "successive halving: many settings on few seeds, the best of them on more, the last on fresh ones",
     "grid": "every combination",
     "one-at-a-time": "each option through its values, the others as they are without tuning",
     "random": "combinations drawn at random, none twice",
@@ -58,7 +59,7 @@ def create(name: str, space: Space, trials: int | None, seed: int, base: Point) 
     QrlSuiteError
         If Optuna is not installed.
     """
-    if name not in NAMES:
+    if name not in NAMES or name == "halving":  # which is a search of its own, and goes back to known points
         raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
     ranges = [dimension.name for dimension in space if dimension.range is not None]
     if name in ("grid", "one-at-a-time"):

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
@@ -74,9 +73,11 @@ class Request:
     grid, varied:
         What is varied: a grid file, and options with lists of values of their own.
     trials, sampler_seed:
-        See `qrlsuite.tuning.samplers`.
+        See `qrlsuite.tuning.samplers`, and for `halving` `qrlsuite.tuning.halving`.
+    core_hours:
+        With `halving` instead of `trials`: as many settings as this many core-hours hold.
     seeds:
-        Tuning seeds.
+        Tuning seeds; with `halving` those of the last rung, in number.
     epochs:
         Of every trial; None for the task's protocol.
     """
@@ -89,21 +90,53 @@ class Request:
     varied: tuple[Setting, ...] = ()
     sampler: str = "grid"
     trials: int | None = None
+    core_hours: float | None = None
     sampler_seed: int = 0
     seeds: tuple[int, ...] = ()
     epochs: int | None = None
-    objective: Objective = "cell"
+    objective: Objective = "time"
+
+
+def default_sampler(varied: object) -> str:
+    """Return the sampler of a search that names none: all combinations of what is listed, else halving."""
+    return "grid" if varied else "halving"
+
+
+def split_model(text: str) -> tuple[str, tuple[Setting, ...]]:
+    """Split `vqc-native qubits=6` into the model and its settings.
+
+    Raises
+    ------
+    OptionError
+        If it does not begin with a name, or a setting has no `=`.
+    """
+    name, *settings = text.split() or [""]
+    if not name or "=" in name:
+        raise OptionError(f"--model '{text}': write a model and its settings, for example 'mlp width=16'")
+    return name, tuple(options.parse_setting(word) for word in settings)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A finished trial."""
+    """A finished trial.
+
+    Attributes
+    ----------
+    number:
+        Of its settings, in the order in which they were first tried.
+    core_seconds:
+        Of its runs, those that an earlier rung trained too.
+    seeds, rung:
+        What it was tried on; rungs count from 0 and are those of `halving`.
+    """
 
     number: int
     point: space.Point
     entry: Entry
     merit: Merit
     core_seconds: float
+    seeds: tuple[int, ...]
+    rung: int = 0
 
 
 class Search(Shown):
@@ -135,6 +168,17 @@ class Search(Shown):
         self.runs = results / FOLDER
         self.base = resolve(request.task, request.model, request.algorithm, request.settings)
         self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
+        self.trials: list[Trial] = []
+        self.pending: list[Entry] = []
+        self.written: Path | None = None
+        self.asked = 0
+        self._seconds: dict[tuple[str, int], float] = {}
+        self._begin()
+
+    def _begin(self) -> None:
+        request = self.request
+        if request.core_hours is not None:
+            raise OptionError(f"--core-hours is for --sampler halving, not for '{request.sampler}'")
         self.space = space.space(self.base, request.grid, request.varied, request.settings)
         self.sampler = samplers.create(
             request.sampler,
@@ -143,10 +187,6 @@ class Search(Shown):
             request.sampler_seed,
             space.base(self.space, self.base),
         )
-        self.trials: list[Trial] = []
-        self.pending: list[Entry] = []
-        self.written: Path | None = None
-        self.asked = 0
 
     @property
     def planned(self) -> int:
@@ -154,18 +194,38 @@ class Search(Shown):
         return self.sampler.total
 
     @property
-    def steps(self) -> int:
-        """Environment steps of all planned trials."""
-        return self.planned * self._steps_per_trial
+    def runs_planned(self) -> int:
+        """How many runs, each of one seed, all planned trials take."""
+        return self.planned * len(self.request.seeds)
 
     @property
-    def _steps_per_trial(self) -> int:
-        return len(self.request.seeds) * self.epochs * self.base.task.file.protocol.interactions
+    def plan_text(self) -> str:
+        """Say how many settings are tried on how many seeds."""
+        seeds = self.request.seeds
+        return (
+            f"{self.planned} trials ({samplers.NAMES[self.request.sampler]}), each {len(seeds)} seeds "
+            f"({format_seeds(seeds)})"
+        )
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all planned trials."""
+        return self.runs_planned * self.steps_per_run
+
+    @property
+    def steps_per_run(self) -> int:
+        """Environment steps of one seed: the horizon."""
+        return self.epochs * self.base.task.file.protocol.interactions
+
+    @property
+    def presentable(self) -> bool:
+        """Whether the best settings so far can be written down."""
+        return self.best is not None and not self.pending
 
     @property
     def best(self) -> Trial | None:
-        """The best finished trial, the earliest of equals; None before any."""
-        return min(self.trials, key=lambda trial: (trial.merit.order, trial.number), default=None)
+        """The best finished trial, of the latest rung, the earliest of equals; None before any."""
+        return next(iter(self.ordered), None)
 
     @property
     def over(self) -> bool:
@@ -183,35 +243,43 @@ class Search(Shown):
             If a trial cannot be run.
         """
         point = self.sampler.ask()
+        trial = self._try(self.asked + 1, point, self.request.seeds, train)
+        if trial is not None:
+            self.sampler.tell(trial.merit.signal)
+        return trial
+
+    def _try(
+        self, number: int, point: space.Point, seeds: tuple[int, ...], train: Train, rung: int = 0
+    ) -> Trial | None:
+        """Train settings on seeds and look at their curves; None where some are left to others."""
         self.asked += 1
         request = self.request
         entry = resolve(
             request.task, request.model, request.algorithm, [*request.settings, *space.settings(point)]
         )
-        store = train(entry, request.seeds, self.epochs)
-        curves = self._curves(store)
-        if curves is None:
+        store = train(entry, seeds, self.epochs)
+        if store.finished(seeds, self.epochs) != set(seeds):
             self.pending.append(entry)
             return None
+        curves = np.stack([store.seed(seed).read().curve[: self.epochs] for seed in seeds])
         worth = merit(
             curves, entry.task.file.ranking, entry.task.file.protocol.interactions, request.objective
         )
-        self.sampler.tell(worth.signal)
-        seconds = sum(store.seed(seed).seconds() for seed in request.seeds)
-        trial = Trial(self.asked, point, entry, worth, seconds)
+        own = {(entry.hash, seed): store.seed(seed).seconds() for seed in seeds}
+        self._seconds |= own
+        trial = Trial(number, point, entry, worth, sum(own.values()), seeds, rung)
         self.trials.append(trial)
         return trial
 
-    def _curves(self, store: EntryStore) -> NDArray[np.float64] | None:
-        """Return the learning curves (N, T) of the tuning seeds; None while some are missing."""
-        if store.finished(self.request.seeds, self.epochs) != set(self.request.seeds):
-            return None
-        return np.stack([store.seed(seed).read().curve[: self.epochs] for seed in self.request.seeds])
-
     @property
     def core_seconds(self) -> float:
-        """Core-seconds spent on the finished trials; equal settings count once."""
-        return sum({trial.entry.hash: trial.core_seconds for trial in self.trials}.values())
+        """Core-seconds spent on the finished trials; each run counts once."""
+        return sum(self._seconds.values())
+
+    @property
+    def runs_done(self) -> int:
+        """Runs, each of one seed, of the finished trials; each counts once."""
+        return len(self._seconds)
 
     @property
     def path(self) -> Path:
@@ -221,11 +289,14 @@ class Search(Shown):
             {
                 "identity": base.identity,
                 "space": {dimension.name: dimension.plain() for dimension in self.space},
-                "sampler": [request.sampler, self.planned, request.sampler_seed],
+                "sampler": self._sampler_key(),
                 "runs": [list(request.seeds), self.epochs, request.objective],
             }
         )
         return self.runs / f"{base.task.name}-{base.algorithm.name}-{base.model.name}-{key[:8]}.toml"
+
+    def _sampler_key(self) -> list[Any]:
+        return [self.request.sampler, self.planned, self.request.sampler_seed]
 
     def preset(self) -> preset.PresetFile:
         """Return the best settings, and how they were found.
@@ -238,12 +309,11 @@ class Search(Shown):
         best = self.best
         if best is None:
             raise OptionError("no trial has finished yet, so there are no settings to write down")
-        distinct = len({trial.entry.hash for trial in self.trials})
         plugins = [
             registry.load().get(kind, name).distribution
             for kind, name in (("models", best.entry.model.name), ("algorithms", best.entry.algorithm.name))
         ]
-        extra = ["optuna"] if self.sampler.adaptive else []
+        extra = ["optuna"] if self.request.sampler == "tpe" else []
         return preset.PresetFile(
             format_version=1,
             algorithm=best.entry.algorithm.name,
@@ -255,16 +325,23 @@ class Search(Shown):
                 objective=self.request.objective,
                 value=best.merit.value,
                 sampler=self.request.sampler,
-                trials=len(self.trials),
-                planned=self.planned,
-                seeds=format_seeds(self.request.seeds),
+                seeds=format_seeds(sorted({seed for trial in self.trials for seed in trial.seeds})),
+                runs=self.runs_done,
                 epochs=self.epochs,
-                steps=distinct * self._steps_per_trial,
-                space={dimension.name: dimension.plain() for dimension in self.space},
+                steps=self.runs_done * self.steps_per_run,
                 versions=dict(provenance.collect([*plugins, *extra])["versions"]),
                 core_hours=float(f"{self.core_seconds / 3600:.3g}"),
+                **self._how(),
             ),
         )
+
+    def _how(self) -> dict[str, Any]:
+        """Return what the record says of how settings were chosen."""
+        return {
+            "trials": len(self.trials),
+            "planned": self.planned,
+            "space": {dimension.name: dimension.plain() for dimension in self.space},
+        }
 
     def write(self, path: Path) -> None:
         """Write the best settings to a preset file, atomically.
@@ -285,32 +362,38 @@ class Search(Shown):
         write_atomically(path, preset.dumps(best_preset, comment).encode())
         self.written = path
 
+    @property
+    def ordered(self) -> list[Trial]:
+        """The finished trials from best to worst; those of a later rung before those of an earlier one."""
+        return sorted(self.trials, key=lambda trial: (-trial.rung, trial.merit.order, trial.number))
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show the best trials, a row each."""
         ranking = self.base.task.file.ranking
-        seeds = len(self.request.seeds)
         table = Table(
             title=Text(
                 f"{self.base.label} on {self.base.task.name}: the best of {len(self.trials)} trials, "
-                f"{seeds} seeds x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours"
+                f"{self.runs_done} runs x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours"
             ),
             title_justify="left",
             header_style="bold",
             box=box.SIMPLE_HEAD,
             caption=Text(
-                f"minimized: {cell_text(ranking, self.request.objective)}; ties by the other, then by the mean score "
-                "over all epochs. Chosen as the best of many, the first row looks too good: judge it on protocol seeds"
+                f"minimized: {cell_text(ranking, self.request.objective)}; ties by the area, then by the mean score "
+                f"over all epochs. {self._warning}"
             ),
             caption_justify="left",
             pad_edge=False,
         )
-        for name in ("trial", "settings", "S_hat", "area", "mean score", "core-hours"):
+        for name in ("trial", "settings", "seeds", "M", "S_hat", "area", "mean score", "core-hours"):
             table.add_column(Text(name), justify="left" if name == "settings" else "right", overflow="fold")
-        for trial in sorted(self.trials, key=lambda t: (t.merit.order, t.number))[:SHOWN]:
+        for trial in self.ordered[:SHOWN]:
             merit = trial.merit
             row = [
                 str(trial.number),
                 space.text(trial.point),
+                self._seeds_text(trial),
+                steps_text(merit.time),
                 f"{'>= ' * merit.unsettled}{steps_text(merit.cell)}",
                 steps_text(merit.area),
                 f"{merit.score:.4f}",
@@ -319,19 +402,26 @@ class Search(Shown):
             table.add_row(*(Text(cell) for cell in row))
         yield table
 
+    @property
+    def _warning(self) -> str:
+        return "Chosen as the best of many, the first row looks too good: judge it on protocol seeds"
+
+    def _seeds_text(self, trial: Trial) -> str:
+        return str(len(trial.seeds))
+
 
 def merit_text(trial: Trial) -> str:
-    """Write a trial's worth: `S_hat >= 60k, area 51k, mean score 0.712`."""
+    """Write a trial's worth: `M 54k, S_hat >= 60k, area 51k, mean score 0.712`."""
     merit = trial.merit
     sign = ">= " if merit.unsettled else ""
     return (
-        f"S_hat {sign}{steps_text(merit.cell)}, area {steps_text(merit.area)}, mean score {merit.score:.4f}"
+        f"M {steps_text(merit.time)}, S_hat {sign}{steps_text(merit.cell)}, area {steps_text(merit.area)}, "
+        f"mean score {merit.score:.4f}"
     )
 
 
 def as_dict(search: Search) -> dict[str, Any]:
     """Return a search as plain values, for JSON: trials from best to worst."""
-    ordered = sorted(search.trials, key=lambda trial: (trial.merit.order, trial.number))
     return {
         "task": search.base.task.name,
         "algorithm": search.base.algorithm.name,
@@ -341,7 +431,7 @@ def as_dict(search: Search) -> dict[str, Any]:
         "space": {dimension.name: dimension.plain() for dimension in search.space},
         "planned": search.planned,
         "pending": len(search.pending),
-        "seeds": format_seeds(search.request.seeds),
+        "runs": search.runs_done,
         "epochs": search.epochs,
         "core_hours": search.core_seconds / 3600,
         "trials": [
@@ -349,13 +439,16 @@ def as_dict(search: Search) -> dict[str, Any]:
                 "number": trial.number,
                 "settings": trial.point,
                 "entry": trial.entry.name,
+                "rung": trial.rung,
+                "seeds": format_seeds(trial.seeds),
                 "value": trial.merit.value,
+                "mean_time": trial.merit.time,
                 "sample_complexity": trial.merit.cell,
                 "unsettled": trial.merit.unsettled,
                 "area": trial.merit.area,
                 "mean_score": trial.merit.score,
                 "core_hours": trial.core_seconds / 3600,
             }
-            for trial in ordered
+            for trial in search.ordered
         ],
     }

@@ -135,8 +135,23 @@ def load(name: str) -> GridFile:
         ) from None
 
 
+def declared(entry: Entry) -> dict[str, Range]:
+    """Return the ranges of the options that an entry's algorithm and model mark as tuned, by full name."""
+    sides = {"algorithm": specs.resolve(entry.algorithm.options), "model": specs.resolve(entry.model.options)}
+    return {
+        f"{side}.{name}": Range(low=mark.low, high=mark.high, log=True)
+        for side, cls in sides.items()
+        for name, mark in options.tuned(cls).items()
+        if mark.family in (None, entry.model.family)
+    }
+
+
 def space(
-    entry: Entry, grid: GridFile | None, varied: Sequence[Setting] = (), fixed: Sequence[Setting] = ()
+    entry: Entry,
+    grid: GridFile | None,
+    varied: Sequence[Setting] = (),
+    fixed: Sequence[Setting] = (),
+    ranges: Mapping[str, Range] | None = None,
 ) -> Space:
     """Return what is varied for an entry.
 
@@ -149,7 +164,9 @@ def space(
     varied:
         Further options with lists of values (or ranges) of their own; they replace the grid's.
     fixed:
-        Options that the grid shall not vary.
+        Options that shall not be varied.
+    ranges:
+        What is varied without a grid file, by full name.
 
     Raises
     ------
@@ -157,7 +174,7 @@ def space(
         If nothing is left to vary, an option is unknown, or a value cannot be used.
     """
     sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
-    axes: dict[str, list[Any] | Range] = {}
+    axes: dict[str, list[Any] | Range] = dict(ranges or {})
     tables = grid.search if grid is not None else {}
     for algorithm in ("all", entry.algorithm.name):
         for family in ("all", entry.model.family):
@@ -256,6 +273,16 @@ def _dimension(name: str, values: list[Any] | Range) -> Dimension:
     if not distinct:
         raise OptionError(f"{name}: the list of values to try is empty")
     return Dimension(name, tuple(distinct))
+
+
+def admits(entry: Entry, dimension: Dimension) -> bool:
+    """Return whether an entry's option can have every value of a dimension, or both ends of its range."""
+    sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
+    try:
+        _check(dimension, sides, entry)
+    except OptionError:
+        return False
+    return True
 
 
 def _check(dimension: Dimension, sides: Mapping[str, type[Any]], entry: Entry) -> None:

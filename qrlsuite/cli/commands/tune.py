@@ -36,6 +36,7 @@ LARGE = 200
 class SamplerName(StrEnum):
     """In which order settings are tried; `qrlsuite.tuning.samplers.NAMES` says what each does."""
 
+    halving = "halving"
     grid = "grid"
     one_at_a_time = "one-at-a-time"
     random = "random"
@@ -45,6 +46,7 @@ class SamplerName(StrEnum):
 class Goal(StrEnum):
     """What is minimized."""
 
+    time = "time"
     cell = "cell"
     area = "area"
 
@@ -53,23 +55,25 @@ def tune(
     task: Annotated[
         str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
     ],
-    model: Annotated[
-        str | None, typer.Option("--model", help="A function approximator (see `qrlsuite list models`).")
-    ] = None,
-    equal_budget: Annotated[
-        tuple[str, str] | None,
+    models: Annotated[
+        list[str],
         typer.Option(
-            "--equal-budget",
-            metavar="A B",
-            help="Two models, with settings if need be (mlp 'vqc-native qubits=6'), instead of --model: both get the "
-            "same number of trials, seeds and epochs.",
+            "--model",
+            metavar="'NAME [SETTING=VALUE ...]'",
+            help="A function approximator (see `qrlsuite list models`), with settings if need be: 'mlp width=16'. "
+            "Repeat it to tune several with equal budgets.",
         ),
-    ] = None,
+    ],
     algorithm: Annotated[
         str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
     ] = None,
     grid: Annotated[
-        str | None, typer.Option("--grid", help="What is varied: `paper`, or a grid file's path.")
+        str | None,
+        typer.Option(
+            "--grid",
+            help="What is varied: `paper`, or a grid file's path; default: the options that models and algorithms "
+            "name for tuning.",
+        ),
     ] = None,
     vary: Annotated[
         list[str] | None,
@@ -82,12 +86,27 @@ def tune(
         typer.Option("--set", metavar="NAME=VALUE", help="A value that all trials share; not varied then."),
     ] = None,
     sampler: Annotated[
-        SamplerName,
-        typer.Option("--sampler", help="All combinations, one option at a time, at random, or Optuna's TPE."),
-    ] = SamplerName.grid,
+        SamplerName | None,
+        typer.Option(
+            "--sampler",
+            help="Successive halving, all combinations, one option at a time, at random, or Optuna's TPE; default: "
+            "halving, or all combinations of a --grid or --vary.",
+        ),
+    ] = None,
     trials: Annotated[
         int | None,
-        typer.Option("--trials", min=1, max=100_000, help="For random and tpe: how many settings."),
+        typer.Option(
+            "--trials",
+            min=1,
+            max=100_000,
+            help="How many settings: for random and tpe in all, for halving per varied option (default 8).",
+        ),
+    ] = None,
+    core_hours: Annotated[
+        float | None,
+        typer.Option(
+            "--core-hours", help="For halving: as many settings as so many core-hours of each model hold."
+        ),
     ] = None,
     sampler_seed: Annotated[
         int, typer.Option("--sampler-seed", min=0, help="For random and tpe: the seed of the proposals.")
@@ -95,7 +114,9 @@ def tune(
     seeds: Annotated[
         str,
         typer.Option(
-            "--seeds", help="Runs of each trial, numbered from 1,000,000: protocol seeds stay unseen."
+            "--seeds",
+            help="Runs of each trial (halving: of each in the last rung), numbered from 1,000,000: protocol seeds "
+            "stay unseen.",
         ),
     ] = "20",
     epochs: Annotated[
@@ -105,9 +126,11 @@ def tune(
     objective: Annotated[
         Goal,
         typer.Option(
-            "--objective", help="S_hat at the task's reference cell, or its mean over the ranking grid."
+            "--objective",
+            help="M, the mean number of steps below the task's thresholds; S_hat at the task's reference cell; or "
+            "its mean over the ranking grid (area).",
         ),
-    ] = Goal.cell,
+    ] = Goal.time,
     budget: Annotated[
         str | None,
         typer.Option(
@@ -131,32 +154,32 @@ def tune(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Find settings with a small sample complexity, and write them to a preset file for `run --preset`.
+    """Find settings with which models learn in few steps, and write them to preset files for `run --preset`.
 
-    Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries are never judged by. Stop with
-    Ctrl-C at any time; the same command continues, and ends with the same preset as if it had never stopped.
+    Several models get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries are
+    never judged by. Stop with Ctrl-C at any time; the same command continues, and ends with the same presets as if it
+    had never stopped.
 
-    Example: qrlsuite tune --task beam6g --model mlp --grid paper --sampler one-at-a-time --seeds 20
+    Example: qrlsuite tune --task beam6g --model "mlp width=16" --model "vqc-native qubits=6"
     """
-    if (model is None) == (equal_budget is None):
-        raise OptionError("give either --model NAME or --equal-budget A B")
-    if out is not None and (equal_budget is not None or out.suffix != ".toml"):
+    if out is not None and (len(models) > 1 or out.suffix != ".toml"):
         raise OptionError(f"--out {out}: one file ending in .toml, for one model")
     limit = None if budget is None else seconds(budget)
-    fixed = tuple(options.parse_setting(word) for word in settings or [])
+    shared = tuple(options.parse_setting(word) for word in settings or [])
     requests = []
-    for name in equal_budget or [str(model)]:
-        first, *entry_settings = name.split()
+    for text in models:
+        model, own = search.split_model(text)
         requests.append(
             search.Request(
                 task=task,
-                model=first,
+                model=model,
                 algorithm=algorithm,
-                settings=(*(options.parse_setting(word) for word in entry_settings), *fixed),
+                settings=(*shared, *own),
                 grid=None if grid is None else space.load(grid),
                 varied=tuple(space.parse_varied(word) for word in vary or []),
-                sampler=sampler.value,
+                sampler=sampler.value if sampler else search.default_sampler(grid or vary),
                 trials=trials,
+                core_hours=core_hours,
                 sampler_seed=sampler_seed,
                 seeds=search.tuning_seeds(seeds),
                 epochs=epochs,
@@ -191,7 +214,7 @@ def tune(
         typer.echo(json.dumps({"searches": rows, "complete": complete}))
         return
     _report(searches, runs, complete)
-    if not complete and not any(each.written or each.pending for each in searches):
+    if not complete and not any(each.trials or each.pending for each in searches):
         raise OptionError("--budget does not hold one trial: give more time, or fewer --seeds or --epochs")
 
 
@@ -205,11 +228,10 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
             wide.print(f"wrote {each.written}", markup=False, soft_wrap=True)
     if len(searches) > 1:
         counts = " and ".join(
-            f"{len(each.trials)} ({hours_text(each.core_seconds / 3600)} core-hours)" for each in searches
+            f"{len(each.trials)} ({each.runs_done} runs, {hours_text(each.core_seconds / 3600)} core-hours)"
+            for each in searches
         )
-        wide.print(
-            f"trials of {' and '.join(each.base.model.name for each in searches)}: {counts}", markup=False
-        )
+        wide.print(f"trials of {' and '.join(each.base.label for each in searches)}: {counts}", markup=False)
     waiting = sum(len(each.pending) for each in searches)
     if waiting:
         wide.print(

@@ -1,0 +1,355 @@
+"""Successive halving over seeds: many settings on few seeds, the better third on three times as many, and so on.
+
+Every trial is trained to the whole horizon: what is saved is seeds of settings that are poor, and never epochs, which
+would favor settings that begin fast (Karnin, Koren & Somekh 2013; Jamieson & Talwalkar 2016, with seeds in the place of
+iterations). The last three settings are trained on fresh seeds, and the best on these alone is chosen: the luck that
+brought a setting into the last rung does not count there.
+
+The first setting is the untuned one; the others are points of a Halton sequence, log-uniform in the ranges. They come
+in three parts, a half and two quarters of all. Where the best so far lies within a tenth of the end of a range, the next
+part is drawn from a range moved beyond that end by half its width, so that a search at an edge costs no further
+trials. As many settings are tried for each varied option, so that models with different numbers of options get budgets in
+proportion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from qrlsuite.errors import OptionError
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import counted
+from qrlsuite.tuning import samplers, space
+from qrlsuite.tuning.search import Search, Train, Trial
+from qrlsuite.tuning.space import Dimension, Point, Range
+
+PER_OPTION = 8
+"""Settings for each varied option, unless told otherwise."""
+
+FINALISTS = 3
+"""Settings of the last rung."""
+
+KEPT = 3
+"""A rung keeps one setting in so many, and trains it on so many times the seeds."""
+
+EDGE = 0.1
+"""Share of a range at each end; the search moves on where the best settings lie there."""
+
+PARTS = (0.5, 0.75, 1.0)
+"""The ranges can move after these shares of all settings, but the last."""
+
+_DRAWS = 1000
+"""Points without a new combination after which there is none left."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Settings to be tried: their number, and the seeds of a rung."""
+
+    number: int
+    point: Point
+    seeds: tuple[int, ...]
+    rung: int
+
+
+def ladder(settings: int, seeds: int) -> tuple[tuple[int, int], ...]:
+    """Return the number of settings and of seeds of each rung; the last rung's seeds are fresh.
+
+    >>> ladder(24, 20)
+    ((24, 4), (8, 12), (3, 20))
+    """
+    rungs = [(settings, max(1, seeds // 5))]
+    while (kept := math.ceil(rungs[-1][0] / KEPT)) > FINALISTS:
+        rungs.append((kept, min(seeds, KEPT * rungs[-1][1])))
+    return (*rungs, (min(FINALISTS, settings), seeds))
+
+
+def runs(rungs: Sequence[tuple[int, int]]) -> int:
+    """Return the runs, each of one seed, of a ladder: a rung trains only the seeds that the one before did not.
+
+    >>> runs(((24, 4), (8, 12), (3, 20)))
+    220
+    """
+    *halving, (finalists, fresh) = rungs
+    before = [0, *(seeds for _, seeds in halving)]
+    return (
+        sum(count * (seeds - known) for (count, seeds), known in zip(halving, before)) + finalists * fresh
+    )
+
+
+def affordable(runs_allowed: float, seeds: int) -> int:
+    """Return the most settings whose ladder takes no more runs; 0 where not even the smallest does."""
+    settings = 0
+    while runs(ladder(settings + 1, seeds)) <= runs_allowed:
+        settings += 1
+    return settings
+
+
+class Halving(Search):
+    """One search by successive halving; see the module.
+
+    Attributes
+    ----------
+    settings:
+        How many are tried; None while a budget in core-hours waits for the first trial, which shows what a run costs.
+
+    Raises
+    ------
+    QrlSuiteError
+        If a name, an option or a value of the request cannot be used.
+    """
+
+    def _begin(self) -> None:
+        request = self.request
+        ranges = space.declared(self.base) if request.grid is None else {}
+        self.space = space.space(self.base, request.grid, request.varied, request.settings, ranges)
+        self.searched = {d.name: d.range for d in self.space if d.range is not None}
+        first, *_ = seeds = request.seeds
+        if list(seeds) != list(range(first, first + len(seeds))):
+            raise OptionError(
+                f"--seeds {format_seeds(seeds)}: halving takes seeds one after the other, such as --seeds {len(seeds)}"
+            )
+        if request.core_hours is not None and request.trials is not None:
+            raise OptionError(
+                "--trials and --core-hours: give one of them, or no budget is equal in both"
+            )
+        if request.core_hours is not None and not 0 < request.core_hours < math.inf:
+            raise OptionError(f"--core-hours {request.core_hours:g}: give a time, for example 2")
+        self.settings: int | None = None
+        if request.core_hours is None:
+            self.settings = self._at_most((request.trials or PER_OPTION) * len(self.space))
+        self._tried: list[Point] = [space.base(self.space, self.base)]
+        self._climb = self._proposals()
+        self._next: Proposal | None = next(self._climb)
+
+    def _at_most(self, settings: int) -> int:
+        """Return a number of settings, or of all combinations where there are fewer."""
+        if self.searched:
+            return settings
+        untuned = space.base(self.space, self.base)
+        return min(settings, samplers.size(self.space) + (untuned not in samplers.product(self.space)))
+
+    @property
+    def rungs(self) -> tuple[tuple[int, int], ...]:
+        """Settings and seeds of each rung; of the smallest ladder while the number of settings is not known."""
+        return ladder(self.settings or FINALISTS, len(self.request.seeds))
+
+    @property
+    def planned(self) -> int:
+        """How many trials there are to be: settings that rise to the next rung count again."""
+        return sum(count for count, _ in self.rungs)
+
+    @property
+    def runs_planned(self) -> int:
+        """How many runs, each of one seed, all planned trials take."""
+        return runs(self.rungs)
+
+    @property
+    def budget_text(self) -> str:
+        """Say what the search is allowed, in words that are equal for models with equal budgets."""
+        seeds = f"up to {len(self.request.seeds)} fresh seeds"
+        if self.request.core_hours is not None:
+            return f"{self.request.core_hours:g} core-hours, {seeds}"
+        return f"{counted(self.request.trials or PER_OPTION, 'setting')} per option, {seeds}"
+
+    @property
+    def plan_text(self) -> str:
+        """Say how many settings are tried on how many seeds."""
+        if self.settings is None:
+            return (
+                f"as many settings as {self.request.core_hours:g} core-hours hold, which the first trial shows, by "
+                "successive halving"
+            )
+        rungs = " -> ".join(f"{count} x {seeds}" for count, seeds in self.rungs)
+        return (
+            f"{counted(self.settings, 'setting')} ({self.budget_text}) by successive halving: {rungs} seeds, "
+            f"{self.runs_planned} runs"
+        )
+
+    @property
+    def over(self) -> bool:
+        """Whether no further trial can be begun: all are, or the next ones need to know some that wait."""
+        return self._next is None
+
+    @property
+    def presentable(self) -> bool:
+        """Whether the last rung is complete."""
+        return self.over and not self.pending
+
+    def step(self, train: Train) -> Trial | None:
+        """Run the next trial; returns None where some of its runs are left to another process or a queue.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, with everything saved.
+        OptionError
+            If the core-hours hold no ladder.
+        QrlSuiteError
+            If a trial cannot be run.
+        """
+        proposal = self._next
+        if proposal is None:
+            raise RuntimeError("the search is over")
+        trial = self._try(proposal.number, proposal.point, proposal.seeds, train, proposal.rung)
+        try:
+            self._next = self._climb.send(trial)
+        except StopIteration:
+            self._next = None
+        return trial
+
+    def _proposals(self) -> Generator[Proposal, Trial | None, None]:
+        """Propose trials rung by rung; ends early where a choice needs one that is left to others."""
+        block, fresh_seeds = self.request.seeds[0], len(self.request.seeds)
+        few = self.rungs[0][1]
+        seeds = tuple(range(block, block + few))
+        trials = [(yield Proposal(1, self._tried[0], seeds, 0))]
+        if self.settings is None:
+            if trials[0] is None:
+                return
+            self.settings = self._afforded(trials[0])
+        points = self._points()
+        dimensions = self.space
+        for share in PARTS:
+            while len(trials) < math.ceil(share * self.settings):
+                point = _new_point(points, dimensions, self._tried)
+                if point is None:
+                    break
+                self._tried.append(point)
+                trials.append((yield Proposal(len(trials) + 1, point, seeds, 0)))
+            known = [trial for trial in trials if trial is not None]
+            if len(known) < len(trials):
+                return
+            if share < 1:
+                dimensions = self._moved(dimensions, _best(known, 1)[0].point)
+        for rung, (count, each) in enumerate(self.rungs[1:], start=1):
+            last = rung == len(self.rungs) - 1
+            start = block + max(n for _, n in self.rungs[:-1]) if last else block
+            seeds = tuple(range(start, start + (fresh_seeds if last else each)))
+            rising = []
+            for trial in _best(known, count):
+                rising.append((yield Proposal(trial.number, trial.point, seeds, rung)))
+            known = [trial for trial in rising if trial is not None]
+            if len(known) < len(rising):
+                return
+
+    def _afforded(self, first: Trial) -> int:
+        """Return how many settings the core-hours hold, by what a run of the first trial took."""
+        hours = self.request.core_hours or 0.0
+        a_run = first.core_seconds / len(first.seeds) / 3600
+        seeds = len(self.request.seeds)
+        settings = affordable(hours / a_run, seeds) if a_run else 0
+        if settings <= FINALISTS:
+            needed = runs(ladder(FINALISTS + 1, seeds)) * a_run
+            raise OptionError(
+                f"--core-hours {hours:g}: a run of {self.base.label} takes {a_run:.2g} of them, so that the smallest "
+                f"search needs {needed:.2g}: give more, or fewer --seeds"
+            )
+        return self._at_most(settings)
+
+    def _points(self) -> Iterable[Sequence[float]]:
+        """Yield the points of a Halton sequence in (0, 1)^D, without end."""
+        from scipy.stats import qmc  # takes half a second to import
+
+        sequence = qmc.Halton(len(self.space), scramble=False)
+        sequence.fast_forward(1)  # the first point is a corner
+        while True:
+            yield sequence.random(1)[0].tolist()
+
+    def _moved(self, dimensions: space.Space, best: Point) -> space.Space:
+        """Move the ranges at whose ends the best settings lie by half their width, where the options admit it."""
+        moved = []
+        for dimension in dimensions:
+            ends = dimension.range
+            place = None if ends is None else _place(ends, best[dimension.name])
+            if ends is not None and place is not None and not EDGE <= place <= 1 - EDGE:
+                shift = 0.5 if place > 0.5 else -0.5
+                further = Range(low=_value(ends, shift), high=_value(ends, 1 + shift), log=ends.log)
+                if space.admits(self.base, replace(dimension, range=further)):
+                    dimension = replace(dimension, range=further)
+                    known = self.searched[dimension.name]
+                    self.searched[dimension.name] = Range(
+                        low=min(known.low, further.low), high=max(known.high, further.high), log=ends.log
+                    )
+            moved.append(dimension)
+        return tuple(moved)
+
+    @property
+    def at_edge(self) -> list[str]:
+        """Options whose best value still lies at an end of all that was searched."""
+        if self.best is None:
+            return []
+        point = self.best.point
+        return [
+            name
+            for name, ends in self.searched.items()
+            if not EDGE <= _place(ends, point[name]) <= 1 - EDGE
+        ]
+
+    def _how(self) -> dict[str, Any]:
+        """Return what the record says of how settings were chosen."""
+        found = {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space}
+        edges = ", ".join(name.partition(".")[2] for name in self.at_edge)
+        return {
+            "trials": len({trial.number for trial in self.trials}),
+            "planned": self.settings,
+            "space": found,
+            "budget": self.budget_text,
+            "rungs": self.rungs,
+            "note": f"the best {edges} lies at the end of what was searched" if edges else None,
+        }
+
+    def _sampler_key(self) -> list[Any]:
+        return [self.request.sampler, self.request.trials or PER_OPTION, self.request.core_hours]
+
+    @property
+    def _warning(self) -> str:
+        edges = self._how()["note"]
+        return (
+            "Trials of the last rung stand first, on seeds that no choice had seen before; an entry is judged on "
+            f"protocol seeds all the same{f'. Beware: {edges}, more --trials go on' if edges else ''}"
+        )
+
+    def _seeds_text(self, trial: Trial) -> str:
+        return f"{len(trial.seeds)}{' fresh' if trial.rung == len(self.rungs) - 1 else ''}"
+
+
+def _best(trials: Sequence[Trial], count: int) -> list[Trial]:
+    return sorted(trials, key=lambda trial: (trial.merit.order, trial.number))[:count]
+
+
+def _new_point(
+    points: Iterable[Sequence[float]], dimensions: space.Space, known: Sequence[Point]
+) -> Point | None:
+    """Return the next combination that was not tried yet; None where there seems to be none."""
+    for _, unit in zip(range(_DRAWS), points):
+        point = {d.name: _at(d, place) for d, place in zip(dimensions, unit)}
+        if point not in known:
+            return point
+    return None
+
+
+def _at(dimension: Dimension, place: float) -> Any:
+    """Return the value of a dimension at a place in (0, 1)."""
+    if dimension.range is None:
+        return dimension.values[int(place * len(dimension.values))]
+    return _value(dimension.range, place)
+
+
+def _value(ends: Range, place: float) -> float:
+    """Return the number at a place of a range, 0 at its low end and 1 at its high one, with three digits."""
+    low, high = (math.log(ends.low), math.log(ends.high)) if ends.log else (ends.low, ends.high)
+    value = low + place * (high - low)
+    value = math.exp(value) if ends.log else value
+    return round(value) if ends.integer else float(f"{value:.3g}")
+
+
+def _place(ends: Range, value: float) -> float:
+    """Undo `_value`; outside of [0, 1] for numbers outside of the range."""
+    if ends.log and value <= 0:
+        return -math.inf
+    low, high, at = (math.log(x) if ends.log else x for x in (ends.low, ends.high, value))
+    return (at - low) / (high - low)
