@@ -518,6 +518,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
             "fixed": entry.fixed,
             "networks": entry.networks,
         },
+        "settings": entry.settings,
         "seeds": len(entry.seeds),
         "unfinished_seeds": len(entry.left_out),
         "provisional": row.provisional,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,9 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry
-from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
+from qrlsuite.results.seeds import parse_seeds
+from qrlsuite.results.text import counted
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,19 @@ class EntryCurves:
         return self.networks is None and not one
 
     @property
+    def settings(self) -> str:
+        """Where its settings come from: the preset and what `--set` changed of it, or `tuned` and how much."""
+        if self.tuning is not None:
+            return _tuned_text(self.tuning)
+        name = self.preset or "default"
+        family = "quantum" if self.parameters[1] else "classical"
+        tables: Mapping[Any, Any] = self.task_file.presets.get(name, {}).get(self.algorithm, {})
+        own = self.identity.get("algorithm_options", {})
+        usual = {**tables.get("all", {}), **tables.get(family, {})}
+        changed = [option for option, value in usual.items() if own.get(option, value) != value]
+        return f"{name} but {', '.join(changed)}" if changed else name
+
+    @property
     def on_protocol_seeds(self) -> bool:
         """Whether its settings are known to have been chosen on seeds that it is judged by."""
         return bool(self.tuning and self.tuning.get("on_protocol_seeds"))
@@ -240,3 +256,14 @@ def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Pat
 
 
 _TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
+
+
+def _tuned_text(tuning: Mapping[str, Any]) -> str:
+    """Say how much was tuned, as far as it is known: `tuned (24 trials, 32 seeds)`."""
+    known = [counted(int(tuning["trials"]), "trial")] if tuning.get("trials") is not None else []
+    if isinstance(tuning.get("seeds"), str):
+        with contextlib.suppress(OptionError):  # text of another suite, which a record may hold
+            known.append(counted(len(parse_seeds(tuning["seeds"])), "seed"))
+    changed = [name.partition(".")[2] for name in tuning.get("changed") or ()]
+    text = f"tuned ({', '.join(known)})" if known else "tuned"
+    return f"{text} but {', '.join(changed)}" if changed else text

@@ -25,6 +25,7 @@ COLUMNS = (
     "rests on",
     "entry",
     "parameters",
+    "settings",
     "seeds",
     "S_hat (5%-95%)",
     "score",
@@ -38,7 +39,7 @@ SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
 NUMERIC = {"rests on", "parameters", "seeds", "score", "cells +/-", "hours"}
 WIDE = 150
 """Characters per line in which the whole table can be read."""
-LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "cells +/-", "hours")))
+LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "settings", "cells +/-", "hours")))
 """What a narrower one leaves out: the first where it has so many columns, else the second too."""
 
 
@@ -51,6 +52,7 @@ def cells(section: Section, row: Row) -> tuple[str, ...]:
         row.rests_on.text if row.rests_on is not None else "-",
         entry.label,
         (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text,
+        entry.settings,
         f"{len(entry.seeds)}" + "*" * row.provisional,
         row.reference.text,
         f"{row.median_score:.3f}",
@@ -107,6 +109,14 @@ def notes(section: Section) -> list[str]:
             "settings found by tuning: "
             + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
         )
+        if len(tuned) < len(section.rows):
+            lines.append(
+                "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
+            )
+        budgets = {(entry.tuning or {}).get("budget") for entry in tuned}
+        if len(budgets) > 1:
+            texts = sorted("not known" if budget is None else str(budget) for budget in budgets)
+            lines.append(f"tuned with different budgets: {'; '.join(texts)}")
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:
         lines.append(

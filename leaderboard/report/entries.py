@@ -88,6 +88,7 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
         ("Code revision", _told(entry.commits)),
         ("Processor", _told(entry.processors)),
         ("Device", _told(entry.devices)),
+        ("Settings", clean(entry.settings)),
         ("Tuned", _tuned(entry.tuning)),
         ("Source", _told(entry.source)),
         ("Task definition", clean(entry.task_hash)),

@@ -57,8 +57,12 @@ class REINFORCEOptions:
     """Options of REINFORCE."""
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
-    lr: Annotated[float, Field(gt=0, description="learning rate of classical parameters"), Tuned(2e-4, 1e-2)] = 1e-2
-    quantum_lr: Annotated[float, Field(gt=0, description="learning rate of quantum parameters"), Tuned(2e-4, 1e-2, "quantum")] = 1e-3
+    lr: Annotated[
+        float, Field(gt=0, description="learning rate of classical parameters"), Tuned(2e-4, 1e-2)
+    ] = 1e-2
+    quantum_lr: Annotated[
+        float, Field(gt=0, description="learning rate of quantum parameters"), Tuned(2e-4, 1e-2, "quantum")
+    ] = 1e-3
     baseline: Annotated[
         Literal["none", "mean", "value"],
         Field(description="subtracted from rewards-to-go: nothing, their mean, or a value network"),

@@ -33,7 +33,8 @@ class TuningRecord(_Table):
     task: Annotated[str | None, Field(max_length=80)] = None
     objective: Literal["time", "cell", "area"] | None = None
     value: Annotated[
-        float | None, Field(ge=0, description="objective of the settings found, in steps, on the tuning seeds")
+        float | None,
+        Field(ge=0, description="objective of the settings found, in steps, on the tuning seeds"),
     ] = None
     sampler: Annotated[str | None, Field(max_length=40)] = None
     trials: Annotated[int | None, Field(ge=1, description="settings that were tried")] = None
@@ -41,7 +42,8 @@ class TuningRecord(_Table):
     seeds: Annotated[str | None, Field(max_length=10_000, description="as --seeds reads them")] = None
     runs: Annotated[int | None, Field(ge=1, description="of all trials together, a seed each")] = None
     budget: Annotated[
-        str | None, Field(max_length=200, description="what the search was allowed; equal for models tuned together")
+        str | None,
+        Field(max_length=200, description="what the search was allowed; equal for models tuned together"),
     ] = None
     rungs: Annotated[
         tuple[tuple[int, int], ...] | None,
@@ -164,7 +166,9 @@ def record_of(
     )
     record = EntryTuning(**tuning.model_dump(), preset=source, changed=tuple(changed))
     unknown = {name for name in ("runs", "budget", "rungs") if getattr(record, name) is None}
-    return record.model_dump(mode="json", exclude=unknown)  # version 0.1.0 reads records without these keys only
+    return record.model_dump(
+        mode="json", exclude=unknown
+    )  # version 0.1.0 reads records without these keys only
 
 
 def dumps(preset: PresetFile, comment: str = "") -> str:

@@ -6,10 +6,9 @@ iterations). The last three settings are trained on fresh seeds, and the best on
 brought a setting into the last rung does not count there.
 
 The first setting is the untuned one; the others are points of a Halton sequence, log-uniform in the ranges. They come
-in three parts, a half and two quarters of all. Where the best so far lies within a tenth of the end of a range, the next
-part is drawn from a range moved beyond that end by half its width, so that a search at an edge costs no further
-trials. As many settings are tried for each varied option, so that models with different numbers of options get budgets in
-proportion.
+in three parts, a half and two quarters of all. Where the best so far lies in the outer third of a range and nothing
+beyond it was tried, the next part is drawn from a range moved beyond that end by half its width: a search at an edge
+has no more trials than another. The number of settings is proportional to the number of varied options.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ FINALISTS = 3
 KEPT = 3
 """A rung keeps one setting in so many, and trains it on so many times the seeds."""
 
-EDGE = 0.1
-"""Share of a range at each end; the search moves on where the best settings lie there."""
+OUTER = 1 / 3
+"""Share of a range at each end: the search moves on where the best value lies there and none was tried beyond it."""
 
 PARTS = (0.5, 0.75, 1.0)
 """The ranges can move after these shares of all settings, but the last."""
@@ -75,9 +74,7 @@ def runs(rungs: Sequence[tuple[int, int]]) -> int:
     """
     *halving, (finalists, fresh) = rungs
     before = [0, *(seeds for _, seeds in halving)]
-    return (
-        sum(count * (seeds - known) for (count, seeds), known in zip(halving, before)) + finalists * fresh
-    )
+    return sum(count * (seeds - known) for (count, seeds), known in zip(halving, before)) + finalists * fresh
 
 
 def affordable(runs_allowed: float, seeds: int) -> int:
@@ -113,9 +110,7 @@ class Halving(Search):
                 f"--seeds {format_seeds(seeds)}: halving takes seeds one after the other, such as --seeds {len(seeds)}"
             )
         if request.core_hours is not None and request.trials is not None:
-            raise OptionError(
-                "--trials and --core-hours: give one of them, or no budget is equal in both"
-            )
+            raise OptionError("--trials and --core-hours: give one of them, or no budget is equal in both")
         if request.core_hours is not None and not 0 < request.core_hours < math.inf:
             raise OptionError(f"--core-hours {request.core_hours:g}: give a time, for example 2")
         self.settings: int | None = None
@@ -229,10 +224,10 @@ class Halving(Search):
             last = rung == len(self.rungs) - 1
             start = block + max(n for _, n in self.rungs[:-1]) if last else block
             seeds = tuple(range(start, start + (fresh_seeds if last else each)))
-            rising = []
-            for trial in _best(known, count):
-                rising.append((yield Proposal(trial.number, trial.point, seeds, rung)))
-            known = [trial for trial in rising if trial is not None]
+            known, rising = [], _best(known, count)
+            for risen in rising:
+                if (trial := (yield Proposal(risen.number, risen.point, seeds, rung))) is not None:
+                    known.append(trial)
             if len(known) < len(rising):
                 return
 
@@ -264,9 +259,9 @@ class Halving(Search):
         moved = []
         for dimension in dimensions:
             ends = dimension.range
-            place = None if ends is None else _place(ends, best[dimension.name])
-            if ends is not None and place is not None and not EDGE <= place <= 1 - EDGE:
-                shift = 0.5 if place > 0.5 else -0.5
+            side = 0 if ends is None else self._edge(dimension.name, best)
+            if ends is not None and side * (_place(ends, best[dimension.name]) - 0.5) > 0.5 - OUTER:
+                shift = side / 2
                 further = Range(low=_value(ends, shift), high=_value(ends, 1 + shift), log=ends.log)
                 if space.admits(self.base, replace(dimension, range=further)):
                     dimension = replace(dimension, range=further)
@@ -277,17 +272,16 @@ class Halving(Search):
             moved.append(dimension)
         return tuple(moved)
 
+    def _edge(self, name: str, best: Point) -> int:
+        """Return 1 or -1 where no larger or no smaller value of an option was tried than the best one, else 0."""
+        values = [trial.point[name] for trial in self.trials]
+        return (best[name] == max(values)) - (best[name] == min(values))
+
     @property
     def at_edge(self) -> list[str]:
-        """Options whose best value still lies at an end of all that was searched."""
-        if self.best is None:
-            return []
-        point = self.best.point
-        return [
-            name
-            for name, ends in self.searched.items()
-            if not EDGE <= _place(ends, point[name]) <= 1 - EDGE
-        ]
+        """Options of which nothing was tried beyond the best value."""
+        best = self.best
+        return [] if best is None else [name for name in self.searched if self._edge(name, best.point)]
 
     def _how(self) -> dict[str, Any]:
         """Return what the record says of how settings were chosen."""
@@ -299,7 +293,7 @@ class Halving(Search):
             "space": found,
             "budget": self.budget_text,
             "rungs": self.rungs,
-            "note": f"the best {edges} lies at the end of what was searched" if edges else None,
+            "note": f"nothing was tried beyond the best {edges}" if edges else None,
         }
 
     def _sampler_key(self) -> list[Any]:

@@ -87,12 +87,12 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
 
 
 def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
-    words = ["tune", "--task", task, "--equal-budget", "mlp width=4", "mlp width=5 depth=1"]
+    words = ["tune", "--task", task, "--model", "mlp width=4", "--model", "mlp width=5 depth=1"]
     words += ["--vary", "lr=1e-2,1e-3,1e-4", "--set", "lr=1e-2", "--vary", "gamma=.9,.99"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     done = qrlsuite(*words)
     assert done.returncode == 0, done.stderr
-    assert "trials of mlp and mlp: 2 (" in done.stdout
+    assert "trials of ddqn mlp width=4 and ddqn mlp width=5 depth=1: 2 (" in done.stdout
     assert done.stdout.count("next: qrlsuite run") == 2
     content = json.loads(CliRunner().invoke(build(), [*words, "--json"]).stdout)
     assert [len(each["trials"]) for each in content["searches"]] == [2, 2]
@@ -113,7 +113,8 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tm
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give either --model NAME or --equal-budget A B"),
+        (["--model", "width=4"], "--model 'width=4': write a model and its settings"),
+        (["--model", "mlp", "--model", "mlp", "--out", "p.toml"], "for one model"),
         (["--model", "mlp", "--grid", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
         (
             ["--model", "mlp", "--vary", "lr=1,2", "--seeds", "0:20"],

@@ -103,7 +103,7 @@ def test_evaluating(tiny_task: str, tmp_path: Path) -> None:
 
 
 def test_tuning(tiny_task: str, tmp_path: Path) -> None:
-    found = api.tune(
+    (found,) = api.tune(
         tiny_task,
         "mlp",
         options=OPTIONS,

@@ -214,6 +214,8 @@ def test_worth_by_hand() -> None:
     assert better.order < worth.order, "equal sample complexities are told apart by the scores"
     assert 0 < worth.signal - better.signal < 5
     assert objective.merit(np.zeros((2, 4)), RANKING, 10, "cell").unsettled
+    # below 0.5: 1 and 2 epochs, below 0.8: 2 and 4
+    assert worth.time == objective.merit(curves, RANKING, 10, "time").value == (10 + 20 + 20 + 40) / 4
 
 
 def test_the_papers_grids_have_its_sizes() -> None:

@@ -156,9 +156,9 @@ def tune(
 ) -> None:
     """Find settings with which models learn in few steps, and write them to preset files for `run --preset`.
 
-    Several models get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries are
-    never judged by. Stop with Ctrl-C at any time; the same command continues, and ends with the same presets as if it
-    had never stopped.
+    Several models get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries
+    are never judged by. Stop with Ctrl-C at any time; the same command continues, and ends with the same presets as
+    if it had never stopped.
 
     Example: qrlsuite tune --task beam6g --model "mlp width=16" --model "vqc-native qubits=6"
     """
