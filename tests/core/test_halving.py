@@ -49,7 +49,9 @@ class Recorder:
             score = self.speed(entry, seed)
             rows = [{"epoch": t, "scores": [min(1.0, score * t)]} for t in range(1, epochs + 1)]
             folder = store.seed(seed)
-            folder.path.mkdir(exist_ok=True)  # plain writes: forcing hundreds of files to the disk takes a minute
+            folder.path.mkdir(
+                exist_ok=True
+            )  # plain writes: forcing hundreds of files to the disk takes a minute
             folder.table.write_bytes(table_bytes(rows))
             folder.timings.write_text('{"epoch":1,"cpu":36.0}\n')
             record = {"format_version": FORMAT_VERSION, "status": "finished", "epochs": epochs}
