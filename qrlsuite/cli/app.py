@@ -57,6 +57,7 @@ BUILT_IN = {
             "evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"
         ),
         LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
+        LazyCommand("import", "Take over seeds trained elsewhere.", f"{_ROOM}.import_:import_entries"),
         LazyCommand(
             "export",
             "Write entries to publish on a leaderboard.",

@@ -164,7 +164,7 @@ def shortest(values: NDArray[Any]) -> list[float]:
     return [float(text) for text in np.asarray(values, np.float32).astype(str).ravel()]
 
 
-def learning_curve(scores: NDArray[np.float32]) -> NDArray[np.float64]:
+def learning_curve(scores: NDArray[np.float32 | np.float64]) -> NDArray[np.float64]:
     """Return the mean of every epoch's validation scores (..., episodes), rounded by `round_means`."""
     return round_means(np.asarray(scores, np.float64).mean(axis=-1))
 
@@ -183,7 +183,7 @@ class SeedRun:
     record:
         `run.json`; empty where the run never began.
     scores:
-        (T, validation episodes), one row per epoch.
+        (T, validation episodes), one row per epoch; (T, 1), their means, of seeds that were imported from an export.
     seconds:
         Core-seconds spent on it, see `SeedStore.seconds`.
     executions:
@@ -193,7 +193,7 @@ class SeedRun:
 
     seed: int
     record: Mapping[str, Any]
-    scores: NDArray[np.float32]
+    scores: NDArray[np.float32 | np.float64]
     seconds: float
     executions: int
 
@@ -332,7 +332,11 @@ class SeedStore:
         rows = self.epochs(decimals=False)
         try:
             with np.errstate(over="ignore"):
-                scores = np.array([row["scores"] for row in rows], dtype=np.float32)
+                scores: NDArray[Any]
+                if rows and "score" in rows[0] and "scores" not in rows[0]:
+                    scores = np.array([[row["score"]] for row in rows], dtype=np.float64)
+                else:
+                    scores = np.array([row["scores"] for row in rows], dtype=np.float32)
         except (KeyError, TypeError, ValueError, OverflowError):
             raise StoreError(f"{self.path}: an epoch has no list of validation scores") from None
         if rows and (scores.ndim != 2 or scores.shape[1] == 0 or not np.isfinite(scores).all()):

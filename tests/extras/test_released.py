@@ -120,7 +120,7 @@ def test_a_malicious_pickle_is_refused_and_nothing_is_run(
         released.read(bad)
     assert not mark.exists()
     result = CliRunner().invoke(
-        build(), ["import", str(bad), "--task", "beam6g", "--runs", str(tmp_path / "runs")]
+        build(), ["import-released", str(bad), "--task", "beam6g", "--runs", str(tmp_path / "runs")]
     )
     assert isinstance(result.exception, StoreError)
     assert not (tmp_path / "runs").exists(), "a refused file leaves nothing behind"
@@ -188,7 +188,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
 ) -> None:
     files = [write(tmp_path / "hybrid" / f"{seed}.pkl", content(seed)) for seed in range(3)]
     words = [
-        "import",
+        "import-released",
         *map(str, files),
         "--task",
         tiny_task,

@@ -1,4 +1,4 @@
-"""`qrlsuite import`: import result files of the paper's released code as an entry."""
+"""`qrlsuite import-released`: import result files of the paper's released code as an entry."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def import_results(
     A pickle is a program. Each file is read in its own process, with limited memory and time and a closed list of
     names; a file that asks for anything else is refused. Files that were imported before are skipped.
 
-    Example: qrlsuite import results/mlp/*.pkl --task beam6g --label "MLP of the paper"
+    Example: qrlsuite import-released results/mlp/*.pkl --task beam6g --label "MLP of the paper"
     """
     loaded = load(task)
     name = (label if label is not None else files[0].absolute().parent.name).strip()

@@ -1,0 +1,282 @@
+"""Taking over seeds that were trained elsewhere: of an exported entry, or of another results folder.
+
+They count as seeds that were trained here, and `qrlsuite run` trains only what is missing. Each seed's folder is copied
+beside its place and renamed into it, so that it is there whole or not at all, and an import that was stopped goes on
+when it is repeated. Seeds that are here already stay as they are.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qrlsuite import registry
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment import task as tasks
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.leaderboard import origin, published
+from qrlsuite.leaderboard.curves import require_scores
+from qrlsuite.leaderboard.published import PublishedEntry
+from qrlsuite.results import checkpoint, provenance
+from qrlsuite.results.claims import acquire, living
+from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
+from qrlsuite.results.store import (
+    EntryStore,
+    SeedRun,
+    SeedStore,
+    entries,
+    json_line,
+    table_bytes,
+    write_atomically,
+)
+
+
+@dataclass(frozen=True)
+class TakenOver:
+    """What was taken over of an entry.
+
+    Attributes
+    ----------
+    store:
+        The entry's folder here.
+    new, known:
+        Seeds that were copied, and seeds that were here already.
+    notes:
+        What a reader has to know: seeds that were left, and why; other versions.
+    """
+
+    store: EntryStore
+    entry: Entry
+    new: tuple[int, ...]
+    known: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "folder": str(self.store.path),
+            "entry": self.entry.name,
+            "label": self.entry.label,
+            "task": self.entry.task.name,
+            "seeds": list(self.new),
+            "known": list(self.known),
+            "notes": list(self.notes),
+        }
+
+
+def sources(folder: Path) -> list[EntryStore]:
+    """Return the entries of a folder: itself, or all below it, where it is a results folder or one of exports.
+
+    Raises
+    ------
+    StoreError
+        If there is none.
+    """
+    if (folder / "entry.json").is_file():
+        return [EntryStore(folder.resolve())]
+    found = entries(folder) if folder.is_dir() else []
+    if not found:
+        raise StoreError(
+            f"{folder} holds no entry: give a results folder, a folder that `qrlsuite export` wrote, or one entry's "
+            "folder in it (the one with entry.json)"
+        )
+    return found
+
+
+def take_over(source: EntryStore, runs: Path) -> TakenOver:
+    """Copy the seeds of an entry that are not in a results folder yet.
+
+    Raises
+    ------
+    StoreError
+        If the entry was made under another definition of its task, is damaged, was not trained by this suite or
+        belongs to a decision plan; or if the seeds are being trained here.
+    """
+    exported = published.read(source.path) if published.is_published(source.path) else None
+    entry = source.entry()  # computes the hash anew
+    if entry.plan is not None:
+        raise StoreError(
+            f"{source.path} belongs to a decision plan, whose number of seeds depends on what they showed: it is "
+            "continued by the plan alone"
+        )
+    store = EntryStore.find(runs, entry)
+    if store.path.resolve() == source.path.resolve():
+        raise StoreError(f"{source.path} is in {runs} itself: there is nothing to import")
+    _require_same_task(entry, source, runs)
+    held = sorted(exported.seeds if exported is not None else source.seeds())
+    seeds = [seed for seed in held if seed < TUNING_SEEDS]
+    if not seeds:
+        raise StoreError(f"{source.path} holds no seed")
+    found = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
+    for run in found.values():  # all of them, before anything is written
+        _check(run, entry, source.seed(run.seed))
+    store = EntryStore.create(runs, entry)
+    claim = acquire(store, seeds)
+    try:
+        return (
+            _from_runs(source, found, entry, store)
+            if exported is None
+            else _from_export(exported, entry, store)
+        )
+    finally:
+        claim.release()
+
+
+def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
+    """Refuse an entry whose task is defined differently here, by its registered file or by the entries in `runs`."""
+    name = entry.task.name
+    if name in registry.load().entries["tasks"]:
+        here = {tasks.load(name).hash}
+    else:  # a task of the user's own file is known by its entries
+        here = {str(o.record()["task_hash"]) for o in (entries(runs, name) if runs.is_dir() else [])}
+    if here and entry.task.hash not in here:
+        raise StoreError(
+            f"{source.path} was made under another definition of task '{name}' ({entry.task.hash}, here "
+            f"{', '.join(sorted(here))}): its seeds are no seeds of the task that is known here"
+        )
+
+
+def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, store: EntryStore) -> TakenOver:
+    """Copy seeds with their agents and checkpoints."""
+    training = {seed for claim in living(source) for seed in claim.seeds}
+    newest, present = checkpoint.latest(source), set(store.seeds())
+    new, known, differing, waiting, versions = list[int](), list[int](), list[int](), list[int](), list[Any]()
+    for seed, run in runs.items():
+        if seed in present:
+            known.append(seed)
+            own = store.seed(seed).read().curve
+            shared = min(len(own), len(run.curve))
+            if not np.array_equal(own[:shared], run.curve[:shared]):
+                differing.append(seed)
+        elif seed in training or not (run.finished or seed in newest):
+            waiting.append(seed)
+        else:
+            _place(store, seed, source.seed(seed).path)
+            new.append(seed)
+            versions += run.record.get("provenance", [])
+    _take_checkpoints(source, store, sorted({*new, *known} - {*differing}))
+    notes = _differences(differing) + _other_versions(versions, entry)
+    if waiting:
+        notes.append(
+            f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
+        )
+    return TakenOver(store, entry, tuple(new), tuple(known), tuple(notes))
+
+
+def _check(run: SeedRun, entry: Entry, folder: SeedStore) -> None:
+    """Refuse a seed that is not one of the entry, or whose scores cannot be."""
+    own = (entry.task.hash, entry.name, run.seed)
+    if tuple(run.record.get(name) for name in ("task_hash", "entry", "seed")) != own:
+        raise StoreError(
+            f"{folder.path}: its run.json does not say that it is seed {run.seed} of {entry.name}"
+        )
+    require_scores(run.curve, entry.task.file, folder.path)
+
+
+def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int]) -> None:
+    """Copy the checkpoints of seeds that are here and have none, so that they can go on."""
+    theirs, own = checkpoint.latest(source), checkpoint.latest(store)
+    by_epoch: dict[int, list[int]] = {}
+    for seed in seeds:
+        if seed in theirs and seed not in own and len(store.seed(seed).epochs()) >= theirs[seed].epoch:
+            by_epoch.setdefault(theirs[seed].epoch, []).append(seed)
+    for members in by_epoch.values():
+        for first in range(0, len(members), LARGEST_GROUP):
+            group = members[first : first + LARGEST_GROUP]
+            epoch, arrays = checkpoint.load(source, group)
+            checkpoint.save(store, group, epoch, arrays)
+
+
+def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> TakenOver:
+    """Write seeds from their curves; the agents and checkpoints were not exported."""
+    present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
+    for row, seed in enumerate(exported.seeds):
+        curve = exported.curves[row]
+        if seed in present:
+            known.append(seed)
+            own = store.seed(seed).read().curve
+            shared = min(len(own), len(curve))
+            if not np.array_equal(own[:shared], curve[:shared]):
+                differing.append(seed)
+            continue
+        rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
+        if executions := int(exported.executions[row]):
+            rows[-1]["executions"] = {"imported": executions}
+        made = _unplaced(store, seed)
+        made.path.mkdir(parents=True)
+        write_atomically(made.table, table_bytes(rows))
+        write_atomically(
+            made.timings, json_line({"epoch": len(rows), "cpu": 3600 * float(exported.hours[row])})
+        )
+        made.write_record(
+            {
+                "task": entry.task.name,
+                "task_hash": entry.task.hash,
+                "entry": entry.name,
+                "label": entry.label,
+                "algorithm": entry.algorithm.name,
+                "model": entry.model.name,
+                "family": entry.model.family,
+                "parameters": dict(exported.record["published"]["parameters"]),
+                "seed": seed,
+                "interactions_per_epoch": entry.task.file.protocol.interactions,
+                "status": "finished",
+                "epochs": len(rows),
+                "provenance": [dict(exported.provenance[row])],
+            }
+        )
+        made.path.rename(store.seed(seed).path)
+        new.append(seed)
+    notes = _differences(differing) + _other_versions(exported.provenance, entry)
+    if new:
+        notes.append(
+            "an export holds curves alone: these seeds cannot be evaluated, nor trained to more epochs"
+        )
+    return TakenOver(store, entry, tuple(new), tuple(known), tuple(notes))
+
+
+def _unplaced(store: EntryStore, seed: int) -> SeedStore:
+    """Return an empty place beside that of a seed, without what an import that was killed left there."""
+    path = store.path / f".seed-{seed:04d}.import"
+    shutil.rmtree(path, ignore_errors=True)
+    return SeedStore(path, seed)
+
+
+def _place(store: EntryStore, seed: int, folder: Path) -> None:
+    """Copy a seed's folder, whole or not at all."""
+    copy = _unplaced(store, seed).path
+    try:
+        shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(".*"))
+        for path in copy.iterdir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+        copy.rename(store.seed(seed).path)
+    except OSError as error:
+        shutil.rmtree(copy, ignore_errors=True)
+        raise StoreError(f"cannot copy {folder} to {store.path}: {error.strerror or error}") from None
+
+
+def _differences(seeds: Sequence[int]) -> list[str]:
+    if not seeds:
+        return []
+    return [f"seeds {format_seeds(seeds)} have other curves there than here: those here stay"]
+
+
+def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:
+    """Say which versions the seeds were made with, where they are not those that are installed here."""
+    here = provenance.collect(entry.distributions())["versions"]
+    there = origin.versions(list(made_with))
+    wanted = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}
+    other = [
+        f"{name} {', '.join(known)} (here {here[name]})"
+        for name, known in there.items()
+        if name in wanted and name in here and set(known) != {here[name]}
+    ]
+    return [f"made with {'; '.join(other)}; boards say where versions mix"] if other else []

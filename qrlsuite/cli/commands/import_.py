@@ -1,0 +1,50 @@
+"""`qrlsuite import`: take over seeds that were trained elsewhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.engine.terminal import command
+from qrlsuite.leaderboard import takeover
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import counted
+
+
+def import_entries(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="A results folder, a folder that `qrlsuite export` wrote, or one entry's folder in it.",
+        ),
+    ],
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only what is missing.
+
+    Of a results folder agents and checkpoints come along. An export holds learning curves alone. Seeds that are here
+    already stay. Stop with Ctrl-C at any time; the same command continues.
+
+    Example: qrlsuite import /mnt/cluster/runs
+    """
+    done = []
+    for source in takeover.sources(folder):
+        taken = takeover.take_over(source, runs)
+        done.append(taken)
+        if json_output:
+            continue
+        new = f"imported seeds {format_seeds(taken.new)}" if taken.new else "nothing new"
+        known = f", {counted(len(taken.known), 'seed')} here already" if taken.known else ""
+        typer.echo(f"{taken.entry.label} on {taken.entry.task.name}: {new}{known}")
+        for note in taken.notes:
+            typer.echo(f"  note: {note}", err=True)
+    if json_output:
+        typer.echo(json.dumps({"entries": [taken.as_dict() for taken in done]}))
+    else:
+        typer.echo(f"next: {command('runs', runs=runs)}")
