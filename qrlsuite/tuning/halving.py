@@ -101,8 +101,7 @@ class Halving(Search):
 
     def _begin(self) -> None:
         request = self.request
-        ranges = space.declared(self.base) if request.grid is None else {}
-        self.space = space.space(self.base, request.grid, request.varied, request.settings, ranges)
+        self.space = self._space(request.grid is None)
         self.searched = {d.name: d.range for d in self.space if d.range is not None}
         first, *_ = seeds = request.seeds
         if list(seeds) != list(range(first, first + len(seeds))):

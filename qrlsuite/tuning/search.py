@@ -179,7 +179,7 @@ class Search(Shown):
         request = self.request
         if request.core_hours is not None:
             raise OptionError(f"--core-hours is for --sampler halving, not for '{request.sampler}'")
-        self.space = space.space(self.base, request.grid, request.varied, request.settings)
+        self.space = self._space(request.grid is None and not request.varied)
         self.sampler = samplers.create(
             request.sampler,
             self.space,
@@ -187,6 +187,12 @@ class Search(Shown):
             request.sampler_seed,
             space.base(self.space, self.base),
         )
+
+    def _space(self, declared: bool) -> space.Space:
+        """Return what is varied, with the ranges that algorithm and model declare, if they shall count."""
+        request = self.request
+        ranges = space.declared(self.base) if declared else {}
+        return space.space(self.base, request.grid, request.varied, request.settings, ranges)
 
     @property
     def planned(self) -> int:
