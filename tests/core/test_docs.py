@@ -14,6 +14,7 @@ import pytest
 from qrlsuite import options, registry, specs
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
+from qrlsuite.tuning.search import split_model
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -95,7 +96,12 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
             and not named[flag].startswith(("gym:", "my-"))
             and not named[flag].endswith(".toml")
         ):
-            registry.load().get(kind, named[flag])
+            registry.load().get(kind, named[flag].split()[0])
+    for model in [value for key, value in itertools.pairwise(words) if key == "--model"] * (
+        words[0] == "tune"
+    ):
+        name, own = split_model(model)
+        resolve(named["--task"], name, named.get("--algorithm"), own)
     if (
         words[0] == "run"
         and "--task" in named
