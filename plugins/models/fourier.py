@@ -20,6 +20,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
+from qrlsuite.options import Tuned
 from qrlsuite.plugins.models.mlp import initial_layer
 from qrlsuite.population import fixed_order_linear
 
@@ -38,6 +39,7 @@ class FourierOptions:
             allow_inf_nan=False,
             description="standard deviation of the initial frequencies, radians per unit",
         ),
+        Tuned(0.3, 30),
     ] = 1.0
     train: Annotated[
         Literal["all", "linear"],

@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite.options import Since
+from qrlsuite.options import Since, Tuned
 from qrlsuite.population import linear
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -48,6 +48,7 @@ class MLPOptions:
         float,
         Field(gt=0, allow_inf_nan=False, description="factor on the observation"),
         Since("0.2.0"),
+        Tuned(0.3, 30),
     ] = 1.0
 
 

@@ -26,7 +26,7 @@ from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
 from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
-from qrlsuite.options import Since, field_names, without_later
+from qrlsuite.options import Since, Tuned, field_names, without_later
 from qrlsuite.plugins.circuits.options import PennyLaneOptions, QiskitOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
@@ -77,6 +77,7 @@ class VQCOptions:
             "scalings from [0, init_scale 2 pi)",
         ),
         Since("0.2.0"),
+        Tuned(0.1, 10),
     ] = 1.0
 
     @field_validator("ansatz_options")

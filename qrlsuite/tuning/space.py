@@ -136,14 +136,31 @@ def load(name: str) -> GridFile:
 
 
 def declared(entry: Entry) -> dict[str, Range]:
-    """Return the ranges of the options that an entry's algorithm and model mark as tuned, by full name."""
-    sides = {"algorithm": specs.resolve(entry.algorithm.options), "model": specs.resolve(entry.model.options)}
+    """Return the ranges of the options that an entry's algorithm and model mark as tuned, by full name.
+
+    Options that the entry's other options leave without effect, and which are then refused, are left out.
+    """
+    sides = {
+        "algorithm": (specs.resolve(entry.algorithm.options), entry.algorithm_options),
+        "model": (specs.resolve(entry.model.options), entry.model_options),
+    }
     return {
         f"{side}.{name}": Range(low=mark.low, high=mark.high, log=True)
-        for side, cls in sides.items()
+        for side, (cls, own) in sides.items()
         for name, mark in options.tuned(cls).items()
         if mark.family in (None, entry.model.family)
+        and _accepted(cls, {**options.plain(own), name: mark.low})
     }
+
+
+def _accepted(cls: type[Any], values: Mapping[str, Any]) -> bool:
+    try:
+        built = options.build(cls, values, "tuned options")
+        if hasattr(built, "check"):
+            built.check()
+    except OptionError:
+        return False
+    return True
 
 
 def space(

@@ -22,10 +22,13 @@ from qrlsuite.tuning import halving, runner, search, space
 from qrlsuite.tuning.halving import Halving
 from tests.core.test_tuning import SETTINGS, Trainer, varied
 
+OWN = (*SETTINGS, parse_setting("input_scale=1"))
+"""Leaves lr alone to be tuned."""
+
 
 def request(task: str, model: str = "mlp", **changes: Any) -> search.Request:
     given: dict[str, Any] = {
-        "settings": SETTINGS if model == "mlp" else (),
+        "settings": OWN if model == "mlp" else (),
         "sampler": "halving",
         "seeds": search.tuning_seeds("5"),
         "epochs": 3,
@@ -129,7 +132,7 @@ def test_an_options_own_bounds_are_kept_and_said(tiny_task: str, tmp_path: Path)
         return 0.3 + 0.1 * float(entry.algorithm_options.gamma)
 
     words = varied("gamma={low = .8, high = 1.0}")
-    wanted = request(tiny_task, trials=4, varied=words, settings=(*SETTINGS, parse_setting("lr=1e-3")))
+    wanted = request(tiny_task, trials=4, varied=words, settings=(*OWN, parse_setting("lr=1e-3")))
     found = finish(Halving(wanted, tmp_path), Recorder(tmp_path / "tuning", speed))
     assert found.searched["algorithm.gamma"].high == 1.0, "gamma beyond 1 is refused by the option"
     assert found.at_edge == ["algorithm.gamma"]
@@ -161,7 +164,7 @@ def test_with_real_training_two_models_get_equal_budgets(tiny_task: str, tmp_pat
         request(
             tiny_task,
             "vqc-native",
-            settings=(parse_setting("qubits=2"), parse_setting("layers=1")),
+            settings=tuple(parse_setting(word) for word in ("qubits=2", "layers=1", "init_scale=1")),
             trials=2,
             seeds=search.tuning_seeds("1"),
             epochs=1,
@@ -219,7 +222,7 @@ def test_all_combinations_of_a_list_and_no_more(tiny_task: str, tmp_path: Path) 
         tiny_task,
         trials=9,
         varied=varied("activation=relu,tanh"),
-        settings=(*SETTINGS, parse_setting("lr=1e-3")),
+        settings=(*OWN, parse_setting("lr=1e-3")),
     )
     found = finish(Halving(wanted, tmp_path), Recorder(tmp_path / "tuning", near(2e-3)))
     assert {trial.point["model.activation"] for trial in found.trials} == {"relu", "tanh"}
@@ -233,7 +236,7 @@ def test_all_combinations_of_a_list_and_no_more(tiny_task: str, tmp_path: Path) 
         ({"trials": 3, "core_hours": 1.0}, "--trials and --core-hours: give one of them"),
         ({"core_hours": -1.0}, "--core-hours -1: give a time"),
         ({"sampler": "grid", "varied": varied("lr=1,2"), "core_hours": 1.0}, "--core-hours is for --sampler"),
-        ({"settings": (*SETTINGS, parse_setting("lr=1e-3"))}, "nothing is varied"),
+        ({"settings": (*OWN, parse_setting("lr=1e-3"))}, "nothing is varied"),
     ],
 )
 def test_bad_requests(changes: dict[str, Any], message: str, tiny_task: str, tmp_path: Path) -> None:
@@ -255,13 +258,28 @@ def test_options_say_that_they_are_tuned() -> None:
         Tuned(0, 1)
 
 
-def test_every_algorithm_tunes_its_learning_rates() -> None:
-    for algorithm in ("ddqn", "ppo", "reinforce"):
-        for model, names in (("mlp", {"lr"}), ("vqc-native", {"lr", "quantum_lr"})):
-            found = space.declared(resolve("beam6g", model, algorithm))
-            rates = {name: ends for name, ends in found.items() if name.startswith("algorithm.")}
-            assert set(rates) == {f"algorithm.{name}" for name in names}
-            assert all((ends.low, ends.high, ends.log) == (2e-4, 1e-2, True) for ends in rates.values())
+@pytest.mark.parametrize("algorithm", ["ddqn", "ppo", "reinforce"])
+@pytest.mark.parametrize(
+    ("model", "names"),
+    [
+        ("mlp", {"algorithm.lr", "model.input_scale"}),
+        ("fourier", {"algorithm.lr", "model.bandwidth"}),
+        ("vqc-native", {"algorithm.lr", "algorithm.quantum_lr", "model.init_scale"}),
+        ("vqc-pennylane", {"algorithm.lr", "algorithm.quantum_lr", "model.init_scale"}),
+    ],
+)
+def test_every_model_tunes_its_learning_rates_and_its_gain(
+    algorithm: str, model: str, names: set[str]
+) -> None:
+    entry = resolve("beam6g", model, algorithm)
+    found = space.declared(entry)
+    assert set(found) == names
+    own = {"algorithm": entry.algorithm_options, "model": entry.model_options}
+    for name, ends in found.items():
+        side, _, option = name.partition(".")
+        if side == "algorithm":
+            assert (ends.low, ends.high, ends.log) == (2e-4, 1e-2, True)
+        assert ends.low <= getattr(own[side], option) <= ends.high, "the untuned value lies within"
 
 
 def test_places_and_values_undo_each_other() -> None:

@@ -23,6 +23,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import AnsatzSpec
 from qrlsuite.training import memory
 from qrlsuite.training.trainer import Trainer
+from qrlsuite.tuning.space import declared
 from tests.conftest import results
 
 
@@ -237,6 +238,8 @@ def test_circuits_without_that_parameter(
     with pytest.raises(OptionError, match=message) as refused:
         entry("vqc-native", *words)
     assert "\n" not in str(refused.value)
+    assert "model.init_scale" in declared(entry("vqc-native"))
+    assert "model.init_scale" not in declared(entry("vqc-native", "ansatz=unscaled")), "nothing to tune"
 
 
 @pytest.mark.parametrize(
