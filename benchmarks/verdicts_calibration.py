@@ -34,6 +34,7 @@ from qrlsuite.statistics import (
     outperformance,
     sample_complexity,
     slower,
+    times_below,
     times_board,
 )
 from qrlsuite.statistics.calibration import draw_times, judge, judge_times, play, simulated_pairs
@@ -128,6 +129,54 @@ def rivals(entries: dict[str, LearningCurves]) -> list[tuple[str, SmoothedRuns, 
         ("width 64 against 32", MODELS[W64], MODELS[W32]),
         ("10 qubits against width 16", MODELS[Q10], MODELS[W16]),
     ]
+
+
+def print_populations(pairs: int) -> None:
+    """Rule times on width 64 against itself 10 percent slower, its runs drawn in three ways."""
+    count, generator = pairs // 10, np.random.default_rng(10)
+    entries = ENTRIES[W64], slower(ENTRIES[W64], 1.1)
+    sides = [times_below(entry.values, GRID, entry.steps_per_epoch) for entry in entries]
+    print(
+        f"\nM of the published runs: the second's is {sides[1].mean() / sides[0].mean():.4f} times the first's"
+    )
+    columns = ("runs drawn", "second's M / first's", *(f"{n_runs} runs" for n_runs in SIZES))
+    head(f"Rule times, width 64 against itself 10% slower, {count} pairs: first needs fewer", *columns)
+    for name, draw in (("from the published ones", _resampled), ("mixed with a neighbor", _mixed)):
+        large = [_times(draw(entry, 5000, generator)).mean() for entry in entries]
+        power = []
+        for n_runs in SIZES:
+            drawn = [_times(draw(entry, count * n_runs, generator)) for entry in entries]
+            ours, theirs = (each.reshape(count, n_runs, -1) for each in drawn)
+            power.append(judge_times(ours, theirs).first)
+        line(name, f"{large[1] / large[0]:.3f}", *power)
+    models = [SmoothedRuns(entry) for entry in entries]
+    large = [draw_times(model, 5000, 1, GRID, generator).mean() for model in models]
+    power = []
+    for n_runs in SIZES:
+        ours, theirs = (draw_times(model, n_runs, count, GRID, generator) for model in models)
+        power.append(judge_times(ours, theirs).first)
+    line("smoothed (SmoothedRuns)", f"{large[1] / large[0]:.3f}", *power)
+
+
+def _resampled(entry: LearningCurves, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return runs of the entry, with replacement."""
+    return entry.values[generator.integers(0, entry.n_runs, count)]
+
+
+def _mixed(entry: LearningCurves, count: int, generator: np.random.Generator, nearest: int = 5) -> np.ndarray:
+    """Return runs on the line between a run of the entry and one of its nearest neighbors."""
+    values = entry.values.astype(np.float64)
+    distance = ((values[:, None] - values[None]) ** 2).sum(axis=2)
+    np.fill_diagonal(distance, np.inf)
+    neighbors = np.argsort(distance, axis=1)[:, :nearest]
+    first = generator.integers(0, entry.n_runs, count)
+    second = neighbors[first, generator.integers(0, nearest, count)]
+    share = generator.random((count, 1))
+    return share * values[first] + (1 - share) * values[second]
+
+
+def _times(values: np.ndarray) -> np.ndarray:
+    return times_below(np.clip(values, 0, 1), GRID, 2000)
 
 
 def print_seeds(pairs: int) -> None:
@@ -241,6 +290,7 @@ PARTS: dict[str, Callable[[int], None]] = {
     "equality": print_equality,
     "power": print_power,
     "decisions": print_decisions,
+    "populations": print_populations,
     "seeds": print_seeds,
     "boards": print_boards,
     "coverage": print_coverage,

@@ -290,9 +290,7 @@ def test_a_changed_plan_is_refused_once_it_began(refused: Refused) -> None:
     edit("widths.toml", "alpha = 0.01", "alpha = 0.05")
     for command in ("run", "status", "show", "end"):
         message = refused(command, "widths.toml")
-        assert (
-            "widths.toml: alpha (was 0.01, is 0.05) changed after the plan began: it can be ended" in message
-        )
+        assert "widths.toml: alpha (was 0.01, is 0.05) changed after the plan began. End this plan" in message
 
 
 def test_seeds_of_others_are_refused(refused: Refused) -> None:
