@@ -109,8 +109,8 @@ def summary(found: Sequence[CalibrationResult], rule: str, board: int) -> str:
     if equals := [each.winner for each in plans if each.factor is None]:
         parts.append(f"as a decision plan finds a false difference in {_range(equals)}")
         worst = max(each.factor or 1 for each in plans)
-        seeds = [each.mean_seeds or 0 for each in plans if each.factor == worst]
-        low, high = f"{min(seeds):.0f}", f"{max(seeds):.0f}"
+        needed = [each.mean_seeds or 0.0 for each in plans if each.factor == worst]
+        low, high = f"{min(needed):.0f}", f"{max(needed):.0f}"
         parts.append(
             f"as a plan needs {low if low == high else f'{low} to {high}'} seeds on average, not "
             f"{plans[0].n_runs[0]}, where an entry takes {worst - 1:.0%} longer"

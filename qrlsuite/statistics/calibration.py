@@ -401,8 +401,9 @@ def decision_rates(
     count = whole(n_studies, "n_studies", at_least=1)
     drawn = [draw_times(model, plan.looks[-1], count, grid, generator) for model in models]
     rates = play(plan, drawn)
-    for _ in range(count if tick is not None else 0):
-        tick()
+    if tick is not None:
+        for _ in range(count):
+            tick()
     return rates
 
 
