@@ -19,10 +19,12 @@ from qrlsuite.engine.display import Bar
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import evaluation
+from qrlsuite.training.entanglement import PARAMETERS, Entanglement, along_episodes
 from qrlsuite.training.evaluation import Played
 
 WIDE = 100
@@ -41,6 +43,8 @@ class Evaluation(Shown):
         Complete episodes of each agent.
     seed:
         The evaluation seed, which fixes the episodes.
+    entanglement:
+        That of the entries' circuits, where it was asked for.
     """
 
     task: str
@@ -48,6 +52,7 @@ class Evaluation(Shown):
     policies: tuple[Played, ...]
     episodes: int
     seed: int
+    entanglement: tuple[Entanglement, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values: mean, percentiles and extremes of every policy."""
@@ -58,10 +63,13 @@ class Evaluation(Shown):
             "episodes": self.episodes,
             "selection": "last validation score",
             "policies": [each.summary() for each in self.policies],
+            **({"entanglement": [each.as_dict() for each in self.entanglement]} if self.entanglement else {}),
         }
 
     def figure(self) -> Figure:
-        """Draw the histogram of the episodes' sums of rewards."""
+        """Draw the histogram of the episodes' sums of rewards, or the entanglement where it was asked for."""
+        if self.entanglement:
+            return entanglement_picture.draw(self.entanglement, title=self.task)
         note = ""
         if any(each.seeds for each in self.policies):
             note = (
@@ -106,6 +114,30 @@ class Evaluation(Shown):
             row += [""] * (len(names) - len(row))
             table.add_row(*(Text(row[i]) for i in shown))
         yield table
+        if self.entanglement:
+            yield self._entanglement()
+
+    def _entanglement(self) -> Table:
+        """Return a row per entry and parameters: means over agents, episodes and steps."""
+        table = Table(
+            title=Text("entanglement of the circuits' states along the episodes"),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text(
+                "meyer-wallach: 0 for products, 1 at most; half-cut entropy: bits, n // 2 at most; means over agents, "
+                "episodes and steps; initial: the same agents before training, on the same observations"
+            ),
+            caption_justify="left",
+            pad_edge=False,
+        )
+        for name in ("policy", "parameters", "meyer-wallach", "half-cut entropy", "at most"):
+            table.add_column(Text(name), justify="left" if name in ("policy", "parameters") else "right")
+        for each in self.entanglement:
+            for which in PARAMETERS:
+                means = [f"{np.nanmean(found[which]):.3f}" for found in each.values.values()]
+                table.add_row(Text(each.name), Text(which), *means, str(each.qubits // 2))
+        return table
 
     def _notes(self) -> list[str]:
         """Say how the agents were chosen, and what the choice promised against what came."""
@@ -139,6 +171,7 @@ def evaluate(
     seed: int = 0,
     device: str = "cpu",
     progress: bool = True,
+    entanglement: bool = False,
 ) -> Evaluation:
     """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
 
@@ -154,6 +187,8 @@ def evaluate(
         As for `qrlsuite.training.evaluation.trained`.
     progress:
         Whether to show a bar.
+    entanglement:
+        Measure the entanglement of every entry's circuit, too.
 
     Raises
     ------
@@ -171,6 +206,7 @@ def evaluate(
     folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in names)
     stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
+    measured = tuple(along_episodes(s, best, episodes, seed, device) for s in stores) if entanglement else ()
     bar = Bar(Console(stderr=True, quiet=not progress, highlight=False), TimeRemainingColumn())
 
     def report(name: str, done: int, total: int) -> None:
@@ -190,7 +226,7 @@ def evaluate(
         each if labels.count(each.name) == 1 else replace(each, name=f"{each.name} {store.path.name[-8:]}")
         for each, store in zip(played, stores)
     ]
-    return Evaluation(entry.task.name, entry.task.hash, (*played, *references), episodes, seed)
+    return Evaluation(entry.task.name, entry.task.hash, (*played, *references), episodes, seed, measured)
 
 
 def _one_task(stores: Sequence[EntryStore]) -> None:

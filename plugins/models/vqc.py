@@ -239,6 +239,19 @@ class _Hybrid(nn.Module):
         """Circuit executions of each agent so far, shared with deep copies."""
         return self._runner.executions
 
+    def circuit_states(self, x: Tensor) -> Tensor:
+        """Return the circuit's final states (S, B, 2^n) for observations (S, B, in); qubit 0 is the highest bit."""
+        from qrlsuite.plugins.circuits.native import dense  # the state is no backend's business but native's
+
+        inner = self._circuit_inputs(x, dict(self.named_parameters()))
+        parameters = [value.reshape(len(value), -1) for value in self.circuit.values()]
+        return dense.states(self._runner.circuit, inner, torch.cat(parameters, dim=1))
+
+    def _circuit_inputs(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
+        """Map (S, B, in) to what the circuit is given, (S, B, circuit.inputs)."""
+        inner = linear(x.to(state["input.weight"].dtype), state["input.weight"], state["input.bias"])
+        return ACTIVATIONS[self._runner.options.activation_in](inner)
+
     def quantum_parameters(self) -> set[str]:
         """Return the names of the circuit's parameters."""
         return {f"circuit.{name}" for name in self._runner.circuit.parameters}
@@ -246,8 +259,7 @@ class _Hybrid(nn.Module):
     def _stacked(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
         """Map (S, B, in) to (S, B, out) with parameters (S, ...)."""
         runner, options = self._runner, self._runner.options
-        inner = x.to(state["input.weight"].dtype)
-        inner = ACTIVATIONS[options.activation_in](linear(inner, state["input.weight"], state["input.bias"]))
+        inner = self._circuit_inputs(x, state)
         parameters = {name: state[f"circuit.{name}"] for name in runner.circuit.parameters}
         values = runner.backend(inner, parameters, self._shot_seeds())
         executions, inputs = runner.executions, x.shape[1]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from qrlsuite.circuit import Circuit
 from qrlsuite.plugins.circuits.native.program import (
     AXIS_X,
     AXIS_Y,
@@ -21,6 +22,7 @@ from qrlsuite.plugins.circuits.native.program import (
     ROTATE,
     Component,
     Program,
+    compile_circuit,
 )
 
 if TYPE_CHECKING:
@@ -36,6 +38,27 @@ def expectations(program: Program, inputs: Tensor, flat: Tensor) -> Tensor:
         angles.reshape(inputs.shape[0] * inputs.shape[1], -1 if angles.shape[2] else 0), program
     )
     return result.reshape(*inputs.shape[:2], len(program.observables))
+
+
+def states(circuit: Circuit, inputs: Tensor, flat: Tensor) -> Tensor:
+    """Return final states (S, B, 2^n) of inputs (S, B, I) and flat parameters (S, P), up to a global phase.
+
+    Qubit 0 is the highest bit of a basis state's index.
+    """
+    program = compile_circuit(circuit)
+    angles = _angles(program, inputs, flat)
+    angles = angles.reshape(inputs.shape[0] * inputs.shape[1], -1 if angles.shape[2] else 0)
+    together = torch.ones(len(angles), 1, dtype=COMPLEX[angles.dtype], device=angles.device)
+    for component in _components(program):
+        state = _begin(component, angles)
+        for step in _steps(program, component):
+            _apply(program, component.qubits, state, step, angles)
+        together = (together[:, :, None] * state[:, None, :]).flatten(1)
+    # the qubits come component by component
+    order = [q for qubits in circuit.components() for q in qubits]
+    axes = [1 + order.index(q) for q in range(circuit.qubits)]
+    shaped = together.reshape(len(angles), *[2] * circuit.qubits).permute(0, *axes)
+    return shaped.reshape(*inputs.shape[:2], -1)
 
 
 def mean_field_expectations(program: MeanFieldProgram, inputs: Tensor, flat: Tensor) -> Tensor:
@@ -87,6 +110,8 @@ def _angles(program: Program | MeanFieldProgram, inputs: Tensor, flat: Tensor) -
 
 def _pick(flat: Tensor, index: Tensor) -> Tensor:
     """Return flat parameters (S, 1, A) at an index; where it is -1 the value means nothing."""
+    if flat.shape[1] == 0:  # no parameter at all, so every index is -1
+        return flat.new_zeros(len(flat), 1, len(index))
     return flat[:, index.clamp(min=0)][:, None]
 
 

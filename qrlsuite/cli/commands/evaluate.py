@@ -34,6 +34,14 @@ def evaluate(
         int,
         typer.Option("--seed", min=0, help="Seed of the episodes, which are the same for all policies."),
     ] = 0,
+    entanglement: Annotated[
+        bool,
+        typer.Option(
+            "--entanglement",
+            help="Measure how entangled the circuits' states are along the episodes, trained and initial; --out draws "
+            "it.",
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Draw the histogram to a png, pdf or svg file."),
@@ -54,7 +62,14 @@ def evaluate(
     if out is not None and format_ not in ("png", "pdf", "svg"):
         raise OptionError(f"--out {out}: the file's ending must be .png, .pdf or .svg")
     evaluations = evaluation.evaluate(
-        runs, entries, task=task, best=best, episodes=episodes, seed=seed, progress=not json_output
+        runs,
+        entries,
+        task=task,
+        best=best,
+        episodes=episodes,
+        seed=seed,
+        progress=not json_output,
+        entanglement=entanglement,
     )
     if out is not None:
         write_atomically(out, pictures.encode(evaluations.figure(), format_))
