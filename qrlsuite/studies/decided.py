@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +15,7 @@ from rich.text import Text
 from qrlsuite.engine import execution
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution
-from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.terminal import Shown, table
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
 from qrlsuite.results.text import counted, hours_range, hours_text
@@ -309,11 +308,9 @@ def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
 
 
 def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
-        table.add_column(column, overflow="fold")
-    for pair, facts in zip(decision.pairs, plain):
-        cells = (
+    columns = ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs")
+    rows = (
+        (
             versus(pair),
             pair.verdict,
             str(pair.n_runs),
@@ -321,5 +318,6 @@ def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(study, facts["needs"]),
         )
-        table.add_row(*(Text(cell) for cell in cells))
-    return table
+        for pair, facts in zip(decision.pairs, plain)
+    )
+    return table(columns, rows, left=columns)

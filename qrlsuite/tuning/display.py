@@ -7,10 +7,9 @@ import time
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from rich.console import Console
-
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.execution import Plan
+from qrlsuite.engine.terminal import message_console
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
@@ -38,7 +37,7 @@ class TuneDisplay:
         again: Literal["command", "call"] = "command",
     ) -> None:
         self.searches, self.workers, self.again = searches, workers, again
-        self.console = Console(stderr=True, quiet=quiet, highlight=False)
+        self.console = message_console(quiet)
         self.bar = Bar(self.console)
         self._began = time.monotonic()
         self._trained = 0
