@@ -70,9 +70,9 @@ def print_bias(entry: LearningCurves, draws: int) -> None:
         print(f"| {entry.name} | {n_runs} | {means} |", flush=True)
 
 
-def print_tables(jobs: list[calibration.Job]) -> None:
+def print_tables(jobs: list[calibration.Job], cells: int, board: int) -> None:
     """Compute and print tables in markdown, as `qrlsuite calibrate` shows them."""
-    for sentence, rows in tables([job.run() for job in jobs]):
+    for sentence, rows in tables([job.run() for job in jobs], cells, board):
         print(f"\n{sentence}\n")
         for k, row in enumerate(rows):
             print(f"| {' | '.join(row)} |" + (f"\n|{'---|' * len(row)}" if k == 0 else ""), flush=True)
@@ -95,7 +95,7 @@ def main() -> None:
         print_bias(entry, draws)
 
     numbers = [(20, 20), (50, 50), (100, 100), (10, 40), (25, 50), (30, 100)]
-    print_tables(calibration.plan(entries, grid, RULES, draws, ["pairs"], numbers))
+    print_tables(calibration.plan(entries, grid, RULES, draws, ["pairs"], numbers), grid.size, 0)
 
     print("\n| network | runs | a winner, each entry keeping its own interval |\n|---|---|---|")
     for entry in entries:
@@ -106,6 +106,8 @@ def main() -> None:
     for board in (5, 10):
         print_tables(
             calibration.plan(entries, grid, RULES, 2 * draws // 5, ["boards"], [(100, 100)], board),
+            grid.size,
+            board,
         )
     print("\nrule difference with alpha = .05 / 45 pairs, 10,000 resamples, 40 boards of ten:")
     for entry in entries:
@@ -116,7 +118,7 @@ def main() -> None:
 
     for n_runs in (20, 50, 100):
         jobs = calibration.plan(entries, grid, RULES, draws // 5, ["power"], [(n_runs, n_runs)])
-        print_tables(jobs)
+        print_tables(jobs, grid.size, 0)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.progress import TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from qrlsuite.engine.display import Bar
-from qrlsuite.engine.terminal import Shown, message_console, table
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
@@ -83,10 +85,25 @@ class Evaluation(Shown):
         notes = self._notes()
         if not wide:
             notes.append(f"a terminal of {WIDE} columns shows medians and percentiles too")
+        table = Table(
+            title=Text(f"{self.task}: {self.episodes} fresh episodes of each policy, the same for all"),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text("\n".join(notes)),
+            caption_justify="left",
+            pad_edge=False,
+        )
         names = ["policy", "agents", "return: mean", "median", "5%", "95%"]
         names += ["score: mean", "median", "5%", "95%"] * relative
         shown = [i for i, name in enumerate(names) if wide or i < 2 or name.endswith("mean")]
-        rows = []
+        for name in (names[i] for i in shown):
+            table.add_column(
+                Text(name),
+                justify="left" if name == "policy" else "right",
+                overflow="fold",
+                no_wrap=name != "policy",
+            )
         for each in self.policies:
             row = [
                 each.name,
@@ -95,31 +112,32 @@ class Evaluation(Shown):
                 *_row(each, "score") * relative,
             ]
             row += [""] * (len(names) - len(row))
-            rows.append([row[i] for i in shown])
-        columns = [names[i] for i in shown]
-        title = f"{self.task}: {self.episodes} fresh episodes of each policy, the same for all"
-        caption = "\n".join(notes)
-        yield table(columns, rows, title=title, caption=caption, left=["policy"], fixed=columns[1:])
+            table.add_row(*(Text(row[i]) for i in shown))
+        yield table
         if self.entanglement:
             yield self._entanglement()
 
     def _entanglement(self) -> Table:
         """Return a row per entry and parameters: means over agents, episodes and steps."""
-        rows = []
-        for each in self.entanglement:
-            for which in PARAMETERS:
-                means = [f"{np.nanmean(found[which]):.3f}" for found in each.values.values()]
-                rows.append((each.name, which, *means, str(each.qubits // 2)))
-        return table(
-            ("policy", "parameters", "meyer-wallach", "half-cut entropy", "at most"),
-            rows,
-            title="entanglement of the circuits' states along the episodes",
-            caption=(
+        table = Table(
+            title=Text("entanglement of the circuits' states along the episodes"),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text(
                 "meyer-wallach: 0 for products, 1 at most; half-cut entropy: bits, n // 2 at most; means over agents, "
                 "episodes and steps; initial: the same agents before training, on the same observations"
             ),
-            left=("policy", "parameters"),
+            caption_justify="left",
+            pad_edge=False,
         )
+        for name in ("policy", "parameters", "meyer-wallach", "half-cut entropy", "at most"):
+            table.add_column(Text(name), justify="left" if name in ("policy", "parameters") else "right")
+        for each in self.entanglement:
+            for which in PARAMETERS:
+                means = [f"{np.nanmean(found[which]):.3f}" for found in each.values.values()]
+                table.add_row(Text(each.name), Text(which), *means, str(each.qubits // 2))
+        return table
 
     def _notes(self) -> list[str]:
         """Say how the agents were chosen, and what the choice promised against what came."""
@@ -189,7 +207,7 @@ def evaluate(
     stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
     measured = tuple(along_episodes(s, best, episodes, seed, device) for s in stores) if entanglement else ()
-    bar = Bar(message_console(quiet=not progress), TimeRemainingColumn())
+    bar = Bar(Console(stderr=True, quiet=not progress, highlight=False), TimeRemainingColumn())
 
     def report(name: str, done: int, total: int) -> None:
         bar.start(total, name)

@@ -6,13 +6,12 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.engine.terminal import table
 from qrlsuite.leaderboard.absent import absent
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Comparison
@@ -170,15 +169,53 @@ def section_table(section: Section, width: int = WIDE) -> Table:
     shown = [name for name in COLUMNS if name not in left_out]
     if left_out:
         remarks.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
-    texts = (dict(zip(COLUMNS, cells(section, row))) for row in section.rows)
-    return table(
+    found = table(
         shown,
-        ([row[name] for name in shown] for row in texts),
         title=title(section),
         caption="\n".join(remarks),
         left=[name for name in shown if name not in NUMERIC],
         fixed=[name for name in shown if name in NUMERIC or name.startswith("S_hat")],
     )
+    for row in section.rows:
+        texts = dict(zip(COLUMNS, cells(section, row)))
+        found.add_row(*(Text(texts[name]) for name in shown))
+    return found
+
+
+def table(
+    columns: Sequence[str],
+    *,
+    title: str | None = None,
+    caption: str | None = None,
+    left: Sequence[str] = (),
+    fixed: Sequence[str] = (),
+) -> Table:
+    """Return an empty table as all commands show them.
+
+    Parameters
+    ----------
+    columns:
+        Their names. Numbers stand at the right.
+    title, caption:
+        What stands above and below it.
+    left:
+        Columns of words, which stand at the left.
+    fixed:
+        Columns that are never broken into several lines.
+    """
+    found = Table(
+        title=None if title is None else Text(title),
+        title_justify="left",
+        header_style="bold",
+        box=box.SIMPLE_HEAD,
+        caption=None if caption is None else Text(caption),
+        caption_justify="left",
+        pad_edge=False,
+    )
+    for name in columns:
+        justify: Literal["left", "right"] = "left" if name in left else "right"
+        found.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
+    return found
 
 
 NARROW = 105
@@ -203,26 +240,29 @@ def times_table(section: Section, width: int = WIDE) -> Table:
         remarks.append(
             f"a terminal of {NARROW} columns, or --format markdown, shows {', '.join(left_out)} too"
         )
-    kept = [index for index, name in enumerate(columns) if name not in left_out]
-    shown = [columns[index] for index in kept]
-    return table(
+    kept = [place for place, name in enumerate(columns) if name not in left_out]
+    shown = [columns[place] for place in kept]
+    found = table(
         shown,
-        ([texts[index] for index in kept] for texts in map(times.cells, times.rows)),
         title=times_title(section),
         caption="\n".join(remarks),
         left=[name for name in shown if name not in LEFT_OUT_OF_TIMES],
         fixed=[name for name in shown if name not in NAMES],
     )
+    for row in times.rows:
+        texts = times.cells(row)
+        found.add_row(*(Text(texts[place]) for place in kept))
+    return found
 
 
 def across_table(board: AcrossBoard) -> Table:
     """Return a comparison over several tasks as a table."""
     columns = board.columns()
     fixed = [name for name in columns if name not in NAMES]
-    rows = map(board.cells, range(len(board.order)))
-    return table(
-        columns, rows, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed
-    )
+    found = table(columns, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed)
+    for place in range(len(board.order)):
+        found.add_row(*map(Text, board.cells(place)))
+    return found
 
 
 def markdown(board: Leaderboard) -> str:

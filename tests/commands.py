@@ -122,7 +122,7 @@ def _worker(
 
 
 def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -> int:
-    """Be `python -W error -m qrlsuite WORDS`, or a worker, in a forked process."""
+    """Be `python -W error -m qrlsuite WORDS`, a worker or `pytest WORDS` in a forked process."""
     from qrlsuite import cli, registry
     from qrlsuite.engine import local, worker
 
@@ -141,6 +141,10 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
     warnings.simplefilter("error")
     if program == "worker":
         return worker.main(words)
+    if program == "pytest":
+        import pytest
+
+        return pytest.main(words)
     cli.main()
     return 0
 
@@ -209,6 +213,7 @@ class Command:
         cwd: Path | None = None,
         python: str = sys.executable,
         program: str = "qrlsuite",
+        output: IO[bytes] | None = None,
     ) -> None:
         self.returncode: int | None = None
         self._printed: tuple[str, ...] = ()
@@ -223,7 +228,8 @@ class Command:
             request.write(json.dumps(asked).encode())
             request.seek(0)
             self._reply, reply = os.pipe()
-            files = [request.fileno(), self._out.fileno(), self._err.fileno(), reply]
+            out, err = output or self._out, output or self._err
+            files = [request.fileno(), out.fileno(), err.fileno(), reply]
             socket.send_fds(_server(python), [b"."], files)
             os.close(reply)
         self.pid = int(self._line(HANGS))
@@ -281,6 +287,12 @@ def start(*words: str, env: Mapping[str, str] | None = None, cwd: Path | None = 
 def start_worker(*words: str, env: Mapping[str, str] | None = None) -> Command:
     """Start `python -m qrlsuite.engine.worker WORDS` and go on."""
     return Command(list(words), env, program="worker")
+
+
+def popen(command: list[str], *, env: Mapping[str, str], stdout: IO[bytes], **rest: object) -> Command:
+    """Stand in for the `subprocess.Popen` of a local engine in this process."""
+    words = command[command.index("qrlsuite.engine.worker") + 1 : command.index("--follow-parent")]
+    return Command(words, env, program="worker", output=stdout)
 
 
 def qrlsuite(

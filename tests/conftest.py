@@ -12,12 +12,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from tests.commands import HANGS as HANGS  # tests take it from here
-from tests.commands import Command
+from tests.commands import Command, popen
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles the suite again
 sys.dont_write_bytecode = False
@@ -42,14 +43,12 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 LONGEST = (
     "third_party/test_stranger.py",
-    "cli/test_cli.py",
     "testing/test_builtins.py",
-    "cli/test_study.py",
-    "engine/test_trouble.py",
-    "cli/test_tune.py",
-    "cli/test_new.py",
     "circuits/test_native.py",
-    "engine/test_kills.py",
+    "cli/test_new.py",
+    "core/test_api.py",
+    "cli/test_cli.py",
+    "cli/test_study.py",
 )
 """Begun first, for a file is one process's: the last one would be waited for by an idle core."""
 
@@ -135,6 +134,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 from qrlsuite import hookimpl
 
@@ -200,6 +200,17 @@ def tiny_task(tmp_path: Path) -> str:
     path = tmp_path / "tiny.toml"
     path.write_text(TINY)
     return str(path)
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that the local engine starts from the test's own process are forks, and begin at once."""
+    from qrlsuite.engine import local
+
+    stand_in = SimpleNamespace(
+        Popen=popen, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired
+    )
+    monkeypatch.setattr(local, "subprocess", stand_in)
 
 
 @pytest.fixture

@@ -12,30 +12,6 @@ from qrlsuite.engine import execution
 from qrlsuite.engine.execution import Execution
 from qrlsuite.errors import OptionError
 
-TaskOption = Annotated[
-    str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
-]
-AlgorithmOption = Annotated[
-    str | None,
-    typer.Option(
-        "--algorithm", help="A learning algorithm (see `qrlsuite list algorithms`); default: the task's."
-    ),
-]
-PresetOption = Annotated[
-    str | None, typer.Option("--preset", help="One of the task's presets, or a preset file's path.")
-]
-SeedsOption = Annotated[
-    str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: the task's protocol.")
-]
-EpochsOption = Annotated[
-    int | None, typer.Option("--epochs", min=1, help="Epochs of each seed; default: the task's protocol.")
-]
-BudgetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--budget", metavar="TIME", help="90s, 30min, 2h: begin nothing that would not end within it."
-    ),
-]
 WorkersOption = Annotated[
     int | None,
     typer.Option("--workers", min=1, help="Processes, or array tasks; default: one per core, or 10 tasks."),

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 
 from qrlsuite import registry
 from qrlsuite.engine.execution import Plan
-from qrlsuite.engine.terminal import command, message_console
+from qrlsuite.engine.terminal import command
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.text import counted, duration
 
@@ -214,7 +214,7 @@ class RunDisplay:
         again: Literal["command", "call"] = "command",
     ) -> None:
         self.plan, self.entry, self.epochs, self.groups = plan, plan.entry, plan.epochs, plan.groups
-        self.console = message_console(quiet)
+        self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.estimate = CostEstimate(plan.groups, plan.epochs, workers)
         self.workers = min(workers, max(1, len(plan.groups)))
         self.again = again

@@ -7,14 +7,9 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 
 class Shown:
@@ -31,50 +26,6 @@ def table_console(least: int = 130) -> Console:
     """Return where tables are printed: as wide as the terminal, and in a pipe or a file `least` columns or more."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(width=max(console.width, least), highlight=False)
-
-
-def message_console(quiet: bool = False) -> Console:
-    """Return where messages and progress are printed: stderr, or nowhere if quiet."""
-    return Console(stderr=True, quiet=quiet, highlight=False)
-
-
-def table(
-    columns: Sequence[str],
-    rows: Iterable[Iterable[str]],
-    *,
-    title: str | None = None,
-    caption: str | None = None,
-    left: Sequence[str] = (),
-    fixed: Sequence[str] = (),
-) -> Table:
-    """Return a table in the style of all commands.
-
-    Parameters
-    ----------
-    columns:
-        Their names; columns are aligned right.
-    rows:
-        The cells of each row, as plain text.
-    left:
-        Columns that are aligned left.
-    fixed:
-        Columns whose cells are never broken into several lines.
-    """
-    result = Table(
-        title=None if title is None else Text(title),
-        title_justify="left",
-        header_style="bold",
-        box=box.SIMPLE_HEAD,
-        caption=None if caption is None else Text(caption),
-        caption_justify="left",
-        pad_edge=False,
-    )
-    for name in columns:
-        justify: Literal["left", "right"] = "left" if name in left else "right"
-        result.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
-    for row in rows:
-        result.add_row(*map(Text, row))
-    return result
 
 
 def command(*words: str, runs: Path | None = None) -> str:

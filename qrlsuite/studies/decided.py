@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -15,7 +16,7 @@ from rich.text import Text
 from qrlsuite.engine import execution
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution
-from qrlsuite.engine.terminal import Shown, table
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
 from qrlsuite.results.text import counted, hours_range, hours_text
@@ -308,9 +309,11 @@ def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
 
 
 def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str, Any]]) -> Table:
-    columns = ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs")
-    rows = (
-        (
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
+        table.add_column(column, overflow="fold")
+    for pair, facts in zip(decision.pairs, plain):
+        cells = (
             versus(pair),
             pair.verdict,
             str(pair.n_runs),
@@ -318,6 +321,5 @@ def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(study, facts["needs"]),
         )
-        for pair, facts in zip(decision.pairs, plain)
-    )
-    return table(columns, rows, left=columns)
+        table.add_row(*(Text(cell) for cell in cells))
+    return table

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +17,7 @@ from qrlsuite import registry
 from qrlsuite.engine.api import EngineOutcome
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution, Plan, plan, train
-from qrlsuite.engine.terminal import Shown, table
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
@@ -127,7 +128,11 @@ class Overview(Shown):
         yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
 
     def _table(self) -> Table:
-        columns, rows = ("task", "entry", "seeds", "epochs", "core time left", "because"), []
+        table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+        for column in ("task", "entry", "seeds", "epochs", "core time left", "because"):
+            table.add_column(
+                column, justify="right" if column in ("seeds", "epochs") else "left", overflow="fold"
+            )
         for item in self.items:
             cost = item.seconds
             busy = f" (+{len(item.plan.busy)} at work)" if item.plan.busy else ""
@@ -139,8 +144,8 @@ class Overview(Shown):
                 "-" if cost == 0 else "?" if item.range is None else duration_range(*item.range),
                 "" if cost == 0 else item.estimate.basis,
             )
-            rows.append(cells)
-        return table(columns, rows, left=("task", "entry", "core time left", "because"))
+            table.add_row(*map(Text, cells))
+        return table
 
 
 def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:

@@ -7,9 +7,10 @@ import time
 from collections.abc import Sequence
 from typing import Any, Literal
 
+from rich.console import Console
+
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.execution import Plan
-from qrlsuite.engine.terminal import message_console
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
@@ -37,7 +38,7 @@ class TuneDisplay:
         again: Literal["command", "call"] = "command",
     ) -> None:
         self.searches, self.workers, self.again = searches, workers, again
-        self.console = message_console(quiet)
+        self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
         self._began = time.monotonic()
         self._trained = 0

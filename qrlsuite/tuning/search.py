@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
 
 from qrlsuite import options, registry
-from qrlsuite.engine.terminal import Shown, table
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
@@ -373,32 +376,37 @@ class Search(Shown):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show the best trials, a row each."""
         ranking = self.base.task.file.ranking
-        rows = (
-            (
-                str(trial.number),
-                space.text(trial.point),
-                self._seeds_text(trial),
-                steps_text(trial.merit.time),
-                f"{'>= ' * trial.merit.unsettled}{steps_text(trial.merit.cell)}",
-                steps_text(trial.merit.area),
-                f"{trial.merit.score:.4f}",
-                hours_text(trial.core_seconds / 3600),
-            )
-            for trial in self.ordered[:SHOWN]
-        )
-        yield table(
-            ("trial", "settings", "seeds", "M", "S_hat", "area", "mean score", "core-hours"),
-            rows,
-            title=(
+        table = Table(
+            title=Text(
                 f"{self.base.label} on {self.base.task.name}: the best of {len(self.trials)} trials, "
                 f"{self.runs_done} runs x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours"
             ),
-            caption=(
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE_HEAD,
+            caption=Text(
                 f"minimized: {cell_text(ranking, self.request.objective)}; ties by the area, then by the mean score "
                 f"over all epochs. {self._warning}"
             ),
-            left=("settings",),
+            caption_justify="left",
+            pad_edge=False,
         )
+        for name in ("trial", "settings", "seeds", "M", "S_hat", "area", "mean score", "core-hours"):
+            table.add_column(Text(name), justify="left" if name == "settings" else "right", overflow="fold")
+        for trial in self.ordered[:SHOWN]:
+            merit = trial.merit
+            row = [
+                str(trial.number),
+                space.text(trial.point),
+                self._seeds_text(trial),
+                steps_text(merit.time),
+                f"{'>= ' * merit.unsettled}{steps_text(merit.cell)}",
+                steps_text(merit.area),
+                f"{merit.score:.4f}",
+                hours_text(trial.core_seconds / 3600),
+            ]
+            table.add_row(*(Text(cell) for cell in row))
+        yield table
 
     @property
     def _warning(self) -> str:

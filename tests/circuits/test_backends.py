@@ -56,9 +56,16 @@ def reference(name, gate, qubits):
     return circuit, given, evaluate(create_backend("pennylane", circuit), *given)
 
 
-@pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "pennylane"])
+@pytest.mark.parametrize(
+    ("backend", "qubits"),
+    [
+        pytest.param(name, qubits, marks=[pytest.mark.long] if name in SLOW and qubits > 3 else [])
+        for name in BACKENDS
+        if name != "pennylane"
+        for qubits in (2, 3, 5)
+    ],
+)
 @pytest.mark.parametrize(("name", "gate"), VARIANTS)
-@pytest.mark.parametrize("qubits", [2, 3, 5])
 def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate, qubits):
     circuit, given, expected = reference(name, gate, qubits)
     got = evaluate(create_backend(backend, circuit), *given)

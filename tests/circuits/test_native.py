@@ -361,8 +361,22 @@ PROCESSORS = {"haswell": 32, "x86-64": 16}
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="runs code for processors of this architecture")
-@pytest.mark.parametrize(("processor", "register"), PROCESSORS.items())
-def test_other_processors(processor: str, register: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("processor", "chosen"),
+    [
+        ("x86-64", "numbers and kernels and float32"),
+        *(
+            pytest.param(
+                processor,
+                "numbers and kernels or company or finite_differences or linear_algebra or connects",
+                marks=pytest.mark.long,
+            )
+            for processor in PROCESSORS
+        ),
+    ],
+    ids=["x86-64", *(f"{processor}-all" for processor in PROCESSORS)],
+)
+def test_other_processors(processor: str, chosen: str, tmp_path: Path) -> None:
     """The released code's numbers, seeds in company and any circuit, compiled for a processor with less."""
     if processor == "haswell" and "fma" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2 and FMA")
@@ -371,10 +385,9 @@ def test_other_processors(processor: str, register: int, tmp_path: Path) -> None
         "assert LANES == {types.float32: int(sys.argv[1]) // 4, types.float64: int(sys.argv[1]) // 8}, LANES; "
         "sys.exit(pytest.main(['-q', '-x', '-p', 'no:cacheprovider', sys.argv[2], '-k', sys.argv[3]]))"
     )
-    chosen = "numbers and kernels or company or finite_differences or linear_algebra or connects"
     target = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "QRLSUITE_CACHE": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", program, str(register), __file__, chosen],
+        [sys.executable, "-c", program, str(PROCESSORS[processor]), __file__, chosen],
         env={**os.environ, **target},
         cwd=Path(__file__).parents[2],
         capture_output=True,

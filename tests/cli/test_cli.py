@@ -291,6 +291,9 @@ def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     assert (tmp_path / "cx.svg").read_text().startswith("<?xml")
     hooks = qrlsuite("list", "hooks").stdout
     assert "register_environments" in hooks
+    manual = qrlsuite("show", "hook", "register_models").stdout
+    assert "register_models" in manual
+    assert qrlsuite("show", "register_models").stdout == manual
 
 
 def test_version_and_help() -> None:

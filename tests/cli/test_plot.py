@@ -156,14 +156,17 @@ def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryCurves
 def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryCurves]) -> None:
     words = ("calibrate", "qubits=6", "--draws", "4", "--seeds", "20", "--board", "2", "--part", "pairs")
     output = call(*words, "--rule", "intervals")
-    assert "pairs: two equal entries, simulated: every winner is false" in output
+    assert "'intervals' promises each cell by itself" in output
+    assert "a false winner between two equal entries of 20 seeds in" in output
     content = json.loads(call(*words, "--rule", "intervals", "--json"))
     assert [rate["seeds"] for rate in content["rates"]] == [[20, 20]]
     assert 0 <= content["rates"][0]["winner"] <= 1
     with pytest.raises(OptionError, match="--seeds 20;30: write two numbers"):
         call("calibrate", "--seeds", "20;30")
+    with pytest.raises(OptionError, match="--seeds 1,30: both numbers must be between 2 and 10000"):
+        call("calibrate", "--seeds", "1,30")
     halves = call("calibrate", "qubits=6", "--draws", "4", "--part", "halves", "--rule", "difference")
-    assert "halves: random halves of one entry's runs: every winner is false" in halves
+    assert "'difference' declares a false winner between halves of one entry in" in halves
     object.__setattr__(entries[0], "curves", entries[0].curves[:, :10])
     cut = json.loads(call("calibrate", "--draws", "4", "--part", "halves", "--json").splitlines()[-1])
     assert len(cut["entries"]) == 2, "an entry at epoch 10 of 100 would cut the others' curves to 10 epochs"

@@ -18,6 +18,8 @@ from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold
 from tests.core.test_tuning import SETTINGS, finish, varied, without_hours
 
+pytestmark = pytest.mark.usefixtures("forked_workers")
+
 
 @pytest.fixture
 def task(tmp_path: Path) -> str:

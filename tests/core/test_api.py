@@ -37,6 +37,8 @@ name = "curves"
 kind = "curves"
 """
 
+pytestmark = pytest.mark.usefixtures("forked_workers")
+
 
 def quiet(task: str, runs: Path, **more: Any) -> Any:
     return api.train(task, "mlp", options=OPTIONS, workers=1, runs=runs, progress=False, **more)

@@ -11,20 +11,21 @@ from qrlsuite.results.store import EntryStore
 from tests.conftest import POLE, results
 
 MODELS = {
-    "mlp": ("width=16",),
-    "vqc-pennylane": ("qubits=3", "layers=2"),
-    "vqc-native": ("qubits=3", "layers=2"),
+    "mlp": (3, ("width=16",)),
+    "vqc-pennylane": (2, ("qubits=2", "layers=1")),
+    "vqc-native": (3, ("qubits=3", "layers=2")),
 }
+"""Epochs and options; PennyLane is slow."""
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_seeds_trained_together_equal_seeds_trained_apart(model: str, train: Callable[..., Path]) -> None:
-    settings = MODELS[model]
-    together = train("together", [0, 1, 2, 3], model=model, settings=settings)
-    first = train("apart", [0, 1], model=model, settings=settings)
-    second = train("apart", [2, 3], model=model, settings=settings)
-    alone = train("alone", [2], model=model, settings=settings)
-    shuffled = train("shuffled", [3, 2, 0], model=model, settings=settings)
+    epochs, settings = MODELS[model]
+    together = train("together", [0, 1, 2, 3], epochs, model=model, settings=settings)
+    first = train("apart", [0, 1], epochs, model=model, settings=settings)
+    second = train("apart", [2, 3], epochs, model=model, settings=settings)
+    alone = train("alone", [2], epochs, model=model, settings=settings)
+    shuffled = train("shuffled", [3, 2, 0], epochs, model=model, settings=settings)
     assert first == second
     for seed in range(4):
         assert results(together, seed) == results(first, seed), f"seed {seed} depends on its company"
@@ -37,8 +38,9 @@ def test_shots_do_not_depend_on_when_others_end_their_episodes(
     tiny_task: str, train: Callable[..., Path]
 ) -> None:
     """The group validates until its last episode has ended; the passes of those that wait must not count."""
-    Path(tiny_task).write_text(POLE)
-    circuit = {"model": "vqc-pennylane", "settings": ("qubits=2", "layers=1", "shots=20")}
+    short = POLE.replace("interactions = 60", "interactions = 20").replace("episodes = 5", "episodes = 3")
+    Path(tiny_task).write_text(short)
+    circuit = {"epochs": 2, "model": "vqc-pennylane", "settings": ("qubits=2", "layers=1", "shots=20")}
     together = train("together", range(4), **circuit)
     lengths = [EntryStore(together).seed(seed).epochs()[0]["scores"] for seed in range(4)]
     assert len({max(scores) for scores in lengths}) > 1, "or nobody waits, and the test proves nothing"

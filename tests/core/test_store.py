@@ -225,3 +225,28 @@ def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[.
     seed.timings.write_text('{"train": 2.0, "validate": 1.0, "cpu": -1}\n', encoding="utf-8")
     with pytest.raises(StoreError, match="cpu = -1 is not a number of seconds"):
         seed.seconds()
+
+
+def test_the_record_of_a_seed_says_what_was_trained(train: Callable[..., Path]) -> None:
+    """Trackers are given it, and it lies beside the curve for whoever finds the folder."""
+    folder = train("runs", [3], 1)
+    entry = store.EntryStore(folder).entry()
+    record = json.loads((folder / "seed-0003" / "run.json").read_text())
+    expected = {
+        "task": "tiny",
+        "task_hash": entry.task.hash,
+        "entry": folder.name,
+        "label": "ddqn mlp width=16",
+        "algorithm": "ddqn",
+        "model": "mlp",
+        "family": "classical",
+        "seed": 3,
+        "interactions_per_epoch": 60,
+        "status": "finished",
+        "epochs": 1,
+    }
+    assert {name: record.get(name) for name in expected} == expected
+    assert record["model_options"]["width"] == 16
+    assert record["algorithm_options"]["lr"] == 0.0005
+    weights = 3 * 16 + 16 + 16 * 16 + 16 + 16 * 3 + 3
+    assert record["parameters"] == {"classical": weights, "quantum": 0, "networks": 1}

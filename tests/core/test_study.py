@@ -202,6 +202,7 @@ def test_every_error_of_a_file_is_named_with_its_place() -> None:
             'group = "vcq"',
             "entries.1.match.group = 'vcq' is no earlier group; did you mean 'vqc'",
         ),
+        ('group = "vqc"', 'group = "mlp"', "entries.1.match.group = 'mlp' is no earlier group"),
         ('name = "vqc"', 'name = "mlp"', "two groups are named 'mlp'"),
         (
             'kind = "curves"',

@@ -16,6 +16,7 @@ import pytest
 from qrlsuite.specs import AnsatzSpec
 from tests.conftest import HANGS
 
+pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {"plugins.md": "test_plugins.py", "statistics.md": "tests/statistics/test_docs.py"}

@@ -187,6 +187,15 @@ def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch
     claim.release()
 
 
+def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Callable[..., Path]) -> None:
+    store = EntryStore(train("runs", [0, 1], 1))
+    for seed in (0, 1):
+        store.seed(seed).write_record({"status": "running", "epochs": 1})
+    write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "9", "seeds": [1], "epochs": 3}]})
+    assert survey.look(store).seeds == {"interrupted": 1, "submitted": 1}
+    assert survey.look(store, queued=[]).seeds == {"interrupted": 2}, "it has left the queue"
+
+
 def test_status_tells_what_waits_from_what_has_left_the_queue(
     train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

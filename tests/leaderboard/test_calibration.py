@@ -10,7 +10,7 @@ import pytest
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration
-from qrlsuite.leaderboard.findings import tables
+from qrlsuite.leaderboard.findings import summary, tables
 from qrlsuite.statistics import (
     DecisionPlan,
     DifferenceRule,
@@ -58,9 +58,9 @@ def test_a_rule_that_always_errs_is_found_out() -> None:
     assert {each.part for each in found} == set(calibration.PARTS) - {"decisions"}
     assert all(each.winner == 1 for each in found)
     assert {each.wrong for each in found if each.part == "power"} == {0}
-    shown = {title.partition(":")[0]: rows for title, rows in tables(found)}
-    assert list(shown) == ["halves", "pairs", "boards", "power"]
-    assert shown["pairs"][1][-1].startswith("100.0 ±")
+    words = summary(found, "always", 3)
+    assert "false winner between two equal entries of 20 seeds in 100.0% of cases" in words
+    assert "somewhere on 100.0% of boards of 3 equals" in words
 
 
 def test_rates_are_those_of_the_statistics_and_ticks_count_draws() -> None:
@@ -91,19 +91,22 @@ def test_decision_plans_are_played_where_times_is_measured() -> None:
     assert found[-1].wrong == 0
     assert found[-1].mean_seeds is not None
     assert found[-1].mean_seeds < 100
-    [(_, rows)] = tables(found)
-    assert [row[2:5] for row in rows[1:]] == [
-        ["equal", "8", "2"],
-        ["equal", "2", "3"],
-        ["10% slower", "8", "2"],
-        ["25% slower", "8", "2"],
-        ["50% slower", "8", "2"],
+    [(sentence, rows)] = tables(found, GRID.size, 3)
+    assert "at most 100 seeds, 8 or 2 plans each" in sentence
+    assert [row[1] for row in rows[1:]] == [
+        "2 equals",
+        "3 equals",
+        "10% slower",
+        "25% slower",
+        "50% slower",
     ]
+    assert "seeds on average, not 100, where an entry takes 50% longer" in summary(found, "times", 3)
 
 
 def test_tables_state_the_spread_over_entries_and_no_error_of_splits() -> None:
     jobs = calibration.plan([entry(0), entry(1)], GRID, [Always()], 4, ["halves"])
-    ((_, rows),) = tables([job.run() for job in jobs])
+    ((sentence, rows),) = tables([job.run() for job in jobs], GRID.size, 5)
+    assert "only the spread over entries" in sentence
     assert rows[-1][0] == "over 2 entries"
     assert all("±" not in cell for row in rows for cell in row)
 

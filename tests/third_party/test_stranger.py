@@ -157,8 +157,18 @@ def test_it_passes_its_own_test(installed: Installation) -> None:
     assert "3 passed" in run(*words, cwd=installed.folder).stdout
 
 
-def test_the_commands_of_the_page_run(installed: Installation) -> None:
+@pytest.fixture(scope="module")
+def ranked(installed: Installation) -> Path:
+    """The page's two entries of 20 seeds, as it trains them."""
+    budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "ranked")
+    for model in ("waves", "mlp"):
+        installed.qrlsuite("run", "--task", "channel-hop", "--model", model, *budget)
+    return installed.folder / "ranked"
+
+
+def test_the_commands_of_the_page_run(installed: Installation, ranked: Path) -> None:
     """docs/plugins.md, in its order; `new` and installing have tests of their own."""
+    shutil.copytree(ranked, installed.folder / "runs")
     blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)
     lines = [shlex.split(line) for line in "".join(blocks).splitlines()]
     outputs = {}
@@ -212,11 +222,8 @@ def test_its_circuit_is_trained_on_beam_management(installed: Installation) -> N
     assert record["provenance"][0]["versions"]["qrlsuite"]
 
 
+@pytest.mark.usefixtures("ranked")
 def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Installation) -> None:
-    budget = ("--seeds", "20", "--epochs", "12", "--workers", "1", "--runs", "ranked")
-    for model in ("waves", "mlp"):
-        installed.qrlsuite("run", "--task", "channel-hop", "--model", model, *budget)
-
     def board() -> dict[str, Any]:
         out = installed.qrlsuite("leaderboard", "--runs", "ranked", "--format", "json").stdout
         (section,) = json.loads(out)["sections"]

@@ -99,7 +99,7 @@ def compile_circuit(circuit: Circuit) -> MeanFieldProgram:
     Gates are never collected: CRX and CRY in a row drop correlations twice.
     """
     compiler = Compiler(circuit)
-    steps = []
+    steps: list[tuple[int, ...]] = []
     for operation in circuit:
         if operation.gate == "H":
             steps.append((HADAMARD, NONE, operation.wires[0], NONE, 0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Sequence
 from enum import StrEnum
@@ -11,15 +10,14 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import TaskProgressColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
-from qrlsuite.engine.display import Bar
-from qrlsuite.engine.terminal import message_console, table
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration, findings, rules
 from qrlsuite.leaderboard.calibration import CalibrationResult, Job
+from qrlsuite.leaderboard.tables import table
 from qrlsuite.results.text import duration
 
 
@@ -100,8 +98,14 @@ def calibrate(
         }
         typer.echo(json.dumps(content))
         return
-    for title, lines in findings.tables(found):
-        _show(title, lines)
+    for heading, lines in findings.tables(found, setup.grid.size, board):
+        _show(heading, lines)
+    for judge in judges:
+        typer.echo(f"'{judge.name}' promises {judge.promise}")
+    if said := [words for judge in judges if (words := findings.summary(found, judge.name, board))]:
+        typer.echo("\nOn these entries:")
+        for words in said:
+            typer.echo(f"- {words}")
 
 
 def _pair(word: str) -> tuple[int, int]:
@@ -118,7 +122,7 @@ def _pair(word: str) -> tuple[int, int]:
 
 def _compute(jobs: Sequence[Job], quiet: bool) -> list[CalibrationResult]:
     """Run all jobs behind one progress bar, having said how long that will take."""
-    console = message_console(quiet=quiet)
+    console = Console(stderr=True, quiet=quiet, highlight=False)
     seconds = calibration.estimate(jobs)
     total = sum(job.draws for job in jobs)
     console.print(
@@ -126,24 +130,30 @@ def _compute(jobs: Sequence[Job], quiet: bool) -> list[CalibrationResult]:
         "timed); --draws and --part change that. Ctrl-C stops."
     )
     found = []
-    bar, done = Bar(console, TaskProgressColumn(), TimeRemainingColumn()), itertools.count(1)
-    bar.start(total, "")
-    try:
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as live:
+        bar = live.add_task("", total=total)
         for job in jobs:
-            line = f"{job.part}, {job.entry}, {job.rule}"
-            found.append(job.run(lambda line=line: bar.update(next(done), line)))  # type: ignore[misc]
-    finally:
-        bar.stop()
+            live.update(bar, description=f"{job.part}, {job.entry}, {job.rule}")
+            found.append(job.run(lambda: live.advance(bar)))
     return found
 
 
-def _show(title: str, rows: Sequence[Sequence[str]]) -> None:
+def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:
     """Print a table of findings; an entry is named in its first line only."""
-    entries = ["", *(row[0] for row in rows[1:])]
-    lines = (("" if row[0] == before else row[0], *row[1:]) for before, row in zip(entries, rows[1:]))
-    fixed = [name for name in rows[0] if name != "entry"]
-    shown = table(rows[0], lines, left=("entry", "rule"), fixed=fixed)
+    shown = table(rows[0], left=("entry", "rule"), fixed=[name for name in rows[0] if name != "entry"])
     shown.padding = (0, 1, 0, 0)
+    before = None
+    for row in rows[1:]:
+        shown.add_row(*(Text(cell) for cell in ("" if row[0] == before else row[0], *row[1:])))
+        before = row[0]
     console = Console(highlight=False)
-    console.print(Text(title))
+    console.print(Text(heading))
     console.print(shown)

@@ -13,19 +13,15 @@ from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
-    AlgorithmOption,
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
-    EpochsOption,
     PartitionOption,
-    PresetOption,
-    TaskOption,
     TimeOption,
     WorkersOption,
     execution_of,
 )
-from qrlsuite.engine.terminal import command, message_console, table_console
+from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import write_atomically
@@ -52,10 +48,18 @@ def new(
         list[str],
         typer.Argument(metavar="ENTRY ENTRY ...", help="Two or more: 'mlp width=64' 'vqc-native qubits=10'."),
     ],
-    task: TaskOption,
-    algorithm: AlgorithmOption = None,
-    preset: PresetOption = None,
-    epochs: EpochsOption = None,
+    task: Annotated[
+        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+    ],
+    algorithm: Annotated[
+        str | None, typer.Option("--algorithm", help="Of entries that name none; default: the task's.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="One of the task's presets of settings.")
+    ] = None,
+    epochs: Annotated[
+        int | None, typer.Option("--epochs", min=1, help="Default: the task's protocol.")
+    ] = None,
     looks: Annotated[
         str, typer.Option("--looks", metavar="N,M,...", help="Seeds of each entry at each look.")
     ] = "20,40,60,80,100",
@@ -148,7 +152,7 @@ def run(
     """
     study = _study(path, runs)
     chosen_execution = execution_of(engine, workers, partition, time, engine_options, device)
-    console = message_console(quiet=json_output)
+    console = Console(stderr=True, quiet=json_output, highlight=False)
     try:
         outcome = decided.run(
             study, chosen_execution, json_output, looked=lambda found: _say_look(found.decision, console)

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption
-from qrlsuite.engine.terminal import message_console, table, table_console
+from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.leaderboard import board, collect
 from qrlsuite.leaderboard.curves import EntryCurves
@@ -83,7 +86,7 @@ def power(
         detect = functools.partial(runs_to_detect, pilots[0], grid, share, powers=POWERS, n_pairs=draws)
         jobs += [(f"{100 * share:.0f}% slower than {found[0].label}", detect)]
     per_seed, basis = _core_hours(found, curves, runs)
-    console = message_console(quiet=json_output)
+    console = Console(stderr=True, quiet=json_output, highlight=False)
     rows = []
     for words, job in jobs:
         with console.status(Text(f"simulating: {words}")):
@@ -154,8 +157,10 @@ def _show(
     basis: str,
     draws: int,
 ) -> None:
-    columns = ("difference", "power", "seeds, all at once", "seeds by a plan: mean (most)", "its looks")
-    before, lines = None, []
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in ("difference", "power", "seeds, all at once", "seeds by a plan: mean (most)", "its looks"):
+        table.add_column(column, justify="left" if column in ("difference", "its looks") else "right")
+    before = None
     for row in rows:
         fixed = f"over {LADDER[-1]}" if row["fixed_seeds"] is None else _cost(row, "fixed")
         mean, looks = f"over {LADDER[-1]}", ""
@@ -164,8 +169,8 @@ def _show(
             looks = ", ".join(str(look) for look in row["looks"])
         shown = "" if row["difference"] == before else row["difference"]
         before = row["difference"]
-        lines.append((shown, f"{row['power']:g}", fixed, mean, looks))
-    table_console().print(table(columns, lines, left=("difference", "its looks")))
+        table.add_row(*(Text(cell) for cell in (shown, f"{row['power']:g}", fixed, mean, looks)))
+    table_console().print(table)
     pilots = " and ".join(f"{len(entry.seeds)} seeds of {entry.label}" for entry in found)
     typer.echo(f"Seeds of each of the two entries, with the core-hours of both. Simulated from {pilots},")
     error = (0.8 * 0.2 / draws) ** 0.5

@@ -11,16 +11,11 @@ import typer
 from qrlsuite import options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
-    AlgorithmOption,
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
-    EpochsOption,
     MinutesOption,
     PartitionOption,
-    PresetOption,
-    SeedsOption,
-    TaskOption,
     TimeOption,
     TrackOption,
     WorkersOption,
@@ -38,11 +33,15 @@ QUICK_QUBITS = 4
 
 
 def run(
-    task: TaskOption,
+    task: Annotated[
+        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+    ],
     model: Annotated[
         str, typer.Option("--model", help="A function approximator (see `qrlsuite list models`).")
     ],
-    algorithm: AlgorithmOption = None,
+    algorithm: Annotated[
+        str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -51,9 +50,15 @@ def run(
             help="An option, for example --set qubits=6, --set algorithm.gamma=.9, --set environment.degree=4.",
         ),
     ] = None,
-    preset: PresetOption = None,
-    seeds: SeedsOption = None,
-    epochs: EpochsOption = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="One of the task's presets of settings.")
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: the task's protocol.")
+    ] = None,
+    epochs: Annotated[
+        int | None, typer.Option("--epochs", min=1, help="Default: the task's protocol.")
+    ] = None,
     quick: Annotated[
         bool,
         typer.Option(

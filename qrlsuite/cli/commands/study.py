@@ -12,13 +12,10 @@ import typer
 from qrlsuite import options, registry
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
-    BudgetOption,
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
-    EpochsOption,
     PartitionOption,
-    SeedsOption,
     TimeOption,
     WorkersOption,
     execution_of,
@@ -39,6 +36,10 @@ app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: lis
 StudyArgument = Annotated[
     str, typer.Argument(metavar="STUDY", help="A study (see `qrlsuite study list`) or a study file's path.")
 ]
+SeedsOption = Annotated[
+    str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: each task's protocol.")
+]
+EpochsOption = Annotated[int | None, typer.Option("--epochs", min=1, help="Default: each task's protocol.")]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -131,7 +132,12 @@ def run(
     name: StudyArgument,
     seeds: SeedsOption = None,
     epochs: EpochsOption = None,
-    budget: BudgetOption = None,
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            "--budget", metavar="TIME", help="90s, 30min, 2h: stop at a group's end when it is used up."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would be trained, and train nothing.")
     ] = False,

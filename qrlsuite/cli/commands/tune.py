@@ -13,14 +13,10 @@ import typer
 from qrlsuite import options
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
-    AlgorithmOption,
-    BudgetOption,
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
-    EpochsOption,
     PartitionOption,
-    TaskOption,
     TimeOption,
     WorkersOption,
     execution_of,
@@ -56,7 +52,9 @@ class Goal(StrEnum):
 
 
 def tune(
-    task: TaskOption,
+    task: Annotated[
+        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+    ],
     models: Annotated[
         list[str],
         typer.Option(
@@ -66,7 +64,9 @@ def tune(
             "Repeat it to tune several with equal budgets.",
         ),
     ],
-    algorithm: AlgorithmOption = None,
+    algorithm: Annotated[
+        str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
+    ] = None,
     grid: Annotated[
         str | None,
         typer.Option(
@@ -119,7 +119,10 @@ def tune(
             "stay unseen.",
         ),
     ] = "20",
-    epochs: EpochsOption = None,
+    epochs: Annotated[
+        int | None,
+        typer.Option("--epochs", min=1, help="Epochs of each trial; default: the task's protocol."),
+    ] = None,
     objective: Annotated[
         Goal,
         typer.Option(
@@ -128,7 +131,14 @@ def tune(
             "its mean over the ranking grid (area).",
         ),
     ] = Goal.time,
-    budget: BudgetOption = None,
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            "--budget",
+            metavar="TIME",
+            help="Time for all trials, 30min or 2h; a trial that would take longer is not begun.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE.toml", help="The preset file; default: below --runs."),

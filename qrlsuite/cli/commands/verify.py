@@ -9,11 +9,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.progress import TimeRemainingColumn
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.engine.display import Bar
-from qrlsuite.engine.terminal import message_console
 from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard import verify as checks
 from qrlsuite.results.progress import Progress as RunProgress
@@ -50,22 +50,25 @@ def verify(
     folders = [folder for path in paths or [published.PUBLISHED] for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice
     verdicts = []
-    bar = Bar(message_console(), TimeRemainingColumn())
-    bar.start(len(folders), "")
-    try:
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        whole = bar.add_task("", total=len(folders))
         for index, folder in enumerate(folders):
 
-            def report(progress: RunProgress, index: int = index, name: str = folder.name) -> None:
-                bar.update(index + progress.epoch / max(1, progress.epochs), name)
+            def report(progress: RunProgress, index: int = index) -> None:
+                bar.update(whole, completed=index + progress.epoch / max(1, progress.epochs))
 
-            bar.update(index, folder.name)
+            bar.update(whole, description=Text(folder.name).plain, completed=index)
             generator = np.random.default_rng([number, index])
             verdicts.append(checks.verify(folder, rerun, generator, report))
             if not json_output:
                 last = verdicts[-1]
                 typer.echo(f"{'ok    ' if last.ok else 'FAILED'} {last.name}: {last.message}")
-    finally:
-        bar.stop()
     if json_output:
         typer.echo(json.dumps({"choice": number, "entries": [verdict.as_dict() for verdict in verdicts]}))
     else:
