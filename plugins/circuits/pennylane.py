@@ -37,7 +37,7 @@ BROADCASTING = "default.qubit"
 MEMORY = 2**30
 """Bytes that the states of one differentiated pass may take; more seeds are recomputed in the backward pass."""
 
-LANES = 16
+LANE_MULTIPLE = 16
 """Every seed's lanes are padded to a multiple of this. torch multiplies complex numbers with fused operations in
 vectors and without them in what is left over at the end, so that a lane's bits would depend on its place."""
 
@@ -150,7 +150,7 @@ class PennyLaneBackend:
             flat = angles.reshape(count, S * B)
             lanes: Tensor = _DeviceGradient.apply(flat, self, S * B)  # type: ignore[no-untyped-call]
             return lanes.reshape(S, B, -1)
-        padded = torch.nn.functional.pad(angles, (0, -B % LANES))
+        padded = torch.nn.functional.pad(angles, (0, -B % LANE_MULTIPLE))
         width = padded.shape[2]
         return self.execute(padded.reshape(count, S * width), S * width).reshape(S, width, -1)[:, :B]
 

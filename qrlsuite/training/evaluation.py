@@ -24,7 +24,7 @@ from qrlsuite.results.store import EntryStore, SeedStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training.trainer import Policy, Trainer, build_envs, play_episodes
 
-LANES = 100
+EVALUATION_LANES = 100
 """Episodes of a policy that are played side by side."""
 PERCENTILES = (5, 25, 50, 75, 95)
 
@@ -342,7 +342,7 @@ def play(
     if episodes < 1:
         raise OptionError(f"--episodes {episodes}: at least one is needed")
     streams = Streams(entry.task.hash, seed)
-    lanes = min(LANES, episodes)
+    lanes = min(EVALUATION_LANES, episodes)
     envs = build_envs(entry, agents * lanes, lambda: None)
     envs.inner.autoreset = False
     rounds = -(-episodes // lanes)
