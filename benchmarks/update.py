@@ -1,12 +1,17 @@
 """One DDQN update of the hybrid network (batch 64), per backend, for 1 and 16 seeds together; and of the MLP.
 
     python benchmarks/update.py --qubits 4 6 10
+    python benchmarks/update.py --controls 6 10 > table.md
 
 An update is what training repeats: two forward passes for the target, one forward and backward pass, one step of
 Adam. Milliseconds of processor time per update and seed, medians, one thread, one run; ratios are to PennyLane at the
 same number of seeds. Qiskit (4 qubits, or fewer) computes a batch of 2, extrapolated: its cost is one of samples.
 For the native backend one round of training (choose actions, step the environment, update) is also divided: what
 part is the circuit's kernels, the environment, and the rest, which is torch.
+
+`--controls` prints the table of docs/controls.md instead: of the circuits of these sizes, of every control and of
+networks of equal size the numbers of trained and of fixed parameters, the rank of the circuit's Jacobian, and the
+milliseconds per update and seed, 10 seeds together.
 """
 
 from __future__ import annotations
@@ -95,6 +100,40 @@ def parts(qubits: int, seeds: int, seconds: float) -> dict[str, float]:
     return {**shares, "torch": 1.0 - sum(shares.values())}
 
 
+def controls(qubits: int) -> list[tuple[str, list[str]]]:
+    """Return model and settings of a circuit, its controls, and classical models of as many trained parameters."""
+    circuit = [f"qubits={qubits}"]
+    trained = 31 * qubits + 3  # with 3 inputs, 3 actions and 4 layers
+    width = min(range(1, 64), key=lambda w: abs(w * w + 8 * w + 3 - trained))
+    return [
+        ("vqc-native", circuit),
+        *(("vqc-native", [*circuit, f"entangled={kind}"]) for kind in ("mean-field", "separable")),
+        *(("vqc-native", [*circuit, f"train={part}"]) for part in ("scaling", "weights", "linear")),
+        ("mlp", [f"width={width}"]),
+        ("mlp", [f"width={round((trained - 3) / 7)}", "depth=1", "activation=sin"]),
+        ("mlp", [f"width={qubits}", "depth=1", "activation=sin"]),
+        ("fourier", [f"frequencies={round((trained - 3) / 9)}"]),
+        ("fourier", [f"frequencies={round((trained - 3) / 6)}", "train=linear"]),
+    ]
+
+
+def print_controls(sizes: list[int], seconds: float) -> None:
+    """Print the table of circuits, controls and networks of equal size as Markdown."""
+    from qrlsuite.circuit.resources import jacobian_rank
+
+    print("| model | trained | fixed | rank of the circuit | ms per update |\n|---|---|---|---|---|")
+    seeds = 10
+    for model, settings in (row for qubits in sizes for row in controls(qubits)):
+        ddqn, picked = training(model, settings, seeds)
+        counts = {name: p.numel() // seeds for name, p in ddqn.online.named_parameters() if p.requires_grad}
+        fixed = sum(p.numel() for p in ddqn.online.parameters() if not p.requires_grad) // seeds
+        circuit = getattr(getattr(ddqn.online, "_runner", None), "circuit", None)
+        rank = "-" if circuit is None else f"{jacobian_rank(circuit)} of {circuit.parameter_count}"
+        ms = median_ms(lambda ddqn=ddqn, picked=picked: ddqn._learn(picked), seconds) / seeds
+        name = " ".join(f"`{word}`" for word in (model, *settings))
+        print(f"| {name} | {sum(counts.values())} | {fixed or '-'} | {rank} | {ms:.3f} |", flush=True)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(
@@ -102,8 +141,14 @@ def main() -> None:
     )
     parser.add_argument("--qubits", type=int, nargs="+", default=[4, 6, 10])
     parser.add_argument("--seconds", type=float, default=2.0, help="per measurement")
+    parser.add_argument(
+        "--controls", type=int, nargs="+", metavar="QUBITS", help="print the table of controls"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if given.controls:
+        print_controls(given.controls, given.seconds)
+        return
     for seeds in (1, 16, 100):
         print(
             f"mlp width=64, {seeds} seeds: {median_ms(update('mlp', [], seeds), given.seconds) / seeds:.3f} ms"
