@@ -406,12 +406,29 @@ def test_wrong_input_is_refused_in_one_line(words: tuple[str, ...], message: str
         ("width = 4", 'width = "wide"', "p.toml: entries.1: "),
         ('rule = "times"', 'rule = "intervals"', "rule"),
         ("margin = 0.1", "margin = 0.1\nthresholds = [1]", "give either epsilons"),
+        (
+            "    20,\n    40,",
+            "    40,\n    20,",
+            "p.toml: looks = [40, 20, 60, 80, 100]: each must be at more runs",
+        ),
+        (
+            "    20,\n    40,",
+            "    10,\n    40,",
+            "p.toml: looks = [10, 40, 60, 80, 100]: the first is below 20",
+        ),
     ],
 )
 def test_a_wrong_plan_file_is_refused_in_one_line(old: str, new: str, message: str, refused: Refused) -> None:
     write("mlp width=16", "mlp width=4", plan="p.toml")
     edit("p.toml", old, new)
     assert message in refused("status", "p.toml")
+
+
+def test_a_plan_file_of_one_entry_is_refused_in_one_line(refused: Refused) -> None:
+    write("mlp width=16", "mlp width=4", plan="p.toml")
+    Path("p.toml").write_text(re.sub(r".*width = 4.*\n", "", Path("p.toml").read_text()))
+    message = "p.toml: entries = ['mlp width=16']: a decision needs two or more"
+    assert message in refused("run", "p.toml")
 
 
 def test_looks_below_20_seeds_are_marked() -> None:
