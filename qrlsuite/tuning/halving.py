@@ -274,7 +274,7 @@ class Halving(Search):
     def _edge(self, name: str, best: Point) -> int:
         """Return 1 or -1 where no larger or no smaller value of an option was tried than the best one, else 0."""
         values = [trial.point[name] for trial in self.trials]
-        return (best[name] == max(values)) - (best[name] == min(values))
+        return int(best[name] == max(values)) - int(best[name] == min(values))
 
     @property
     def at_edge(self) -> list[str]:
