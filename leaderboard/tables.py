@@ -37,7 +37,7 @@ COLUMNS = (
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
 """What a spreadsheet shows of the win that a tier rests on."""
 NUMERIC = {"rests on", "parameters", "seeds", "score", "cells +/-", "hours"}
-WIDE = 150
+WIDE = 165
 """Characters per line in which the whole table can be read."""
 LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "settings", "cells +/-", "hours")))
 """What a narrower one leaves out: the first where it has so many columns, else the second too."""
@@ -109,14 +109,7 @@ def notes(section: Section) -> list[str]:
             "settings found by tuning: "
             + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
         )
-        if len(tuned) < len(section.rows):
-            lines.append(
-                "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
-            )
-        budgets = {(entry.tuning or {}).get("budget") for entry in tuned}
-        if len(budgets) > 1:
-            texts = sorted("not known" if budget is None else str(budget) for budget in budgets)
-            lines.append(f"tuned with different budgets: {'; '.join(texts)}")
+    lines += unequal_tuning(section)
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:
         lines.append(
@@ -138,6 +131,21 @@ def notes(section: Section) -> list[str]:
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
     )
     return [*lines, "score: median over seeds after the last epoch; hours: core-hours"]
+
+
+def unequal_tuning(section: Section) -> list[str]:
+    """Say where entries that were tuned unequally are ranked against each other."""
+    tuned = [row.entry.tuning for row in section.rows if row.entry.tuning]
+    lines = []
+    if 0 < len(tuned) < len(section.rows):
+        lines.append(
+            "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
+        )
+    budgets = {record.get("budget") for record in tuned}
+    if len(budgets) > 1:
+        texts = sorted("not known" if budget is None else str(budget) for budget in budgets)
+        lines.append(f"tuned with different budgets: {'; '.join(texts)}")
+    return lines
 
 
 def _tuning_text(tuning: Mapping[str, Any]) -> str:

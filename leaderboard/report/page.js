@@ -54,7 +54,7 @@
     const compare = (a, b) => {
       const [x, y] = [value(a), value(b)];
       if (x === "" || y === "") return (x === "") - (y === ""); // what has no value stays last
-      const order = key === "entry" ? x.localeCompare(y, "en", { numeric: true }) : Number(x) - Number(y);
+      const order = ["entry", "settings"].includes(key) ? x.localeCompare(y, "en", { numeric: true }) : Number(x) - Number(y);
       return direction === "ascending" ? order : -order;
     };
     const rows = [...table.tBodies[0].rows].sort(compare);

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.experiment.task import RankingSection
+from qrlsuite.leaderboard import tables
 from qrlsuite.leaderboard.absent import absent
 from qrlsuite.leaderboard.board import Row, Section, ranking_of
 from qrlsuite.leaderboard.report import ladder, timed
@@ -52,6 +53,7 @@ class SectionView:
     wanted: int
     missing: str
     first_alone: str
+    tuning: str
     flattered: str
     """Entries whose settings were chosen on the protocol's seeds."""
     ladder: ladder.Ladder
@@ -111,6 +113,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         wanted=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
         first_alone=", ".join(row.entry.label for row in rows if row.row.entry.first_network_alone),
+        tuning=clean("; ".join(tables.unequal_tuning(section))),
         flattered=", ".join(row.entry.label for row in rows if row.row.entry.on_protocol_seeds),
         ladder=ladder.draw(judgement.beats(), [row.depth for row in section.rows]),
         matrix=tuple(

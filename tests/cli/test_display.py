@@ -26,7 +26,7 @@ def entry(tiny_task: str) -> Entry:
     return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
 
 
-@pytest.mark.parametrize(("columns", "left_out"), [(80, 5), (105, 2), (150, 0)])
+@pytest.mark.parametrize(("columns", "left_out"), [(80, 6), (105, 2), (165, 0)])
 def test_a_narrow_terminal_shows_fewer_columns_and_says_which(columns: int, left_out: int) -> None:
     words = ["leaderboard", "--task", "beam6g", "--published"]
     done = CliRunner().invoke(build(), words, env={"FORCE_COLOR": "1", "COLUMNS": str(columns)})

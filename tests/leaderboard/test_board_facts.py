@@ -162,6 +162,33 @@ def test_devices_that_mix_within_an_entry_are_named() -> None:
     assert "several kinds of device" not in tables.markdown(boards.of([one, two]))
 
 
+def test_the_board_says_where_settings_come_from() -> None:
+    one, two, three = boards.graded(3)
+    record = {"trials": 16, "seeds": "1000000:1000032", "changed": [], "budget": "8 settings per option"}
+    identity = {"algorithm_options": {"lr": 2e-3}}
+    tuned, released = replace(one, tuning=record), replace(two, preset="released")
+    by_hand = replace(three, preset="released", identity=identity)
+    assert [entry.settings for entry in (tuned, released, by_hand)] == [
+        "tuned (16 trials, 32 seeds)",
+        "released",
+        "released but lr",
+    ]
+    assert replace(one, tuning={"changed": ["algorithm.lr"]}).settings == "tuned but lr"
+    assert replace(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
+    mixed = "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
+    text = tables.markdown(boards.of([tuned, released, by_hand]))
+    assert mixed in text.split("  \n")
+    assert "| tuned (16 trials, 32 seeds) |" in text
+    equal = tables.markdown(boards.of([tuned, replace(two, tuning=record)]))
+    assert mixed not in equal
+    assert "different budgets" not in equal
+    less = {**record, "budget": "2 settings per option"}
+    unequal = tables.markdown(boards.of([tuned, replace(two, tuning=less)]))
+    assert "tuned with different budgets: 2 settings per option; 8 settings per option" in unequal.split(
+        "  \n"
+    )
+
+
 def test_what_tuning_took_is_said() -> None:
     one, two, three = boards.graded(3)
     tuning = {"trials": 7, "steps": 10_500_000, "core_hours": 0.12}
