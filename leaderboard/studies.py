@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
-from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.collect import read_entry
 from qrlsuite.leaderboard.curves import EntryCurves
@@ -100,15 +98,8 @@ def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
         if member.entry.name in found or not (store.path / "entry.json").exists():
             continue
         curves = read_entry(store)
-        if curves is None:
-            continue
-        kept = [seed < TUNING_SEEDS for seed in curves.seeds]
-        if any(kept):
-            found[member.entry.name] = dataclasses.replace(
-                curves,
-                curves=curves.curves[np.array(kept)],
-                seeds=tuple(seed for seed in curves.seeds if seed < TUNING_SEEDS),
-            )
+        if curves is not None:
+            found[member.entry.name] = curves
     return found
 
 
