@@ -12,6 +12,7 @@ make of it are compared with those that the same agents' initial parameters make
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,7 +92,8 @@ def half_cut_entropy(states: Tensor) -> Tensor:
     n = states.shape[-1].bit_length() - 1
     matrix = states.reshape(*states.shape[:-1], 1 << (n // 2), -1)
     weights = torch.linalg.svdvals(matrix).square()
-    return torch.special.entr(weights).sum(-1) / np.log(2.0)
+    bits: Tensor = torch.special.entr(weights).sum(-1) / math.log(2.0)
+    return bits
 
 
 def along_episodes(
