@@ -343,11 +343,14 @@ def times_of(evidence: Evidence) -> IntArray:
 class PermutationRule:
     """Significant where S_hat differs by more than relabeled runs make it differ, anywhere on the grid.
 
-    The difference of S_hat in a cell is divided by its root mean square over all relabelings and the observed labels
-    (with 1/12 of the coarser epoch squared for the rounding to whole epochs), so that all cells count alike. It is
-    compared with the largest over the cells of each relabeling: single-step max-T (Westfall and Young 1993), exact for
-    independent runs of equal laws. S_hat depends on the number of runs; of the larger entry the first n runs are
-    taken.
+    The difference of S_hat in a cell is divided by its standard error within both groups, for the observed and
+    for every relabeling, and |t| compared with the largest of each relabeling: single-step max-T over the cells
+    (Westfall and Young 1993), exact for independent runs of equal laws. The standard error is read off the
+    surface itself: S_hat rises with delta like a quantile, so a quarter of S_hat(delta + 2h) - S_hat(delta - 2h),
+    with h = sqrt(delta (1 - delta) / n) the standard error of P_hat, is that of S_hat (Woodruff 1952, Journal of
+    the American Statistical Association 47); 1/12 of the coarser epoch squared is added for the rounding to whole
+    epochs. Without it, two groups that both mix quick and slow runs would differ as much as the quick from the
+    slow. S_hat depends on the number of runs; of the larger entry the first n runs are taken.
 
     Attributes
     ----------
@@ -388,21 +391,20 @@ class PermutationRule:
         return self._signs(pair, first.grid, resolution, first.resampling.seed)
 
     def _signs(self, pair: Sequence[Curve], grid: Grid, resolution: int, seed: int) -> Signs:
-        differences = _CellDifferences(pair, grid)
-        observed, n_runs, full = differences.observed(), len(pair[0]), relabelings_for(self.alpha)
-        drawn: list[NDArray[np.signedinteger[Any]]] = []
+        ratios = _CellRatios(pair, grid, resolution)
+        t, full = ratios.observed(), relabelings_for(self.alpha)
+        exceeded = np.zeros(grid.shape, dtype=np.int64)
         for begin in range(0, full, _BLOCK):
             chunk, offset = divmod(begin, CHUNK)
-            labels = relabelings(n_runs, n_runs, chunk, seed)[:, offset : offset + _BLOCK]
-            drawn.append(differences(labels))
+            labels = relabelings(ratios.n_runs, ratios.n_runs, chunk, seed)[:, offset : offset + _BLOCK]
+            largest = np.sort(np.abs(ratios(labels)).max(axis=(0, 1)))
+            exceeded += len(largest) - np.searchsorted(largest, np.abs(t))
             count = begin + _BLOCK
-            if count not in (_BLOCK, full):
-                continue
-            p = _cell_p(observed, drawn, resolution)
+            p = (1 + exceeded) / (count + 1)
             doubt = 3 * np.sqrt(self.alpha * (1 - self.alpha) / count)
-            if (np.abs(p - self.alpha) > doubt).all():
+            if begin == 0 and (np.abs(p - self.alpha) > doubt).all():
                 break
-        signs: Signs = np.where(p <= self.alpha, -np.sign(observed), 0).astype(np.int8)
+        signs: Signs = np.where((p <= self.alpha) & (t != 0), -np.sign(t), 0).astype(np.int8)
         return signs
 
 
@@ -423,36 +425,53 @@ def _side_by_side(first: Evidence, second: Evidence) -> tuple[list[Curve], int]:
     return pair, max(first.steps_per_epoch, second.steps_per_epoch) // common
 
 
-class _CellDifferences:
-    """S_hat of the runs labeled "first" - S_hat of the others, in epochs, for many labelings of a pair."""
+class _CellRatios:
+    """(S_hat of the runs labeled "first" - S_hat of the others) / standard error, for many labelings of a pair."""
 
-    def __init__(self, pair: Sequence[Curve], grid: Grid) -> None:
-        self.n_runs = len(pair[0])
-        self.levels = grid.required_counts(self.n_runs)
+    def __init__(self, pair: Sequence[Curve], grid: Grid, resolution: int) -> None:
+        self.n_runs, self.resolution = len(pair[0]), resolution
+        self.levels, self.inverse, self.scale = _levels(grid, self.n_runs)
         self.both = Indicators(np.concatenate([reached(each, grid) for each in pair], axis=2))
-        self.kind: Any = np.int16 if pair[0].shape[1] < 2**15 else np.int32
 
-    def __call__(self, labels: Weights) -> NDArray[np.signedinteger[Any]]:
-        """Return, shape (E, D, R), the difference in every cell, for labels (2 n_runs, R): 1 means first."""
-        first, second = self.both.epochs_below(self.levels, labels, self.n_runs, complement=True)
-        return (first - second).astype(self.kind)
+    def __call__(self, labels: Weights) -> NDArray[np.float32]:
+        """Return, shape (E, D, R), the ratio in every cell, for labels (2 n_runs, R): 1 means first."""
+        sides = self.both.epochs_below(self.levels, labels, self.n_runs, complement=True)
+        rows = [
+            _ratios(first, second, self.inverse, self.scale, self.resolution) for first, second in zip(*sides)
+        ]
+        return np.stack(rows)
 
-    def observed(self) -> NDArray[np.signedinteger[Any]]:
-        """Return, shape (E, D), the difference under the labels as they are."""
+    def observed(self) -> NDArray[np.float32]:
+        """Return, shape (E, D), the ratio under the labels as they are."""
         return self(np.repeat(np.array([[1], [0]], dtype=np.float32), self.n_runs, axis=0))[..., 0]
 
 
-def _cell_p(
-    observed: NDArray[np.signedinteger[Any]], drawn: Sequence[NDArray[np.signedinteger[Any]]], resolution: int
-) -> FloatArray:
-    """Return p of every cell, (E, D), adjusted for all cells, for blocks of relabeled differences (E, D, r)."""
-    count = sum(block.shape[2] for block in drawn)
-    squares = observed.astype(np.float64) ** 2
-    squares += sum(np.einsum("edr,edr->ed", block, block, dtype=np.float64) for block in drawn)
-    # of the observed labels too: a function of all labelings alike, so that p is exact
-    scale = (1 / np.sqrt(squares / (count + 1) + resolution**2 / 12)).astype(np.float32)
-    largest = np.concatenate([(np.abs(block) * scale[..., None]).max(axis=(0, 1)) for block in drawn])
-    largest.sort()
-    exceeded = count - np.searchsorted(largest, np.abs(observed) * scale)
-    p: FloatArray = (1 + exceeded) / (count + 1)
-    return p
+def _levels(grid: Grid, n_runs: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the counts at which S_hat is needed, where they stand for each delta, and a factor.
+
+    For each of D deltas three counts are needed, (3, D): the required one, and those two standard errors of P_hat
+    below and above, within 1 and n; their distance in S_hat times the factor (D,) is the standard error.
+    """
+    required = grid.required_counts(n_runs)
+    deltas = np.array([float(delta) for delta in grid.deltas])
+    step = np.maximum(1, np.rint(2 * np.sqrt(deltas * (1 - deltas) * n_runs))).astype(np.int64)
+    below, above = np.maximum(required - step, 1), np.minimum(required + step, n_runs)
+    levels, inverse = np.unique(np.stack([required, below, above]), return_inverse=True)
+    return levels, inverse.reshape(3, -1), step / np.maximum(above - below, 1) / 2
+
+
+def _ratios(
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
+    inverse: IntArray,
+    scale: FloatArray,
+    resolution: int,
+) -> NDArray[np.float32]:
+    """Return the studentized differences, (D, R), for the epochs of both entries below each level, (L, R)."""
+    difference = (first[inverse[0]] - second[inverse[0]]).astype(np.float32)
+    factor = scale.astype(np.float32)[:, None]
+    variance = np.full(difference.shape, resolution**2 / 12, dtype=np.float32)
+    for side in (first, second):
+        variance += ((side[inverse[2]] - side[inverse[1]]).astype(np.float32) * factor) ** 2
+    ratios: NDArray[np.float32] = difference / np.sqrt(variance)
+    return ratios

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
@@ -20,19 +22,17 @@ from qrlsuite.statistics import (
     compare,
     false_winners,
     power,
-    slower,
 )
 from qrlsuite.statistics.estimator import complexity
 from qrlsuite.statistics.permutation import (
     CHUNK,
-    _cell_p,
-    _CellDifferences,
+    _CellRatios,
     relabelings,
     relabelings_for,
     smallest,
     welch_t,
 )
-from tests.statistics.conftest import SURFACE, entry
+from tests.statistics.conftest import DELTAS, SURFACE, entry
 
 
 def column(*values: int) -> np.ndarray:
@@ -166,38 +166,31 @@ def test_twenty_over_the_level_and_ten_thousand_or_more() -> None:
 
 @pytest.mark.parametrize("copies", [1, 5], ids=["counts in bytes", "more than a byte"])
 def test_differences_of_cells_are_those_of_the_surface(copies: int) -> None:
+    """Each relabeling by itself: S_hat at delta, and two standard errors of P_hat below and above."""
     first, second = (np.repeat(entry(index).values, copies, axis=0) for index in (0, 1))
     n_runs = len(first)
     pooled, labels = np.concatenate([first, second]), relabelings(n_runs, n_runs)
-    differences = _CellDifferences([first, second], SURFACE)
-    found, drawn = differences.observed(), differences(labels[:, :200])
+    ratios = _CellRatios([first, second], SURFACE, 1)
+    found, drawn = ratios.observed(), ratios(labels[:, :200])
 
     def expected(chosen: np.ndarray) -> np.ndarray:
-        one, other = (complexity(pooled[side], SURFACE, 1) for side in (chosen, ~chosen))
-        return one - other
+        counts = [round(delta * n_runs) for delta in DELTAS]
+        steps = [round(2 * (delta * (1 - delta) * n_runs) ** 0.5) for delta in DELTAS]
+        rows = []
+        for shift in (0, -1, 1):
+            deltas = [
+                Fraction(min(count + shift * step, n_runs), n_runs) for count, step in zip(counts, steps)
+            ]
+            cells = dataclasses.replace(SURFACE, deltas=tuple(deltas))
+            surfaces = [complexity(pooled[side], cells, 1) for side in (chosen, ~chosen)]
+            rows.append(np.stack(surfaces).astype(float))
+        reach = [min(count + step, n_runs) - count + step for count, step in zip(counts, steps)]
+        errors = (rows[2] - rows[1]) * np.array(steps) / np.array(reach) / 2
+        return (rows[0][0] - rows[0][1]) / np.sqrt(1 / 12 + (errors**2).sum(axis=0))
 
-    assert (found == expected(np.arange(2 * n_runs) < n_runs)).all()
+    assert found == pytest.approx(expected(np.arange(2 * n_runs) < n_runs), rel=1e-5)
     for index in (0, 199):
-        assert (drawn[..., index] == expected(labels[:, index] > 0)).all()
-
-
-def test_p_of_cells_by_hand() -> None:
-    """Two cells, three relabelings: in units of each cell's root mean square over all four labelings."""
-    observed = np.array([[6, 1]], dtype=np.int16)
-    blocks = [np.array([[[-2, 0], [1, -1]]], dtype=np.int16), np.array([[[4], [-5]]], dtype=np.int16)]
-    # squares of the first cell 36 + 4 + 0 + 16 = 56, of the second 1 + 1 + 1 + 25 = 28
-    units = np.sqrt(np.array([56 / 4, 28 / 4]) + 1 / 12)
-    largest = [max(2 / units[0], 1 / units[1]), 1 / units[1], 5 / units[1]]
-    expected = [(1 + sum(each >= t for each in largest)) / 4 for t in (6 / units[0], 1 / units[1])]
-    assert expected == [2 / 4, 1]
-    assert _cell_p(observed, blocks, 1).tolist() == [expected]
-
-
-def test_every_cell_counts_alike() -> None:
-    """Cells with large and with small S_hat in one grid: a difference in the small ones is found."""
-    model = SmoothedRuns(entry(0))
-    late = SmoothedRuns(slower(entry(0), 1.25))
-    assert power(model, late, 30, 30, SURFACE, PermutationRule(), n_pairs=30).first_wins >= 0.8
+        assert drawn[..., index] == pytest.approx(expected(labels[:, index] > 0), rel=1e-5)
 
 
 def test_epochs_of_different_length_are_laid_side_by_side() -> None:
@@ -255,7 +248,7 @@ def test_equal_entries_rarely_differ_and_slow_ones_are_found(
     rule: TimesRule | PermutationRule, index: int
 ) -> None:
     model = SmoothedRuns(entry(index))
-    rates = false_winners(model, 30, 30, SURFACE, rule, n_pairs=120)
+    rates = false_winners(model, 30, 30, SURFACE, rule, n_pairs=60)
     assert rates.any_cell <= 0.1
     late = LearningCurves(
         np.concatenate([np.zeros((30, 20)), entry(index).values[:, :-20]], axis=1), 2000, "late"
