@@ -26,6 +26,8 @@ from qrlsuite.specs import EngineSpec
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 
+ROOT = Path(__file__).parents[2]
+
 STARTS = {
     "width=16": lambda seed: 11 + seed % 2,
     "width=8": lambda seed: 11 + (seed + 1) % 2,
@@ -189,6 +191,20 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         resumed = answer("run", "widths.toml", "--engine", "scripted", "--runs", runs)
         assert resumed["pairs"] == straight["pairs"]
         assert len(Scripted.trained) == 5, "nothing is trained twice"
+
+
+def test_the_example_on_the_page_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [example] = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "decisions.md").read_text(), re.DOTALL)
+    monkeypatch.setitem(
+        registry.load().entries["engines"],
+        "local",
+        registry.Registered(EngineSpec("local", "for tests", f"{__name__}:Scripted"), "tests"),
+    )
+    write("mlp width=16", "mlp width=2", plan="width.toml")
+    exec(example, {})
+    assert "mlp width=16 mlp width=2 " in capsys.readouterr().out
 
 
 def test_python_decides_as_the_command_does() -> None:

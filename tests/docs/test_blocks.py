@@ -19,7 +19,11 @@ from tests.conftest import HANGS
 pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-ELSEWHERE = {"plugins.md": "test_plugins.py", "statistics.md": "tests/statistics/test_docs.py"}
+ELSEWHERE = {
+    "decisions.md": "tests/cli/test_decide.py",
+    "plugins.md": "test_plugins.py",
+    "statistics.md": "tests/statistics/test_docs.py",
+}
 """Pages whose blocks other tests run."""
 OWN_FILE = "# my_ansatz.py\n"
 
