@@ -1,4 +1,4 @@
-"""What an entry was made with and is not installed here: it is ranked all the same, from its stored curves."""
+"""Names the plugins an entry needs that are not installed here; the entry is ranked from its stored curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a significance rule errs on given entries: what is simulated, how long that takes, what came out.
+"""Simulates entries like given ones to measure how often a significance rule errs; estimates the time first.
 
 The measures themselves are in `qrlsuite.statistics.calibration`.
 """

@@ -1,4 +1,4 @@
-"""Trained agents of some entries and reference policies on the same fresh episodes: a table and a histogram."""
+"""Plays trained agents and reference policies on the same fresh episodes: a table and a histogram."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a calibration found, in tables and sentences."""
+"""Tables of what a calibration measured."""
 
 from __future__ import annotations
 

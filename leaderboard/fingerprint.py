@@ -1,6 +1,6 @@
-"""What a seed looks like before its first epoch: what must agree between machines that cannot agree bit for bit.
+"""Fingerprints of seeds before their first epoch: numbers that agree on machines whose later bits differ.
 
-A published entry carries these numbers, and whoever re-runs its seeds elsewhere computes them anew.
+A published entry carries them, and whoever trains its seeds again elsewhere computes them anew.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pictures of a study, drawn from whatever of its entries a results folder holds."""
+"""Draws the pictures of a study from those of its entries that a results folder holds."""
 
 from __future__ import annotations
 

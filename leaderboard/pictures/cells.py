@@ -1,4 +1,4 @@
-"""What pictures of sample complexity share: which cells, up to which horizon, with what certainty."""
+"""Options shared by pictures of sample complexity: which cells, up to which horizon, with what certainty."""
 
 from __future__ import annotations
 

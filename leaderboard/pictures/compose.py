@@ -1,4 +1,4 @@
-"""A picture from its name: which entries, or which task's environment, it shows."""
+"""Draws a picture by its name, from entries or from a task's environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a few seeds mislead: what a paper with 5 seeds might have shown, and how often who would be ahead.
+"""How a few seeds mislead: verdicts of random subsets of 5 seeds, beside the verdict of all.
 
 Of two entries, or of two sets of seeds of one and the same entry (paper, figure "Inadequate reporting").
 """

@@ -1,4 +1,4 @@
-"""What all pictures share: colors, line styles, hatches, labels, axes."""
+"""Colors, line styles, hatches, labels and axes that all pictures share."""
 
 from __future__ import annotations
 

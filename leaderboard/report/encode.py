@@ -1,4 +1,4 @@
-"""What goes into a page: strings of strangers made harmless, and curves made small.
+"""Makes foreign strings harmless and curves small before they enter a page.
 
 Names come from other people's files. Jinja escapes them in HTML; here they lose the characters that no escaping
 helps against (control characters, writing-direction overrides, lone surrogates), and data for scripts is

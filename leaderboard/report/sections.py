@@ -1,4 +1,4 @@
-"""One section of the page: a task at one horizon, with all that its tables and figures show."""
+"""One section of the page: a task at one horizon, with its tables and figures."""
 
 from __future__ import annotations
 

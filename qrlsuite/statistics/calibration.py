@@ -1,4 +1,4 @@
-"""How often a rule declares a winner where there is none, and how often it finds one where there is.
+"""Simulated error rates and power of a rule: how often it declares a winner wrongly, and how often rightly.
 
 A significance rule's promise is only worth what a simulation of it shows. Two ways are offered:
 

@@ -1,4 +1,4 @@
-"""As many seeds as it takes: a plan with several looks at growing numbers of runs, at one error for all of them.
+"""Decision plans: several looks at growing numbers of runs, with one error probability for all looks.
 
 Whoever looks at the data again and again and stops at the first p below .05 errs far more often than that. Here
 alpha is spent over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over

@@ -1,4 +1,4 @@
-"""The same programs in plain torch operations, on any device: what runs on a GPU.
+"""Runs the same programs in plain torch operations on any device, such as a GPU.
 
 States are complex tensors (lanes, 2^n), complex64 for float32 inputs and complex128 for float64. Gradients are
 adjoint, as on the CPU (see `sweeps`): memory does not grow with depth.
