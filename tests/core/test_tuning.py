@@ -314,7 +314,10 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
     ("changes", "message"),
     [
         ({"varied": ()}, "algorithm.lr is a range, which sampler 'grid' cannot go through"),
-        ({"varied": (), "settings": (*SETTINGS, parse_setting("lr=1e-3"))}, "nothing is varied"),
+        (
+            {"varied": (), "settings": (*SETTINGS, *map(parse_setting, ("lr=1e-3", "input_scale=1")))},
+            "nothing is varied",
+        ),
         ({"varied": varied("widht=1,2")}, "did you mean 'width'"),
         ({"varied": varied("lr=-1,2")}, "a trial with algorithm.lr = -1"),
         ({"varied": varied("lr=[]")}, "the list of values to try is empty"),

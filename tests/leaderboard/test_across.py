@@ -17,9 +17,13 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli import across as words
 from qrlsuite.cli.app import build
+from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import across, latex
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.options import parse_setting
+from qrlsuite.results.store import EntryStore
 from tests.conftest import POLE, TINY
 from tests.leaderboard import boards
 
@@ -128,12 +132,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, text in (("tiny", TINY), ("pole", POLE)):
         (folder / f"{name}.toml").write_text(text.replace("[180]", "[120]"))
     for name, width in (("tiny", 4), ("pole", 4), ("tiny", 8), ("pole", 8), ("tiny", 6)):
-        done = qrlsuite(
-            folder / "runs",
-            *("run", "--task", str(folder / f"{name}.toml"), "--algorithm", "ddqn", "--model", "mlp"),
-            *("--set", f"width={width}", "--seeds", "20", "--epochs", "2"),
-        )
-        assert done.exit_code == 0, done.output
+        task, settings = str(folder / f"{name}.toml"), [parse_setting(f"width={width}")]
+        store = EntryStore.create(folder / "runs", resolve(task, "mlp", "ddqn", settings))
+        train_group(store.path, range(20), 2)
     return folder / "runs"
 
 
