@@ -13,7 +13,7 @@ _BEAM6G = f"{_HERE}.beam6g"
 
 @hookimpl
 def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
-    """Register BeamManagement6G, CartPole, and whatever else Gymnasium knows."""
+    """Register BeamManagement6G, CartPole, Planted, and whatever else Gymnasium knows."""
     register(
         EnvironmentSpec(
             name="beam6g",
@@ -50,6 +50,15 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/CartPole-v1",
             entry_point=f"{_HERE}.cartpole:CartPole",
             vector=f"{_HERE}.cartpole:make_vector",
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="planted",
+            summary="Planted: classify points as a hidden circuit of 2 qubits does",
+            options=f"{_HERE}.planted:PlantedOptions",
+            gymnasium_id="qrlsuite/Planted-v1",
+            entry_point=f"{_HERE}.planted:Planted",
         )
     )
     register(
