@@ -185,10 +185,11 @@ def serve(control: int) -> None:
 @functools.cache
 def _server(python: str) -> socket.socket:
     ours, theirs = socket.socketpair()
-    one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    own = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    own["QRLSUITE_LOAD_PLUGINS"] = ""  # not what the test that comes first has set
     process = subprocess.Popen(
         [python, "-P", __file__, str(theirs.fileno())],
-        env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **one},
+        env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **own},
         stdin=subprocess.DEVNULL,
         pass_fds=[theirs.fileno()],
         start_new_session=True,

@@ -138,7 +138,7 @@ def test_wrong_input(words: list[str], message: str, task: str) -> None:
 def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> None:
     words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--vary", "lr=1e-2,1e-3"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
-    first = CliRunner().invoke(build(), [*words, "--budget", "1s"])
+    first = CliRunner().invoke(build(), [*words, "--budget", "0.01s"])
     assert "the budget is spent, 1 trials are left" in first.stdout, "after the first trial, no other fits"
     rest = CliRunner().invoke(build(), words)
     assert rest.exit_code == 0
