@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qrlsuite import registry
 from qrlsuite.errors import StoreError
@@ -151,9 +152,7 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
     for seed, run in runs.items():
         if seed in present:
             known.append(seed)
-            own = store.seed(seed).read().curve
-            shared = min(len(own), len(run.curve))
-            if not np.array_equal(own[:shared], run.curve[:shared]):
+            if _differs(store, seed, run.curve):
                 differing.append(seed)
         elif seed in training or not (run.finished or seed in newest):
             waiting.append(seed)
@@ -201,9 +200,7 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> T
         curve = exported.curves[row]
         if seed in present:
             known.append(seed)
-            own = store.seed(seed).read().curve
-            shared = min(len(own), len(curve))
-            if not np.array_equal(own[:shared], curve[:shared]):
+            if _differs(store, seed, curve):
                 differing.append(seed)
             continue
         rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
@@ -261,6 +258,13 @@ def _place(store: EntryStore, seed: int, folder: Path) -> None:
     except OSError as error:
         shutil.rmtree(copy, ignore_errors=True)
         raise StoreError(f"cannot copy {folder} to {store.path}: {error.strerror or error}") from None
+
+
+def _differs(store: EntryStore, seed: int, curve: NDArray[np.float64]) -> bool:
+    """Return whether a seed's curve here and a curve (T,) from elsewhere differ in the epochs that both have."""
+    own = store.seed(seed).read().curve
+    shared = min(len(own), len(curve))
+    return not np.array_equal(own[:shared], curve[:shared])
 
 
 def _differences(seeds: Sequence[int]) -> list[str]:

@@ -27,7 +27,7 @@ from qrlsuite.population import fixed_order_linear
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class FourierOptions:
-    """FourierOptions of Fourier features."""
+    """Options of Fourier features."""
 
     frequencies: Annotated[
         int, Field(ge=1, le=2**16, description="number D of frequencies; each has a cosine and a sine")
