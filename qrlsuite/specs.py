@@ -235,12 +235,15 @@ class EngineSpec(Spec):
         Packages that it needs: the pip command by the name of the module.
     submits:
         Whether `run` hands the groups to a queue and returns: there is then nothing to watch or to interrupt.
+    remote:
+        Whether groups run on other machines: this one's memory, devices and speed then say nothing about them.
     """
 
     factory: str
     options: str | None = None
     extras: dict[str, str] = field(default_factory=dict)
     submits: bool = False
+    remote: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,21 @@ from qrlsuite.specs import EngineSpec
 
 @hookimpl
 def register_engines(register: Callable[[EngineSpec], None]) -> None:
-    """Register `local` and `slurm`."""
+    """Register `local`, `command` and `slurm`."""
     register(
         EngineSpec(
             name="local",
             summary="Processes on this machine, one per core, restarted when they die",
             factory="qrlsuite.engine.local:LocalEngine",
+        )
+    )
+    register(
+        EngineSpec(
+            name="command",
+            summary="Workers started by a shell command (PBS, LSF, HTCondor, ssh, Kubernetes), in a shared folder",
+            factory="qrlsuite.engine.command:CommandEngine",
+            options="qrlsuite.engine.command:CommandOptions",
+            remote=True,
         )
     )
     register(
@@ -26,5 +35,6 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             options="qrlsuite.engine.slurm:SlurmOptions",
             extras={"submitit": "pip install 'qrlsuite[slurm]'"},
             submits=True,
+            remote=True,
         )
     )

@@ -44,6 +44,8 @@ class Execution:
         Whether the engine hands the groups to a queue and returns.
     name:
         The engine's name, for messages.
+    remote:
+        Whether groups run on other machines than this one.
     """
 
     engine: Engine
@@ -51,6 +53,7 @@ class Execution:
     device: str = "cpu"
     submits: bool = False
     name: str = "local"
+    remote: bool = False
 
     def run(self, work: Plan, show: api.Show) -> EngineOutcome:
         """Let the engine train the groups of a plan."""
@@ -127,7 +130,7 @@ def create(
     devices.check(device)  # whether it is there is seen where the work is done
     built = api.create(engine, options or {})
     spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
-    return Execution(built, built.workers(workers), device, spec.submits, engine)
+    return Execution(built, built.workers(workers), device, spec.submits, engine, spec.remote or spec.submits)
 
 
 def plan(
@@ -213,7 +216,7 @@ def train(
             raise _TimeIsUp
 
     display.deadline = None if minutes is None else began + 60 * minutes
-    if not execution.submits and work.groups:
+    if not execution.remote and work.groups:
         _check_device(execution.device)
         check_memory(work, execution)
     fresh = not work.store.path.exists()
@@ -245,7 +248,7 @@ def train(
 
 def expected(work: Plan, execution: Execution) -> str | None:
     """Say how long training should take, None where nothing is known before the first epoch."""
-    if not work.groups or execution.submits or execution.device != "cpu":
+    if not work.groups or execution.remote or execution.device != "cpu":
         return None
     try:
         estimate = speed.known(work.runs).estimate(work.entry, work.together)
@@ -263,7 +266,7 @@ def check_memory(work: Plan, execution: Execution) -> None:
     OptionError
         Saying how many seeds would fit.
     """
-    if execution.device == "cpu" and not execution.submits:
+    if execution.device == "cpu" and not execution.remote:
         groups = [group.seeds for group in work.groups]
         memory.require(work.entry, groups, execution.workers, memory.available())
 

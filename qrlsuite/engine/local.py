@@ -11,7 +11,6 @@ import subprocess
 import tempfile
 import time
 from collections import deque
-from dataclasses import dataclass, field
 from typing import IO
 
 from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
@@ -26,14 +25,44 @@ IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
 """Signals with which a cluster warns its jobs: they reach every process, and a worker is told by its supervisor."""
 
 
-@dataclass
-class _Job:
-    group: SeedGroup
-    progress: ProgressFile
-    deaths: int = 0
-    epoch_at_death: int = -1
-    process: subprocess.Popen[bytes] | None = None
-    output: IO[bytes] | None = field(default=None, repr=False)
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+"""Environment variables of every worker: sums are added in the same order on any number of cores."""
+
+
+class WorkerJob:
+    """A group, the process that was started for it, and how often that died."""
+
+    def __init__(self, group: SeedGroup, progress: ProgressFile) -> None:
+        self.group, self.progress = group, progress
+        self.deaths, self.epoch_at_death = 0, -1
+        self.process: subprocess.Popen[bytes] | None = None
+        self.output: IO[bytes] | None = None
+
+    def take_output(self) -> str:
+        """Return what an ended process printed, and close the file that holds it."""
+        if self.output is None or self.output.closed:
+            return ""
+        with self.output:
+            self.output.seek(0)
+            return self.output.read().decode(errors="replace").strip()
+
+    def died(self, reason: str, text: str) -> str | None:
+        """Count a death; returns why the group is given up, None where it is to be started again.
+
+        Parameters
+        ----------
+        reason:
+            How the process ended: `signal SIGKILL`.
+        text:
+            What it printed.
+        """
+        epoch = int(self.progress.read().get("epoch") or 0)
+        self.deaths = 1 if epoch > self.epoch_at_death else self.deaths + 1
+        self.epoch_at_death = epoch
+        if self.deaths < ATTEMPTS:
+            return None
+        last = f": {text.splitlines()[-1]}" if text else ""
+        return f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
 
 
 def usable_cores() -> int:
@@ -47,7 +76,7 @@ class LocalEngine:
     """Supervises worker processes on this machine."""
 
     def __init__(self, options: None = None) -> None:
-        self._running: list[_Job] = []
+        self._running: list[WorkerJob] = []
 
     def workers(self, requested: int | None) -> int:
         """Return the number asked for, else one per core that this process may use."""
@@ -65,7 +94,7 @@ class LocalEngine:
         KeyboardInterrupt
             After Ctrl-C, when every worker has saved and ended.
         """
-        jobs = [_Job(group, ProgressFile(work.store, group.id)) for group in work.groups]
+        jobs = [WorkerJob(group, ProgressFile(work.store, group.id)) for group in work.groups]
         waiting = deque(jobs)
         outcome = EngineOutcome()
         for job in jobs:
@@ -104,18 +133,16 @@ class LocalEngine:
                 process.kill()
                 process.wait()
         for job in self._running:
-            if job.output is not None:
-                job.output.close()
+            job.take_output()
         self._running.clear()
 
 
-def _start(job: _Job, work: Work) -> None:
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+def _start(job: WorkerJob, work: Work) -> None:
     job.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the worker has ended
     # a session of its own: Ctrl-C reaches the workers once, from here
     job.process = subprocess.Popen(
         [*worker_command(work, job.group), "--follow-parent", str(os.getpid())],
-        env={**os.environ, **threads},
+        env={**os.environ, **ONE_THREAD},
         stdin=subprocess.DEVNULL,
         stdout=job.output,
         stderr=job.output,
@@ -129,26 +156,18 @@ def _ignore_warnings() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _ended(job: _Job, code: int, outcome: EngineOutcome) -> bool:
+def _ended(job: WorkerJob, code: int, outcome: EngineOutcome) -> bool:
     """Judge an ended worker; returns whether to try again, else enters what became of it in the outcome."""
-    text = ""
-    if job.output is not None:
-        job.output.seek(0)
-        text = job.output.read().decode(errors="replace").strip()
-        job.output.close()
+    text = job.take_output()
     if code == 0:
         return False
-    progress = job.progress.read()
     if code in (2, 3):
-        message = str(progress.get("error") or text or "failed").removeprefix("qrlsuite: ")
+        message = str(job.progress.read().get("error") or text or "failed").removeprefix("qrlsuite: ")
         (outcome.failed if code == 2 else outcome.taken)[job.group.id] = message
         return False
-    epoch = int(progress.get("epoch") or 0)
-    job.deaths = 1 if epoch > job.epoch_at_death else job.deaths + 1
-    job.epoch_at_death = epoch
-    if job.deaths < ATTEMPTS:
-        return True
     reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-    last = f": {text.splitlines()[-1]}" if text else ""
-    outcome.failed[job.group.id] = f"its worker died {ATTEMPTS} times ({reason}){last}\n{text}"
+    given_up = job.died(reason, text)
+    if given_up is None:
+        return True
+    outcome.failed[job.group.id] = given_up
     return False

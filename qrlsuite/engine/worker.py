@@ -30,7 +30,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 class ClaimHeartbeat(threading.Thread):
-    """Refreshes the claim; interrupts this process when the claim or the parent process `parent` is lost."""
+    """Refreshes the claim; interrupts this process when the claim or its parent is lost, or it is asked to stop."""
 
     def __init__(self, claim: Claim, parent: int | None) -> None:
         super().__init__(daemon=True)
@@ -42,8 +42,8 @@ class ClaimHeartbeat(threading.Thread):
         """Beat until stopped."""
         while not self.stopped.wait(HEARTBEAT):
             orphaned = self.parent is not None and os.getppid() != self.parent
-            lost = orphaned or not self.claim.refresh()
-            if lost and not self.stopped.is_set():  # it may have been released while it was being refreshed
+            ends = orphaned or self.claim.stop_requested or not self.claim.refresh()
+            if ends and not self.stopped.is_set():  # it may have been released while it was being refreshed
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
 
@@ -156,4 +156,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    for warning in (
+        signal.SIGUSR1,
+        signal.SIGUSR2,
+    ):  # with which a cluster warns its jobs, and then sends SIGTERM
+        signal.signal(warning, signal.SIG_IGN)
     sys.exit(main())

@@ -26,6 +26,7 @@ from qrlsuite import registry
 from qrlsuite.engine.local import usable_cores
 from qrlsuite.results.provenance import collect, processor
 from qrlsuite.results.store import entries
+from qrlsuite.specs import EngineSpec
 
 VARIABLES = ("OMP_", "MKL_", "OPENBLAS_", "NUMBA_", "CUDA_", "QRLSUITE_", "XDG_CACHE_HOME", "PYTHONPATH")
 """Prefixes of environment variables that change how fast or from where things run."""
@@ -195,6 +196,15 @@ def _plugins(diagnosis: Diagnosis) -> None:
         if plugin.distribution != "qrlsuite"
     }
     diagnosis.facts["plugins"] = ", ".join(others) or "the suite's own"
+    diagnosis.facts["engines"] = ", ".join(
+        _engine(registered.spec) for _, registered in known if isinstance(registered.spec, EngineSpec)
+    )
+
+
+def _engine(spec: EngineSpec) -> str:
+    """Return an engine's name, with what to type where a package that it needs is not installed."""
+    missing = [command for module, command in spec.extras.items() if importlib.util.find_spec(module) is None]
+    return f"{spec.name} ({', '.join(missing)})" if missing else spec.name
 
 
 def _runs(folder: Path, diagnosis: Diagnosis) -> None:

@@ -67,6 +67,20 @@ class Claim:
             return True
         return True
 
+    def request_stop(self) -> None:
+        """Ask the holder, on whatever machine, to save and end; it looks with every refresh."""
+        with contextlib.suppress(OSError):  # it has just ended, or nothing can be written
+            self._stop.touch()
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether somebody asked the holder to save and end."""
+        return self._stop.exists()
+
+    @property
+    def _stop(self) -> Path:
+        return self.path.with_suffix(".stop")
+
     @property
     def local(self) -> bool:
         """Whether the holder runs where this process can see it: same host, same process numbers."""
@@ -76,6 +90,7 @@ class Claim:
         """Give the seeds back, if they are still held."""
         if self.refresh():
             self.path.unlink(missing_ok=True)
+            self._stop.unlink(missing_ok=True)
 
 
 def _process_start(pid: int) -> str | None:
@@ -121,6 +136,12 @@ def living(store: EntryStore) -> list[Claim]:
     """
     now = _file_system_time(store.claims)
     return [claim for claim in claims(store) if _state(claim, now) != "dead"]
+
+
+def certain(store: EntryStore) -> list[Claim]:
+    """Return the claims whose holders are alive for certain: refreshed a while ago, or processes seen here."""
+    now = _file_system_time(store.claims)
+    return [claim for claim in claims(store) if _state(claim, now) == "alive"]
 
 
 def claims(store: EntryStore) -> list[Claim]:
@@ -207,6 +228,7 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
                     raise SeedsClaimedError(_refusal(holder, shared))
             for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
                 path.unlink(missing_ok=True)
+                path.with_suffix(".stop").unlink(missing_ok=True)
             token = secrets.token_hex(8)
             claim = Claim(
                 path=store.claims / f"{token}.json",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import qrlsuite
@@ -45,6 +46,10 @@ def test_this_installation(tmp_path: Path) -> None:
     assert "OMP_NUM_THREADS=1" in facts["variables"]
     assert "torch for" in facts["GPU"]
     assert facts["simulator"] == "works"
+    assert facts["engines"].startswith("command, ")
+    assert facts["engines"].endswith(
+        ", slurm" if find_spec("submitit") else "slurm (pip install 'qrlsuite[slurm]')"
+    )
     assert "runs, 1 entries, 3 seeds" in facts["runs"]
     assert sorted(tmp_path.rglob("*")) == before, "it leaves nothing behind"
 

@@ -1,0 +1,246 @@
+"""The engine `command`: starts every worker by a shell command, for queues and machines that share the results folder.
+
+The template says how a worker is started: by ssh, by a queue's submit command, in a container. The engine stays until
+all groups have finished. Whether a worker is at work it reads from the results folder and not from its process, so the
+command may end with the worker (`ssh`) or when the worker waits in a queue (`qsub`).
+
+- A worker that ended early (a time limit, a node taken away) is started again, from its checkpoint.
+- After Ctrl-C a file beside its claim asks each worker to save and end.
+- What a queue still holds is not seen: such a worker, when it begins, finds its seeds claimed or done, or trains them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shlex
+import signal
+import string
+import subprocess
+import tempfile
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import pydantic
+from pydantic.dataclasses import dataclass
+
+from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
+from qrlsuite.engine.local import ONE_THREAD, WorkerJob, usable_cores
+from qrlsuite.errors import nearest
+from qrlsuite.results.claims import Claim, certain
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import SeedGroup
+from qrlsuite.results.store import EntryStore
+
+log = logging.getLogger("qrlsuite")
+
+PLACEHOLDERS = ("command", "quoted", "i", "group")
+
+LOOK_SECONDS = 0.5
+"""Seconds between two looks at the results folder."""
+
+PATIENCE = 60.0
+"""Seconds for which workers that were asked to stop are waited for."""
+
+PASSED_ON = ("QRLSUITE_", "PYTHONPATH", "NUMBA_")
+"""Beginnings of the environment variables that a worker on another machine needs as they are here."""
+
+
+def _template(text: str) -> str:
+    """Check a template.
+
+    Raises
+    ------
+    ValueError
+        If a worker's command has no place in it, or it has an unknown one.
+    """
+    try:
+        names = [name for _, name, _, _ in string.Formatter().parse(text) if name is not None]
+    except ValueError as error:
+        raise ValueError(f"{error}; a brace that the shell is to see is doubled: {{{{ and }}}}") from None
+    for name in names:
+        if name not in PLACEHOLDERS:
+            raise ValueError(
+                f"there is no {{{name}}}{nearest(name, PLACEHOLDERS)}; a brace that the shell is to see is doubled"
+            )
+    if not {"command", "quoted"} & set(names):
+        raise ValueError(
+            "no worker is started: write {command} where its command belongs, such as 'srun {command}', or {quoted} "
+            "where a second shell reads it, such as 'ssh node{i} {quoted}'"
+        )
+    return text
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class CommandOptions:
+    """Options of the engine `command`."""
+
+    template: Annotated[
+        str,
+        pydantic.AfterValidator(_template),
+        pydantic.Field(
+            description="shell line that starts a worker: {command} is the worker's command, {quoted} the same as one "
+            "word, {i} counts the workers from 1, {group} names the group of seeds"
+        ),
+    ] = "{command}"
+
+
+def shell_line(template: str, command: Sequence[str], place: int, group: str) -> str:
+    """Put the words of a worker's command into a template, quoted as the shell needs it."""
+    text = shlex.join(command)
+    return template.format(command=text, quoted=shlex.quote(text), i=place, group=group)
+
+
+class CommandEngine:
+    """Starts workers by a shell command and follows them in the results folder."""
+
+    def __init__(self, options: CommandOptions) -> None:
+        self.options = options
+
+    def workers(self, requested: int | None) -> int:
+        """Return the number asked for, else one per core of this machine."""
+        return requested or usable_cores()
+
+    def queued(self, store: EntryStore) -> set[int]:
+        """Return nothing: what a queue holds is not known here, and does no harm when it begins."""
+        return set()
+
+    def run(self, work: Work, show: Show) -> EngineOutcome:
+        """Train the groups, `work.workers` at a time, until all have finished or failed.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, when every worker that had begun has saved and ended.
+        """
+        jobs = [_CommandJob(group, ProgressFile(work.store, group.id)) for group in work.groups]
+        waiting, running = deque(jobs), list[_CommandJob]()
+        free = deque(range(1, work.workers + 1))
+        outcome = EngineOutcome()
+        for job in jobs:
+            job.progress.clear()
+        try:
+            while waiting or running:
+                while waiting and free:
+                    job = waiting.popleft()
+                    job.start(self.options.template, work, free.popleft())
+                    running.append(job)
+                time.sleep(LOOK_SECONDS)
+                at_work = {seed for claim in certain(work.store) for seed in claim.seeds}
+                for job in list(running):
+                    if job.look(work, at_work):
+                        continue
+                    running.remove(job)
+                    free.append(job.place)
+                    if job.ended(work, outcome):
+                        waiting.append(job)
+                show({job.group.id: job.progress.read() for job in jobs})
+        except BaseException:
+            _stop(work.store, running)
+            raise
+        return outcome
+
+
+class _CommandJob(WorkerJob):
+    """A group whose worker was started by a command."""
+
+    def __init__(self, group: SeedGroup, progress: ProgressFile) -> None:
+        super().__init__(group, progress)
+        self.place = 0
+        self.begun = False
+        self._before: dict[str, Any] = {}
+
+    def start(self, template: str, work: Work, place: int) -> None:
+        """Run the template's command.
+
+        Parameters
+        ----------
+        place:
+            1 to `work.workers`: what `{i}` stands for.
+        """
+        self.place, self.begun, self._before = place, False, self.progress.read()
+        own = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
+        words = ["env", *(f"{name}={value}" for name, value in sorted({**own, **ONE_THREAD}.items()))]
+        line = shell_line(template, [*words, *worker_command(work, self.group)], place, self.group.id)
+        self.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the command has ended
+        self.process = subprocess.Popen(
+            line,
+            shell=True,
+            stdin=subprocess.DEVNULL,
+            stdout=self.output,
+            stderr=self.output,
+            start_new_session=True,  # Ctrl-C reaches the worker once, from here
+        )
+
+    def look(self, work: Work, at_work: set[int]) -> bool:
+        """Return whether the group is still being trained, or waits to be."""
+        code = None if self.process is None else self.process.poll()
+        held = not at_work.isdisjoint(self.group.seeds)
+        self.begun |= held
+        if code is None:
+            return True
+        if code == 3 or work.store.finished(self.group.seeds, work.epochs) == set(self.group.seeds):
+            return False
+        waits = code == 0 and not self.begun and self.progress.read() == self._before
+        return held or waits
+
+    def ended(self, work: Work, outcome: EngineOutcome) -> bool:
+        """Judge what has ended; returns whether to start it again, else enters what became of it in the outcome."""
+        text, progress = self.take_output(), self.progress.read()
+        code = 0 if self.process is None else self.process.returncode
+        if work.store.finished(self.group.seeds, work.epochs) == set(self.group.seeds):
+            return False
+        if code == 3:
+            outcome.taken[self.group.id] = text.rpartition("qrlsuite: ")[2] or "its seeds are being trained"
+            return False
+        if progress.get("error"):
+            outcome.failed[self.group.id] = str(progress["error"])
+            return False
+        why = f"exit code {code} of its command" if code else "it left the results folder unfinished"
+        given_up = self.died(why, text)
+        if given_up is None:
+            return True
+        outcome.failed[self.group.id] = given_up
+        return False
+
+
+def _stop(store: EntryStore, running: Sequence[_CommandJob]) -> None:
+    """Ask every worker to save and end, and wait for it; end commands whose worker never began."""
+    seeds = {seed for job in running for seed in job.group.seeds}
+    asked: dict[str, Claim] = {}
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        held = {claim.token: claim for claim in certain(store) if seeds & set(claim.seeds)}
+        for token in held.keys() - asked.keys():
+            held[token].request_stop()
+        asked |= held
+        for job in running:
+            job.begun |= any(set(claim.seeds) & set(job.group.seeds) for claim in asked.values())
+            if not job.begun:
+                _signal(job, signal.SIGTERM)
+        if not held and all(job.process is None or job.process.poll() is not None for job in running):
+            break
+        time.sleep(LOOK_SECONDS / 5)
+    for job in running:
+        _signal(job, signal.SIGKILL)
+        job.take_output()
+    left = sum(
+        1 for job in running if not job.begun and job.process is not None and job.process.returncode == 0
+    )
+    if left:
+        log.warning(
+            f"{left} worker{'s' * (left > 1)} may still wait in a queue: cancel what you do not want there; one that "
+            "begins later goes on with the training"
+        )
+
+
+def _signal(job: _CommandJob, number: signal.Signals) -> None:
+    """Signal a command that has not ended, with all that it started."""
+    if job.process is not None and job.process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(job.process.pid, number)
+        if number == signal.SIGKILL:
+            job.process.wait()
