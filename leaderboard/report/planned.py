@@ -26,9 +26,10 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 12, 12, 38
 
 @dataclass(frozen=True)
 class PairLine:
-    """A pair of the table; `color` is that of its line in the picture."""
+    """A pair of the table; `color` is that of its line in the picture, and `question` what it answers, if anything."""
 
     color: int
+    question: str
     pair: str
     verdict: str
     seeds: int
@@ -94,6 +95,7 @@ def view(outcome: DecisionOutcome) -> PlanView:
     pairs = tuple(
         PairLine(
             color=index,
+            question=clean(facts["question"] or "", 300),
             pair=clean(versus(pair)),
             verdict=clean(pair.verdict),
             seeds=pair.n_runs,

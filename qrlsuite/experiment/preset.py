@@ -81,6 +81,11 @@ class EntryTuning(TuningRecord):
         tuple[str, ...], Field(description="options that --set changed afterwards, as SIDE.NAME")
     ] = ()
 
+    def plain(self) -> dict[str, Any]:
+        """Return what `entry.json` stores."""
+        unknown = {name for name in ("runs", "budget", "rungs") if getattr(self, name) is None}
+        return self.model_dump(mode="json", exclude=unknown)  # 0.1.0 reads records without these keys only
+
 
 class PresetFile(_Table):
     """A whole preset file."""
@@ -164,11 +169,7 @@ def record_of(
         for name, value in values.get(side, {}).items()
         if content.get(name) != value
     )
-    record = EntryTuning(**tuning.model_dump(), preset=source, changed=tuple(changed))
-    unknown = {name for name in ("runs", "budget", "rungs") if getattr(record, name) is None}
-    return record.model_dump(
-        mode="json", exclude=unknown
-    )  # version 0.1.0 reads records without these keys only
+    return EntryTuning(**tuning.model_dump(), preset=source, changed=tuple(changed)).plain()
 
 
 def dumps(preset: PresetFile, comment: str = "") -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -24,6 +25,9 @@ from qrlsuite.statistics.planning import runs_at_difference
 from qrlsuite.statistics.sequential import Decision, PairDecision
 from qrlsuite.studies import decisions
 from qrlsuite.studies.decisions import DecisionStudy
+
+Pair = TypeVar("Pair")
+"""What is known of a pair: its decision, or more."""
 
 Hours = tuple[float, float]
 """Least and most core-hours to be expected; both the same where they were measured on the entry's own seeds."""
@@ -72,7 +76,11 @@ class DecisionOutcome(Shown):
             "ended": study.ended,
             "looks_taken": study.taken,
             "reason": study.file.reason or None,
-            "pairs": [_pair_as_dict(decision, pair) for pair in decision.pairs],
+            "pairs": [
+                {"question": asked or None, **_pair_as_dict(decision, pair)}
+                for asked, pairs in by_question(study, decision.pairs)
+                for pair in pairs
+            ],
             "entries": [
                 {
                     "name": name,
@@ -100,7 +108,10 @@ class DecisionOutcome(Shown):
         yield Text(f"{study.file.name}: {question(study)}", style="bold")
         if not study.begun:
             yield Text("not begun")
-        yield _table(study, decision, facts["pairs"])
+        for asked, pairs in by_question(study, list(zip(decision.pairs, facts["pairs"]))):
+            if asked:
+                yield Text(asked, style="bold")
+            yield _table(study, pairs)
         if any(pair.p for pair in decision.pairs):
             yield Text(
                 "B against A: how much longer B is below the thresholds, with a repeated confidence interval that "
@@ -230,9 +241,20 @@ def total_hours(study: DecisionStudy, seeds: Mapping[str, int]) -> Hours | None:
 
 
 def question(study: DecisionStudy) -> str:
-    """Return what a plan asks: `which needs fewer steps, A, B or C?`."""
+    """Return what a plan asks: `which needs fewer steps, A, B or C?`, or the number of its questions."""
+    if study.questions:
+        return f"{counted(len(study.file.questions), 'question')}, {counted(len(study.plan.family), 'pair')}"
     names = list(study.entries)
     return f"which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
+
+
+def by_question(study: DecisionStudy, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
+    """Return each question of a plan with what is known of its pairs, in order; an empty text where none is asked."""
+    texts = study.questions or [""] * len(pairs)
+    return [
+        (text, [pair for _, pair in group])
+        for text, group in itertools.groupby(zip(texts, pairs), key=lambda each: each[0])
+    ]
 
 
 def reason_note(study: DecisionStudy) -> str:
@@ -308,11 +330,11 @@ def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
     }
 
 
-def _table(study: DecisionStudy, decision: Decision, plain: Sequence[Mapping[str, Any]]) -> Table:
+def _table(study: DecisionStudy, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
     for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
         table.add_column(column, overflow="fold")
-    for pair, facts in zip(decision.pairs, plain):
+    for pair, facts in pairs:
         cells = (
             versus(pair),
             pair.verdict,

@@ -18,7 +18,7 @@ import datetime
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,7 +30,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_lines, write_atomically
@@ -60,6 +60,20 @@ class PlannedEntry(_PlanTable):
         dict[str, Any], Field(description='options as in --set: qubits, "environment.degree", "algorithm.lr"')
     ] = {}
     hash: Annotated[str, Field(description="of the entry that these options make: it cannot become another")]
+    name: Annotated[
+        str | None,
+        Field(pattern=r"^[\w(][\w ,.:=+/()-]*$", max_length=60, description="what verdicts call it"),
+    ] = None
+    tuning: Annotated[
+        EntryTuning | None, Field(description="how its options were found, where a preset file gave them")
+    ] = None
+
+
+class Question(_PlanTable):
+    """What a plan asks, and the pairs of entries whose verdicts answer it."""
+
+    text: Annotated[str, Field(min_length=1, max_length=200)]
+    pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]
 
 
 class PlanFile(_PlanTable):
@@ -86,6 +100,9 @@ class PlanFile(_PlanTable):
     margin: Annotated[float, Field(description="a smaller difference counts as none: 0.1 is 10 percent")]
     first_seed: Annotated[int, Field(ge=0, description="where the plan's own block of seeds begins")]
     reason: Annotated[str, Field(description="why the first look comes before 20 seeds")] = ""
+    questions: Annotated[
+        list[Question], Field(description="which pairs are compared; every pair of entries without them")
+    ] = []
     entries: list[PlannedEntry]
 
     @pydantic.model_validator(mode="after")
@@ -97,7 +114,14 @@ class PlanFile(_PlanTable):
     @property
     def hash(self) -> str:
         """Sixteen hexadecimal digits over everything that the file says."""
-        return digest(self.model_dump(mode="json"))
+        content = self.model_dump(mode="json")
+        if not self.questions:  # no key of version 0.1.0, whose plans keep their hash
+            del content["questions"]
+        for entry in content["entries"]:
+            for key in ("name", "tuning"):
+                if entry[key] is None:
+                    del entry[key]
+        return digest(content)
 
     @property
     def block(self) -> range:
@@ -139,8 +163,9 @@ def load(path: Path) -> PlanFile:
 def dumps(file: PlanFile) -> str:
     """Return a plan file's text."""
     content = file.model_dump(exclude_none=True)
-    if not file.reason:
-        del content["reason"]
+    for key in ("reason", "questions"):
+        if not content[key]:
+            del content[key]
     head = "# Fixed when its first seed is trained: see `qrlsuite decide --help`.\n"
     return head + tomli_w.dumps(content)
 
@@ -166,7 +191,8 @@ def write(
     Parameters
     ----------
     names:
-        For each entry its model and settings, or its label: `mlp width=64`, `ddqn mlp width=64`.
+        For each entry its model and settings, or its label: `mlp width=64`, `ddqn mlp width=64`. A setting
+        `preset=FILE.toml` gives those of a preset file, with the record of how they were found.
     epochs:
         Of every seed; None for the task's protocol.
     first_seed:
@@ -178,17 +204,8 @@ def write(
         If there are fewer than two entries, they would end at different horizons, or a name, an option or a number
         cannot be used.
     """
-    drafts = [_draft(text, algorithm) for text in names]
-    entries = [
-        resolve(
-            task,
-            model,
-            algorithm_name,
-            [setting("", word, value) for word, value in settings.items()],
-            preset,
-        )
-        for algorithm_name, model, settings in drafts
-    ]
+    drafts = [_draft(text, algorithm, preset) for text in names]
+    entries = [draft.resolve(task) for draft in drafts]
     if len(entries) < 2:
         raise OptionError(f"{len(entries)} of two or more entries: write each as 'MODEL NAME=VALUE ...'")
     lengths = {entry.label: epochs or entry.task.epochs(entry.algorithm.name) for entry in entries}
@@ -214,16 +231,7 @@ def write(
             margin=margin,
             first_seed=FIRST_SEED if first_seed is None else first_seed,
             reason=reason,
-            entries=[
-                PlannedEntry(
-                    model=entry.model.name,
-                    algorithm=entry.algorithm.name,
-                    preset=preset,
-                    options=settings,
-                    hash=entry.hash,
-                )
-                for entry, (_, _, settings) in zip(entries, drafts)
-            ],
+            entries=[draft.planned(task, entry) for draft, entry in zip(drafts, entries)],
         )
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(options.file_problems(error, PlanFile))) from None
@@ -234,14 +242,59 @@ def write(
     return study
 
 
-def _draft(text: str, algorithm: str | None) -> tuple[str | None, str, dict[str, Any]]:
+@dataclass(frozen=True)
+class _Draft:
+    """An entry of a new plan as it was written."""
+
+    algorithm: str | None
+    model: str
+    preset: str | None
+    options: dict[str, Any]
+
+    def resolve(self, task: str, preset: bool = True) -> Entry:
+        """Build the entry, or the one that these options make without the preset."""
+        settings = [setting("", word, value) for word, value in self.options.items()]
+        return resolve(task, self.model, self.algorithm, settings, self.preset if preset else None)
+
+    def planned(self, task: str, entry: Entry) -> PlannedEntry:
+        """Return what the plan says of the entry: a preset file's values and record, so that it can change later."""
+        named, values = self.preset, self.options
+        if named is not None and named.endswith(".toml"):
+            usual = replace(self, algorithm=entry.algorithm.name).resolve(task, preset=False)
+            named, values = None, {**values, **_difference(entry, usual)}
+        return PlannedEntry(
+            model=entry.model.name,
+            algorithm=entry.algorithm.name,
+            preset=named,
+            options=values,
+            hash=entry.hash,
+            tuning=None if entry.tuning is None or named is not None else EntryTuning(**entry.tuning),
+        )
+
+
+def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
+    """Return the options in which an entry differs from another of the same model and algorithm, by full name."""
+    sides = {
+        "algorithm": (entry.algorithm_options, other.algorithm_options),
+        "model": (entry.model_options, other.model_options),
+    }
+    return {
+        f"{side}.{name}": value
+        for side, (own, others) in sides.items()
+        for name, value in options.plain(own).items()
+        if value != options.plain(others)[name]
+    }
+
+
+def _draft(text: str, algorithm: str | None, preset: str | None) -> _Draft:
     """Split `[ALGORITHM] MODEL NAME=VALUE ...` into its parts."""
     plain = [word for word in text.split() if "=" not in word]
     if len(plain) not in (1, 2) or text.split()[: len(plain)] != plain:
         raise OptionError(f"entry '{text}': write 'MODEL NAME=VALUE ...', for example 'mlp width=64'")
     settings = [options.parse_setting(word) for word in text.split()[len(plain) :]]
     values = {".".join(part for part in (each.side, each.name) if part): each.value for each in settings}
-    return plain[0] if len(plain) == 2 else algorithm, plain[-1], values
+    chosen = str(values.pop("preset", preset or "")) or None
+    return _Draft(plain[0] if len(plain) == 2 else algorithm, plain[-1], chosen, values)
 
 
 def _next_block(file: PlanFile) -> int:
@@ -266,6 +319,8 @@ class DecisionStudy:
         The entries by the name that verdicts use, in the plan's order.
     plan:
         What is tested when.
+    questions:
+        For each of the plan's pairs the question that it answers; empty where the plan asks none.
     folder:
         Where its results are, or will be.
 
@@ -290,16 +345,21 @@ class DecisionStudy:
                     f"{source}: entries.{index}.hash is '{each.hash}', these options make '{entry.hash}' here: it is "
                     "another entry than was planned; write a new plan with `qrlsuite decide new`"
                 )
-            planned.append(replace(entry, plan=file.hash))
-        self.entries = dict(zip(_names(planned), planned))
+            tuning = entry.tuning if each.tuning is None else each.tuning.plain()
+            planned.append(replace(entry, plan=file.hash, tuning=tuning))
+        names = tuple(each.name or name for each, name in zip(file.entries, _names(planned)))
+        self.entries = dict(zip(names, planned))
+        self.questions = [asked.text for asked in file.questions for _ in asked.pairs]
+        pairs = tuple(pair for asked in file.questions for pair in asked.pairs)
         grid = Grid.relative if file.epsilons is not None else Grid.absolute
         try:
             self.plan = DecisionPlan(
-                tuple(_names(planned)),
+                names,
                 tuple(file.looks),
                 file.alpha,
                 file.spending,  # type: ignore[arg-type]  # checked there
                 file.margin,
+                pairs=pairs or None,
                 reason=file.reason,
             )
             self.grid = grid(file.epsilons or file.thresholds or [], [0.5])  # rule `times` needs no delta

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
-from qrlsuite import specs
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 
@@ -15,18 +12,9 @@ LARGEST_SIZE = 4096
 
 def parameters(entry: Entry) -> int:
     """Return the number of parameters of an entry's first network, classical and quantum together."""
-    # torch is slow to import, and needed only where models of equal size are looked for
-    import torch
+    from qrlsuite.training.trainer import count_parameters  # torch is slow to import
 
-    from qrlsuite import population
-    from qrlsuite.training.trainer import build_envs
-
-    envs = build_envs(entry, 1, lambda: None)
-    inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
-    outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]
-    build = specs.resolve(entry.model.build)
-    agent = build(inputs, outputs, entry.model_options, torch.Generator())
-    return sum(population.count_parameters(agent))
+    return sum(count_parameters(entry))
 
 
 def nearest_size(make: Callable[[int], Entry], target: Entry) -> int:

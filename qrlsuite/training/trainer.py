@@ -80,6 +80,16 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 
+def count_parameters(entry: Entry) -> tuple[int, int]:
+    """Return the numbers of classical and quantum trainable scalars of an entry's first network."""
+    envs = build_envs(entry, 1, lambda: None)
+    inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
+    outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+    with _building("models", entry.model.name):
+        agent = specs.resolve(entry.model.build)(inputs, outputs, entry.model_options, torch.Generator())
+    return population.count_parameters(agent)
+
+
 @dataclass(frozen=True)
 class Episodes:
     """One complete episode of every lane.

@@ -138,8 +138,14 @@ def load(name: str) -> GridFile:
 def declared(entry: Entry) -> dict[str, Range]:
     """Return the ranges of the options that an entry's algorithm and model mark as tuned, by full name.
 
-    Options that the entry's other options leave without effect, and which are then refused, are left out.
+    Options that the entry's other options leave without effect are left out: those that are then refused, and those of
+    quantum parameters where a circuit stays as it was drawn.
     """
+    from qrlsuite.training.trainer import count_parameters  # torch is slow to import
+
+    families = {None, entry.model.family}
+    if entry.model.family == "quantum" and not count_parameters(entry)[1]:
+        families.remove("quantum")
     sides = {
         "algorithm": (specs.resolve(entry.algorithm.options), entry.algorithm_options),
         "model": (specs.resolve(entry.model.options), entry.model_options),
@@ -148,8 +154,7 @@ def declared(entry: Entry) -> dict[str, Range]:
         f"{side}.{name}": Range(low=mark.low, high=mark.high, log=True)
         for side, (cls, own) in sides.items()
         for name, mark in options.tuned(cls).items()
-        if mark.family in (None, entry.model.family)
-        and _accepted(cls, {**options.plain(own), name: mark.low})
+        if mark.family in families and _accepted(cls, {**options.plain(own), name: mark.low})
     }
 
 

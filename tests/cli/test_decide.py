@@ -21,6 +21,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import TaskError
+from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.specs import EngineSpec
 from tests.commands import qrlsuite, start
@@ -445,6 +446,86 @@ def test_a_plan_file_of_one_entry_is_refused_in_one_line(refused: Refused) -> No
     Path("p.toml").write_text(re.sub(r".*width = 4.*\n", "", Path("p.toml").read_text()))
     message = "p.toml: entries = ['mlp width=16']: a decision needs two or more"
     assert message in refused("run", "p.toml")
+
+
+ASKED = """
+[[questions]]
+text = "Does width help?"
+pairs = [["wide", "narrow"]]
+
+[[questions]]
+text = "Is 16 too much?"
+pairs = [["mlp width=8", "wide"]]
+"""
+
+
+def ask() -> str:
+    """Write a plan of three entries that asks two questions and calls two entries by names of its own."""
+    plan = write()
+    for width, name in ((16, "wide"), (4, "narrow")):
+        edit(plan, f"{{ width = {width} }}", f'{{ width = {width} }}, name = "{name}"')
+    Path(plan).write_text(Path(plan).read_text() + ASKED)
+    return plan
+
+
+def test_a_plan_may_ask_about_some_pairs_only() -> None:
+    """Two of three pairs are the family, and the narrow network stops when its only pair is closed."""
+    found = answer("run", ask(), "--engine", "scripted")
+    assert [
+        (pair["question"], pair["first"], pair["second"], pair["verdict"]) for pair in found["pairs"]
+    ] == [
+        ("Does width help?", "wide", "narrow", "wide needs fewer"),
+        ("Is 16 too much?", "mlp width=8", "wide", "equal within 10 percent"),
+    ]
+    assert {entry["name"]: entry["seeds"] for entry in found["entries"]} == {
+        "wide": 40,
+        "mlp width=8": 40,
+        "narrow": 20,
+    }
+    shown = say("show", "widths.toml").stdout
+    assert "widths: 2 questions, 2 pairs" in shown
+    assert "Does width help? wide / narrow" in shown
+    assert "(2 pairs, pocock spending)" in shown
+    screen = say("status", "widths.toml").stdout
+    assert screen.index("Does width help?") < screen.index("wide / narrow") < screen.index("Is 16 too much?")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"wide", "narrow"', '"wide", "narow"', "pairs: 'narow' is not one of the entries"),
+        ('"mlp width=8", "wide"', '"narrow", "wide"', "a pair is repeated"),
+        ('"mlp width=8", "wide"', '"wide"', "questions.1.pairs.0"),
+        ('[["wide", "narrow"]]', "[]", "questions.0.pairs"),
+        ('name = "narrow"', 'name = "wide"', "a name is repeated"),
+        ('name = "narrow"', 'name = "\\u001b[31m"', "entries.2.name"),
+    ],
+)
+def test_a_wrong_question_is_refused_in_one_line(old: str, new: str, message: str, refused: Refused) -> None:
+    edit(ask(), old, new)
+    assert message in refused("status", "widths.toml")
+
+
+def test_a_plan_keeps_the_values_and_the_record_of_a_preset_file() -> None:
+    """What is compared does not change when the preset file does, and every seed's entry says how it was tuned."""
+    content = PresetFile(
+        format_version=1,
+        algorithm="ddqn",
+        model="mlp",
+        algorithm_options={"lr": 2e-3},
+        model_options={"width": 16, "input_scale": 3.0},
+        tuning=TuningRecord(task="tiny", seeds="1000000:1000004", trials=3, runs=12, steps=100),
+    )
+    Path("tuned.toml").write_text(dumps(content))
+    write("mlp width=16 preset=tuned.toml", "mlp width=16", plan="p.toml")
+    Path("tuned.toml").unlink()
+    plain, tuned = sorted(answer("show", "p.toml")["names"], key=len)
+    assert (plain, tuned) == ("mlp width=16", "mlp width=16 input_scale=3.0 lr=0.002")
+    say("run", "p.toml", "--engine", "queue")
+    stores = [EntryStore(path) for path in Path("runs/decisions/p/tiny").iterdir()]
+    records = {store.record()["label"].split(" ", 1)[1]: store.record().get("tuning") for store in stores}
+    assert records[plain] is None
+    assert (records[tuned]["trials"], records[tuned]["preset"]) == (3, "tuned.toml")
 
 
 def test_looks_below_20_seeds_are_marked() -> None:

@@ -282,6 +282,13 @@ def test_every_model_tunes_its_learning_rates_and_its_gain(
         assert ends.low <= getattr(own[side], option) <= ends.high, "the untuned value lies within"
 
 
+@pytest.mark.parametrize(("train", "varied"), [("scaling", True), ("linear", False)])
+def test_a_circuit_that_stays_as_drawn_has_no_quantum_learning_rate(train: str, varied: bool) -> None:
+    settings = [parse_setting(word) for word in (f"train={train}", "qubits=2", "layers=1")]
+    found = space.declared(resolve("beam6g", "vqc-native", "ddqn", settings))
+    assert ("algorithm.quantum_lr" in found) == varied
+
+
 def test_places_and_values_undo_each_other() -> None:
     for ends in (space.Range(low=1e-3, high=1.0, log=True), space.Range(low=-2.0, high=3.0)):
         for place in np.linspace(-0.5, 1.5, 9):

@@ -46,7 +46,10 @@ def new(
     path: Annotated[Path, typer.Argument(metavar="PLAN.toml", help="The file to write.")],
     entries: Annotated[
         list[str],
-        typer.Argument(metavar="ENTRY ENTRY ...", help="Two or more: 'mlp width=64' 'vqc-native qubits=10'."),
+        typer.Argument(
+            metavar="ENTRY ENTRY ...",
+            help="Two or more: 'mlp width=64' 'vqc-native qubits=10'; tuned: 'mlp preset=FILE.toml'.",
+        ),
     ],
     task: Annotated[
         str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
@@ -87,6 +90,8 @@ def new(
     json_output: JsonOption = False,
 ) -> None:
     """Write a plan: what is compared, at which numbers of seeds, and at which error. Trains nothing.
+
+    Every pair is compared. To ask less of more entries, add [[questions]] to the file, each with its pairs.
 
     Example: qrlsuite decide new width.toml "mlp width=64" "mlp width=32" --task beam6g
     """
@@ -239,6 +244,9 @@ def _show_plan(study: DecisionStudy) -> None:
         f"seeds {format_seeds(file.block)}; any false difference with probability {file.alpha:g} "
         f"({counted(family, 'pair')}, {file.spending} spending); equal within {100 * file.margin:g} percent"
     )
+    for asked, pairs in decided.by_question(study, plan.family):
+        if asked:
+            console.print(f"  {asked} {'; '.join(' / '.join(pair) for pair in pairs)}")
     for look, seeds in enumerate(plan.looks):
         equal = plan.equal_level(look)
         words = "" if equal is None else f"; equal at p <= {equal:.4f} on both sides"
