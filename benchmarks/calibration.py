@@ -37,7 +37,7 @@ RULES = (IntervalRule(), DifferenceRule(n_resamples=1000))
 
 def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, pairs: int) -> float:
     """Return how often there is a winner if each entry keeps the interval of its own number of runs."""
-    generator, found = np.random.default_rng(0), 0
+    generator, contradictions = np.random.default_rng(0), 0
     deltas = [float(delta) for delta in grid.deltas]
     for _ in range(pairs):
         first, second = (
@@ -49,8 +49,8 @@ def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, 
             for n in (n_first, n_second)
         )
         fewer, more = first[..., 1] < second[..., 0], first[..., 0] > second[..., 1]
-        found += bool(fewer.any() != more.any())
-    return found / pairs
+        contradictions += bool(fewer.any() != more.any())
+    return contradictions / pairs
 
 
 def print_bias(entry: LearningCurves, draws: int) -> None:
@@ -58,7 +58,7 @@ def print_bias(entry: LearningCurves, draws: int) -> None:
     model, generator = SmoothedRuns(entry), np.random.default_rng(0)
     deltas = [0.5, 0.75, 0.9]
     for n_runs in (5, 10, 20, 50, 100, 1000):
-        found = [
+        estimates = [
             sample_complexity(
                 model.draw(n_runs, generator).values,
                 Grid.relative([0.2], deltas),
@@ -66,7 +66,7 @@ def print_bias(entry: LearningCurves, draws: int) -> None:
             )[0]
             for _ in range(draws)
         ]
-        means = " | ".join(f"{value / 1000:.1f}" for value in np.mean(found, axis=0))
+        means = " | ".join(f"{value / 1000:.1f}" for value in np.mean(estimates, axis=0))
         print(f"| {entry.name} | {n_runs} | {means} |", flush=True)
 
 

@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--lanes", type=int, nargs="+", default=[200, 2000])
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     kinds: dict[str, Callable[[int], Play]] = {
         "loop over single envs": loop,
         "SyncVectorEnv": sync,
@@ -82,15 +82,15 @@ def main() -> None:
         "the same, arctan": lambda count: vector(make_vector(CartPoleOptions(normalization="arctan"), count)),
     }
     print(f"{'':24}{'lanes':>8}{'us/round':>12}{'ns/step':>10}{'steps/s':>14}{'ratio':>8}")
-    for count in given.lanes:
+    for count in arguments.lanes:
         plays = {name: kind(count) for name, kind in kinds.items()}
-        actions = np.random.default_rng(0).integers(0, 2, (given.steps, count))
+        actions = np.random.default_rng(0).integers(0, 2, (arguments.steps, count))
         times: dict[str, list[float]] = {name: [] for name in plays}
-        for _ in range(given.repeats):
+        for _ in range(arguments.repeats):
             for name, play in plays.items():
                 start = time.perf_counter()
                 play(actions)
-                times[name].append((time.perf_counter() - start) / given.steps)
+                times[name].append((time.perf_counter() - start) / arguments.steps)
         slow = statistics.median(times["loop over single envs"])
         for name, values in times.items():
             took = statistics.median(values)

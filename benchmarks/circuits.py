@@ -230,41 +230,41 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="native and PennyLane only")
     parser.add_argument("--plot", help="draw milliseconds against qubits to this file")
     parser.add_argument("--bound", action="store_true", help="shares of the processor's bound, native alone")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    if given.bound:
-        print_shares(given.qubits, given.layers, given.seconds)
+    if arguments.bound:
+        print_shares(arguments.qubits, arguments.layers, arguments.seconds)
         return
     table: dict[str, dict[int, float]] = {}
-    for n in given.qubits:
-        circuit = ansatz(given.ansatz, qubits=n, layers=given.layers, gate=given.gate)
+    for n in arguments.qubits:
+        circuit = ansatz(arguments.ansatz, qubits=n, layers=arguments.layers, gate=arguments.gate)
         peers: dict[str, tuple[Call, float]] = {
             "PennyLane default.qubit": (torch_call(circuit, "pennylane", torch.float32), 1.0),
             "native float32": (torch_call(circuit, "native", torch.float32), 1.0),
             "native float64": (torch_call(circuit, "native", torch.float64), 1.0),
         }
-        if not given.quick:
+        if not arguments.quick:
             lightning = torch_call(
                 circuit, "pennylane", torch.float64, batch=4, device="lightning.qubit", diff_method="adjoint"
             )
             peers["lightning.qubit adjoint"] = (lightning, BATCH / 4)
             if n <= 4:
                 peers["Qiskit EstimatorQNN"] = (torch_call(circuit, "qiskit", torch.float64, batch=1), BATCH)
-            if n <= 12 and (given.ansatz, given.gate) == ("iqp", "rot"):
+            if n <= 12 and (arguments.ansatz, arguments.gate) == ("iqp", "rot"):
                 try:
-                    peers["JAX jit + vmap"] = (jax_call(n, given.layers), 1.0)
+                    peers["JAX jit + vmap"] = (jax_call(n, arguments.layers), 1.0)
                 except ImportError:
                     print("JAX is not installed (pip install jax): left out")
         for name, (call, scale) in peers.items():
-            table.setdefault(name, {})[n] = median_ms(call, given.seconds, scale)
+            table.setdefault(name, {})[n] = median_ms(call, arguments.seconds, scale)
             print(f"  n = {n}: {name} {table[name][n]:.3f} ms", flush=True)
     reference = table["PennyLane default.qubit"]
     print("\nms for forward and backward (ratio: PennyLane default.qubit / this)")
-    print(f"{'':26}" + "".join(f"{f'n = {n}':>20}" for n in given.qubits))
+    print(f"{'':26}" + "".join(f"{f'n = {n}':>20}" for n in arguments.qubits))
     for name, row in table.items():
-        cells = (f"{row[n]:.3g} ({reference[n] / row[n]:.3g})" if n in row else "-" for n in given.qubits)
+        cells = (f"{row[n]:.3g} ({reference[n] / row[n]:.3g})" if n in row else "-" for n in arguments.qubits)
         print(f"{name:26}" + "".join(f"{cell:>20}" for cell in cells))
-    if given.plot:
+    if arguments.plot:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(6.4, 4), layout="constrained")
@@ -274,9 +274,9 @@ def main() -> None:
         axes.set_xlabel("qubits")
         axes.set_ylabel("ms, forward and backward, batch 64")
         axes.grid(alpha=0.3)
-        axes.set_xticks(given.qubits)
+        axes.set_xticks(arguments.qubits)
         figure.legend(frameon=False, loc="outside right upper")
-        figure.savefig(given.plot, dpi=160)
+        figure.savefig(arguments.plot, dpi=160)
 
 
 if __name__ == "__main__":

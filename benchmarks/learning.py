@@ -263,23 +263,23 @@ def main() -> None:
     parser.add_argument("--preset", default="tuned", help="the task's preset that both learn with")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another setting")
     parser.add_argument("--json", type=Path, help="also write every curve to this file")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    seeds, stored = range(given.seeds), {}
-    for algorithm in given.algorithms:
-        settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *given.set]]
-        entry = resolve("cartpole", "mlp", algorithm, settings, given.preset)
-        all_runs = [ours(entry, seeds, given.epochs)]
+    seeds, stored = range(arguments.seeds), {}
+    for algorithm in arguments.algorithms:
+        settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *arguments.set]]
+        entry = resolve("cartpole", "mlp", algorithm, settings, arguments.preset)
+        all_runs = [ours(entry, seeds, arguments.epochs)]
         peers: dict[str, Callable[[Any, int], Any]] = {"SB3 PPO": sb3_ppo(entry)}
         if algorithm == "ddqn":
             peers = {"SB3 DQN": sb3_dqn(entry, False), "SB3 DQN, our update": sb3_dqn(entry, True)}
-        all_runs += [theirs(name, make, entry, seeds, given.epochs) for name, make in peers.items()]
+        all_runs += [theirs(name, make, entry, seeds, arguments.epochs) for name, make in peers.items()]
         report(all_runs)
         stored[algorithm] = {
             r.name: {"scores": r.scores.tolist(), "seconds_per_seed": r.seconds} for r in all_runs
         }
-        if given.json:
-            given.json.write_text(json.dumps(stored), encoding="utf-8")
+        if arguments.json:
+            arguments.json.write_text(json.dumps(stored), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -117,21 +117,21 @@ def main() -> None:
         "--only", default="", help="entries that have this in their name, for example qubits=14"
     )
     parser.add_argument("--write", type=Path, help="a file of reference speeds")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     machine = f"one core of {provenance.processor()}"
     calibration = statistics.median(speed.measure_calibration() for _ in range(3))
     rows: list[Row] = []
     for task, algorithm, model, options, seeds in ENTRIES:
         name = " ".join([task, algorithm, model, *(f"{key}={value}" for key, value in options.items())])
-        if given.only not in name:
+        if arguments.only not in name:
             continue
-        rows.append(measure(task, algorithm, model, options, seeds, given.epochs))
+        rows.append(measure(task, algorithm, model, options, seeds, arguments.epochs))
         print(
             f"{name}: {rows[-1]['seconds']} s per epoch and seed, {seeds} seeds together; {rows[-1]['alone']} s alone",
             flush=True,
         )
-        if given.write:
-            given.write.write_text(merge(given.write, machine, calibration, rows), encoding="utf-8")
+        if arguments.write:
+            arguments.write.write_text(merge(arguments.write, machine, calibration, rows), encoding="utf-8")
 
 
 if __name__ == "__main__":

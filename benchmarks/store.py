@@ -76,10 +76,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--epochs", type=int, default=5)
     parser.add_argument("--runs", type=Path, help="where to store; default: a temporary folder")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         print(
-            json.dumps(measure(given.task, given.seeds, given.epochs, given.runs or Path(folder)), indent=1)
+            json.dumps(
+                measure(arguments.task, arguments.seeds, arguments.epochs, arguments.runs or Path(folder)),
+                indent=1,
+            )
         )
 
 

@@ -40,8 +40,8 @@ BATCH = 64
 
 def training(model: str, settings: list[str], seeds: int, batch: int = BATCH) -> tuple[Any, torch.Tensor]:
     """Return a population's DDQN on the standard task, its replay buffer filled, and a batch's positions in it."""
-    words = [*settings, f"algorithm.batch={batch}"]
-    entry = resolve("beam6g", model, settings=[parse_setting(word) for word in words])
+    settings_text = [*settings, f"algorithm.batch={batch}"]
+    entry = resolve("beam6g", model, settings=[parse_setting(word) for word in settings_text])
     streams = [Streams(entry.task.hash, seed) for seed in parse_seeds(f"0:{seeds}")]
     envs = build_envs(entry, 10 * seeds, lambda: None)
     envs.seed_lanes([s.numpy("environment", lane) for s in streams for lane in range(10)])
@@ -68,11 +68,11 @@ def parts(qubits: int, seeds: int, seconds: float) -> dict[str, float]:
     ddqn, picked = training("vqc-native", [f"qubits={qubits}"], seeds)
     spent = dict.fromkeys(("circuit", "environment"), 0.0)
 
-    def timed(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             start = time.process_time()
             result = function(*arguments, **named)
-            spent[what] += time.process_time() - start
+            spent[part] += time.process_time() - start
             return result
 
         return call
@@ -144,22 +144,22 @@ def main() -> None:
     parser.add_argument(
         "--controls", type=int, nargs="+", metavar="QUBITS", help="print the table of controls"
     )
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    if given.controls:
-        print_controls(given.controls, given.seconds)
+    if arguments.controls:
+        print_controls(arguments.controls, arguments.seconds)
         return
     for seeds in (1, 16, 100):
         print(
-            f"mlp width=64, {seeds} seeds: {median_ms(update('mlp', [], seeds), given.seconds) / seeds:.3f} ms"
+            f"mlp width=64, {seeds} seeds: {median_ms(update('mlp', [], seeds), arguments.seconds) / seeds:.3f} ms"
         )
-    for n in given.qubits:
+    for n in arguments.qubits:
         base: dict[int, float] = {}
         for model in ("vqc-pennylane", "vqc-native", *(("vqc-qiskit",) if n <= 4 else ())):
             batch = 2 if model == "vqc-qiskit" else BATCH
             for seeds in (1, 16) if batch == BATCH else (1,):
                 call = update(model, [f"qubits={n}"], seeds, batch)
-                ms = median_ms(call, given.seconds, BATCH / batch) / seeds
+                ms = median_ms(call, arguments.seconds, BATCH / batch) / seeds
                 base.setdefault(seeds, ms)
                 print(
                     f"{model} qubits={n}, {seeds} seeds: {ms:.3f} ms per seed (ratio {base[seeds] / ms:.3g})",
@@ -167,7 +167,7 @@ def main() -> None:
                 )
         for seeds in (1, 10):
             shares = ", ".join(
-                f"{name} {share:.0%}" for name, share in parts(n, seeds, given.seconds).items()
+                f"{name} {share:.0%}" for name, share in parts(n, seeds, arguments.seconds).items()
             )
             print(f"a round of training, vqc-native qubits={n}, {seeds} seeds: {shares}", flush=True)
 

@@ -185,9 +185,9 @@ def print_seeds(pairs: int) -> None:
     head(f"Decision plan, {count} studies", "pair", "first", "second", "trade-off", "equal", "mean runs")
     for name, first, second in rivals(ENTRIES):
         rates = decision_rates([first, second], plan, GRID, count, seed=5)
-        found = rates.verdicts[0]
+        shares = rates.verdicts[0]
         kinds = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF, Decided.EQUAL)
-        line(name, *(found[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")
+        line(name, *(shares[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")
 
 
 def print_equals(pairs: int) -> None:
@@ -208,8 +208,8 @@ def print_power(pairs: int) -> None:
         for n_runs in SIZES:
             drawn = simulated_pairs(first, second, n_runs, n_runs, count, seed=7)
             for rates in judge(drawn, GRID, RULES):
-                found = rates.first_wins, rates.second_wins, rates.any_cell - rates.winner
-                line(pair, n_runs, rates.rule, *found)
+                shares = rates.first_wins, rates.second_wins, rates.any_cell - rates.winner
+                line(pair, n_runs, rates.rule, *shares)
 
 
 def print_boards(pairs: int) -> None:

@@ -57,7 +57,7 @@ class AcrossBoard:
     """The result of `compare`."""
 
     shares: Shares
-    found: AcrossTasks
+    results: AcrossTasks
     alpha: float
 
     @property
@@ -71,8 +71,8 @@ class AcrossBoard:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Indices in `found` by mean, least first."""
-        return self.found.order
+        """Indices in `results` by mean, least first."""
+        return self.results.order
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -94,14 +94,14 @@ class AcrossBoard:
 
     def cells(self, place: int) -> tuple[str, ...]:
         """Return the row at a place of the order as text."""
-        index, found = self.order[place], self.found
+        index, results = self.order[place], self.results
         after = self.order[place + 1] if place + 1 < len(self.order) else None
         return (
-            found.names[index],
-            ", ".join(str(len(each)) for each in self.shares.values[found.names[index]]),
-            _interval(found.mean[index], found.mean_interval[index]),
-            _interval(found.interquartile_mean[index], found.interquartile_interval[index]),
-            "-" if after is None else f"{found.improvement[index, after]:.2f}",
+            results.names[index],
+            ", ".join(str(len(each)) for each in self.shares.values[results.names[index]]),
+            _interval(results.mean[index], results.mean_interval[index]),
+            _interval(results.interquartile_mean[index], results.interquartile_interval[index]),
+            "-" if after is None else f"{results.improvement[index, after]:.2f}",
             ", ".join(self._against(index, 1)) or "-",
             ", ".join(self._against(index, -1)) or "-",
         )
@@ -118,7 +118,7 @@ class AcrossBoard:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
-        order, found = list(self.order), self.found
+        order, results = list(self.order), self.results
         return {
             "tasks": [
                 {"task": task, "horizon": horizon}
@@ -127,21 +127,21 @@ class AcrossBoard:
             "alpha": self.alpha,
             "entries": [
                 {
-                    "label": found.names[index],
-                    "seeds": [len(each) for each in self.shares.values[found.names[index]]],
-                    "mean": float(found.mean[index]),
-                    "mean_interval": found.mean_interval[index].tolist(),
-                    "interquartile_mean": float(found.interquartile_mean[index]),
-                    "interquartile_interval": found.interquartile_interval[index].tolist(),
+                    "label": results.names[index],
+                    "seeds": [len(each) for each in self.shares.values[results.names[index]]],
+                    "mean": float(results.mean[index]),
+                    "mean_interval": results.mean_interval[index].tolist(),
+                    "interquartile_mean": float(results.interquartile_mean[index]),
+                    "interquartile_interval": results.interquartile_interval[index].tolist(),
                 }
                 for index in order
             ],
-            "improvement": found.improvement[np.ix_(order, order)].tolist(),
+            "improvement": results.improvement[np.ix_(order, order)].tolist(),
             "adjusted_p": [
                 [None if math.isnan(p) else float(p) for p in row]
-                for row in found.adjusted[np.ix_(order, order)]
+                for row in results.adjusted[np.ix_(order, order)]
             ],
-            "better": found.better[np.ix_(order, order)].tolist(),
+            "better": results.better[np.ix_(order, order)].tolist(),
             "refused": list(self.refused),
         }
 
@@ -149,7 +149,7 @@ class AcrossBoard:
         """Return one row of columns per entry, for a spreadsheet."""
         rows: list[dict[str, object]] = []
         for index in self.order:
-            name, found = self.found.names[index], self.found
+            name, results = self.results.names[index], self.results
             others = [other for other in self.order if other != index]
             rows.append(
                 {
@@ -157,17 +157,17 @@ class AcrossBoard:
                     "tasks": list(self.shares.tasks),
                     "horizons": [str(horizon) for horizon in self.shares.horizons],
                     "seeds": [str(len(each)) for each in self.shares.values[name]],
-                    "mean": float(found.mean[index]),
-                    "mean_low": float(found.mean_interval[index, 0]),
-                    "mean_high": float(found.mean_interval[index, 1]),
-                    "iqm": float(found.interquartile_mean[index]),
-                    "iqm_low": float(found.interquartile_interval[index, 0]),
-                    "iqm_high": float(found.interquartile_interval[index, 1]),
+                    "mean": float(results.mean[index]),
+                    "mean_low": float(results.mean_interval[index, 0]),
+                    "mean_high": float(results.mean_interval[index, 1]),
+                    "iqm": float(results.interquartile_mean[index]),
+                    "iqm_low": float(results.interquartile_interval[index, 0]),
+                    "iqm_high": float(results.interquartile_interval[index, 1]),
                     "improvement": [
-                        f"{found.names[other]}: {found.improvement[index, other]:.4g}" for other in others
+                        f"{results.names[other]}: {results.improvement[index, other]:.4g}" for other in others
                     ],
                     "adjusted_p": [
-                        f"{found.names[other]}: {found.adjusted[index, other]:.6g}" for other in others
+                        f"{results.names[other]}: {results.adjusted[index, other]:.6g}" for other in others
                     ],
                     "needs_less_than": self._against(index, 1),
                     "needs_more_than": self._against(index, -1),
@@ -177,7 +177,9 @@ class AcrossBoard:
         return rows
 
     def _against(self, index: int, sign: int) -> list[str]:
-        return [self.found.names[other] for other in self.order if self.found.better[index, other] == sign]
+        return [
+            self.results.names[other] for other in self.order if self.results.better[index, other] == sign
+        ]
 
 
 def collected(
@@ -210,16 +212,16 @@ def collected(
     if len(tasks) < 2:
         raise OptionError(f"--across {' '.join(tasks)}: name two tasks or more; `qrlsuite runs` lists them")
     lookup.check_tasks(runs, *tasks)
-    found, refused = list[EntryCurves](), list[str]()
+    selected, refused = list[EntryCurves](), list[str]()
     for task in tasks:
-        there, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)
-        if not there:
+        of_task, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)
+        if not of_task:
             raise UnknownNameError(
                 f"--across: {runs} holds no results of task {task}: qrlsuite run --task {task}"
             )
-        found += there
+        selected += of_task
         refused += [f"{task}: {line}" for line in left_out]
-    return found, refused
+    return selected, refused
 
 
 def shares(
@@ -273,20 +275,20 @@ def shares(
                 by_configuration[key][task] = reached
     values: dict[str, tuple[FloatArray, ...]] = {}
     seen = Counter(labels.values())
-    for key, found in by_configuration.items():
+    for key, by_task in by_configuration.items():
         name = labels[key] if seen[labels[key]] == 1 else f"{labels[key]} {key[:8]}"
-        missing = [task for task in tasks if task not in found]
-        few = [task for task in tasks if task in found and len(found[task].seeds) < least]
+        missing = [task for task in tasks if task not in by_task]
+        few = [task for task in tasks if task in by_task and len(by_task[task].seeds) < least]
         if missing:
             lines.append(f"{name}: no result with these options on {listed(missing)}")
         elif few:
-            count = len(found[few[0]].seeds)
+            count = len(by_task[few[0]].seeds)
             lines.append(
                 f"{name}: {count} seed{'s' * (count != 1)} on {few[0]}, fewer than {least}: undecided"
             )
         else:
             values[name] = tuple(
-                horizon_shares(learning_curves(found[task]).cut(end), ranking_of([found[task]]).grid)
+                horizon_shares(learning_curves(by_task[task]).cut(end), ranking_of([by_task[task]]).grid)
                 for task, end in zip(tasks, horizons)
             )
     if not values:
@@ -318,8 +320,8 @@ def compare(
     OptionError
         If no configuration is left, or `alpha` is not between 0 and 1.
     """
-    there = shares(entries, tasks, horizon, refused, MIN_RUNS)
-    return AcrossBoard(there, across_tasks(there.values, alpha), alpha)
+    configurations = shares(entries, tasks, horizon, refused, MIN_RUNS)
+    return AcrossBoard(configurations, across_tasks(configurations.values, alpha), alpha)
 
 
 def configuration(entry: EntryCurves) -> str:

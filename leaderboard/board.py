@@ -285,17 +285,17 @@ def build(
 
 
 def _by_horizon(
-    entries: Sequence[EntryCurves], wanted: int | None
+    entries: Sequence[EntryCurves], requested: int | None
 ) -> list[tuple[int, bool, list[EntryCurves]]]:
     """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
     horizons = sorted(ranking_of(entries).horizons)
     groups = []
-    for horizon in horizons if wanted is None else [wanted]:
+    for horizon in horizons if requested is None else [requested]:
         reached = [entry.reaching(horizon // entry.steps_per_epoch) for entry in entries]
         members = [entry for entry in reached if entry is not None]
         if members:
             groups.append((horizon, horizon < horizons[0], members))
-    if wanted is not None:
+    if requested is not None:
         return groups
     short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
     lengths = sorted({_length(entry) for entry in short}, reverse=True)
@@ -333,7 +333,7 @@ def _section(
     board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
     by_name = {entry.name: entry for entry in entries}
     labels = {entry.name: entry.label for entry in entries}
-    wanted = entries[0].task_file.protocol.seeds
+    protocol_seeds = entries[0].task_file.protocol.seeds
     rows = []
     places, better = board.ranking, board.better_cells
     capped = {place.name for place in places.not_reached}
@@ -351,7 +351,7 @@ def _section(
                 losses=int(better[:, board.names.index(place.name)].sum()),
                 outperforms=tuple(labels[name] for name in place.outperforms),
                 outperformed_by=tuple(labels[name] for name in place.outperformed_by),
-                provisional=len(entry.seeds) < wanted,
+                provisional=len(entry.seeds) < protocol_seeds,
                 not_reached=place.name in capped,
                 rests_on=_support(board, place.rests_on, labels),
             )
@@ -453,8 +453,8 @@ def compare_entries(
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
     grid = ranking_of([first, second]).grid
-    found = compare(learning_curves(first), learning_curves(second), grid, rule)
-    values = {field.name: getattr(found, field.name) for field in fields(found)}
+    comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
+    values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
     remarks = [
         f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
         for entry in (first, second)

@@ -190,26 +190,26 @@ def choose(
     lines: list[str] = []
     if names:
         tasks = [task] if task else []
-        found = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
+        entries = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
     else:
-        found, refused = collect.collect(runs, task, published=published)
+        entries, refused = collect.collect(runs, task, published=published)
         lines += refused
-    lines += [f"{entry.label}: a single seed has no spread" for entry in found if len(entry.seeds) < 2]
-    found = [entry for entry in found if len(entry.seeds) >= 2]
-    if not found:
-        wanted = f" of task {task}" if task else ""
-        raise UnknownNameError(f"{runs} holds no entry{wanted} with two seeds or more: qrlsuite run")
-    tasks = sorted({entry.task for entry in found})
-    if len({entry.task_hash for entry in found}) > 1:
+    lines += [f"{entry.label}: a single seed has no spread" for entry in entries if len(entry.seeds) < 2]
+    entries = [entry for entry in entries if len(entry.seeds) >= 2]
+    if not entries:
+        of_task = f" of task {task}" if task else ""
+        raise UnknownNameError(f"{runs} holds no entry{of_task} with two seeds or more: qrlsuite run")
+    tasks = sorted({entry.task for entry in entries})
+    if len({entry.task_hash for entry in entries}) > 1:
         raise OptionError(f"the entries belong to several tasks ({', '.join(tasks)}): choose one with --task")
-    longest = max(entry.curves.shape[1] for entry in found)
+    longest = max(entry.curves.shape[1] for entry in entries)
     lines += [
         f"{entry.label}: at epoch {entry.curves.shape[1]} of {longest}; repeat the `qrlsuite run` that made it"
-        for entry in found
+        for entry in entries
         if entry.curves.shape[1] < longest
     ]
-    found = [entry for entry in found if entry.curves.shape[1] == longest]
-    return sorted(found, key=lambda entry: (entry.model, sum(entry.parameters), entry.label)), lines
+    entries = [entry for entry in entries if entry.curves.shape[1] == longest]
+    return sorted(entries, key=lambda entry: (entry.model, sum(entry.parameters), entry.label)), lines
 
 
 def prepare(entries: Sequence[EntryCurves]) -> Setup:
@@ -372,7 +372,7 @@ def _decisions(models: Sequence[SmoothedRuns], grid: Grid, draws: int, factor: f
 
     def measure(count: int, tick: Callable[[], object] | None) -> CalibrationResult:
         rates = decision_rates(models, plan, grid, count, tick=tick)
-        found = rates.verdicts[0]
+        shares = rates.verdicts[0]
         pairs = len(rates.verdicts)
         return CalibrationResult(
             "decisions",
@@ -380,9 +380,9 @@ def _decisions(models: Sequence[SmoothedRuns], grid: Grid, draws: int, factor: f
             TimesRule().name,
             (plan.looks[-1], plan.looks[-1]),
             count,
-            rates.any_difference if factor is None else found[Decided.FIRST],
+            rates.any_difference if factor is None else shares[Decided.FIRST],
             factor=factor,
-            wrong=None if factor is None else found[Decided.SECOND],
+            wrong=None if factor is None else shares[Decided.SECOND],
             entries=len(models),
             equal=sum(each[Decided.EQUAL] for each in rates.verdicts) / pairs,
             mean_seeds=sum(rates.mean_runs) / pairs,

@@ -47,15 +47,15 @@ def collect(
         if entry is None:
             continue
         good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
-    found = []
+    entries = []
     for copies in good.values():
         shown = _shown(copies) if published else copies[-1:]
-        found += shown
+        entries += shown
         for other in copies if published and len(shown) < len(copies) else ():
             if other is not shown[0]:
                 size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
                 refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
-    return found, refused
+    return entries, refused
 
 
 def select(
@@ -98,13 +98,13 @@ def select(
             [name] if isinstance(name, EntryCurves) else _shown(_read_copies(runs, name, published, tasks))
         )
     }
-    found, left_out = list(named.values()), list[str]()
+    entries, left_out = list(named.values()), list[str]()
     if not named:
-        found, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published)
-        found = [entry for entry in found if not tasks or entry.task in tasks]
-    there = len(found)
+        entries, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published)
+        entries = [entry for entry in entries if not tasks or entry.task in tasks]
+    n_read = len(entries)
     kept = []
-    for entry in found:
+    for entry in entries:
         if horizon is not None and (horizon < 1 or horizon % entry.steps_per_epoch):
             epochs = max(1, round(horizon / entry.steps_per_epoch))
             raise OptionError(
@@ -121,8 +121,8 @@ def select(
             left_out.append(f"{entry.label}: {count} seed{'s' * (count != 1)}, fewer than {min_seeds}")
         else:
             kept.append(reached)
-    if there and not kept:
-        raise UnknownNameError(f"no entry is left: {'; '.join(left_out[-there:])}")
+    if n_read and not kept:
+        raise UnknownNameError(f"no entry is left: {'; '.join(left_out[-n_read:])}")
     return kept, left_out
 
 
@@ -179,14 +179,14 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
         unique = list({entry.key: entry for entry in everything}.values())
         key = lookup.choose(unique, name, _place(runs, tasks)).key
         folders = [entry.store for entry in everything if entry.key == key]
-    found = [entry for entry in map(read, folders) if entry is not None]
-    if not found:
+    copies = [entry for entry in map(read, folders) if entry is not None]
+    if not copies:
         raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
-    if tasks and found[0].task not in tasks:
+    if tasks and copies[0].task not in tasks:
         raise UnknownNameError(
-            f"{name} is an entry of task {found[0].task}, not of {' or '.join(sorted(tasks))}"
+            f"{name} is an entry of task {copies[0].task}, not of {' or '.join(sorted(tasks))}"
         )
-    return found
+    return copies
 
 
 def _shown(copies: Sequence[EntryCurves]) -> list[EntryCurves]:

@@ -154,10 +154,10 @@ class EntryCurves:
         }
 
     def __rich__(self) -> Table:
-        found = Table(show_header=False, box=None, pad_edge=False)
+        table = Table(show_header=False, box=None, pad_edge=False)
         for name, text in self.facts.items():
-            found.add_row(Text(name), Text(text))
-        return found
+            table.add_row(Text(name), Text(text))
+        return table
 
     def _repr_html_(self) -> str:
         rows = (f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts.items())
@@ -184,7 +184,7 @@ class EntryCurves:
     @property
     def mixed_versions(self) -> tuple[str, ...]:
         """The distributions of which more than one version made the runs."""
-        return tuple(name for name, found in self.versions.items() if len(found) > 1)
+        return tuple(name for name, used in self.versions.items() if len(used) > 1)
 
     @property
     def first_network_alone(self) -> bool:
@@ -192,8 +192,10 @@ class EntryCurves:
 
         DDQN trains one network, and so does REINFORCE unless its baseline is one.
         """
-        given = self.identity.get("algorithm_options", {})
-        one = {"ddqn": True, "reinforce": given.get("baseline") != "value"}.get(self.algorithm, False)
+        algorithm_options = self.identity.get("algorithm_options", {})
+        one = {"ddqn": True, "reinforce": algorithm_options.get("baseline") != "value"}.get(
+            self.algorithm, False
+        )
         return self.networks is None and not one
 
     @property

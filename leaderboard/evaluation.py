@@ -135,7 +135,7 @@ class Evaluation(Shown):
             table.add_column(Text(name), justify="left" if name in ("policy", "parameters") else "right")
         for each in self.entanglement:
             for which in PARAMETERS:
-                means = [f"{np.nanmean(found[which]):.3f}" for found in each.values.values()]
+                means = [f"{np.nanmean(by_network[which]):.3f}" for by_network in each.values.values()]
                 table.add_row(Text(each.name), Text(which), *means, str(each.qubits // 2))
         return table
 
@@ -154,11 +154,11 @@ class Evaluation(Shown):
         return notes
 
 
-def _row(played: Played, what: str) -> list[str]:
-    content = played.summary()[what]
+def _row(played: Played, label: str) -> list[str]:
+    content = played.summary()[label]
     if content is None:
         return []
-    digits = 3 if what == "score" else 2
+    digits = 3 if label == "score" else 2
     return [f"{content[name]:.{digits}f}" for name in ("mean", "p50", "p5", "p95")]
 
 

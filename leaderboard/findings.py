@@ -9,9 +9,9 @@ from qrlsuite.leaderboard.calibration import PARTS, CalibrationResult
 HEAD = ["entry", "seeds", "rule", "cell, worst", "any cell", "a winner"]
 
 
-def tables(found: Sequence[CalibrationResult], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
+def tables(results: Sequence[CalibrationResult], cells: int, board: int) -> list[tuple[str, list[list[str]]]]:
     """Return what was found as tables: a sentence, and rows of which the first is the head."""
-    parts = {name: [each for each in found if each.part == name] for name in PARTS}
+    parts = {name: [each for each in results if each.part == name] for name in PARTS}
     result = []
     if halves := parts["halves"]:
         rows = [[each.entry, _seeds(each), each.rule, *_cells(each), f"{each.winner:.1%}"] for each in halves]
@@ -84,9 +84,9 @@ def _plans(plans: Sequence[CalibrationResult]) -> tuple[str, list[list[str]]]:
     return sentence, [["entry", "against", "differ", "wrong", "equal", "seeds"], *rows]
 
 
-def summary(found: Sequence[CalibrationResult], rule: str, board: int) -> str:
+def summary(results: Sequence[CalibrationResult], rule: str, board: int) -> str:
     """Return in one sentence what was found about a rule."""
-    own = [each for each in found if each.rule == rule]
+    own = [each for each in results if each.rule == rule]
     equal = [each for each in own if each.part == "pairs" and each.n_runs[0] == each.n_runs[1]]
     parts = []
     if equal:

@@ -10,14 +10,14 @@ from qrlsuite.results import provenance as machine
 
 def versions(provenance: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
     """Return every version that occurs, by distribution; Python's under "python"."""
-    found: dict[str, set[str]] = {}
+    by_package: dict[str, set[str]] = {}
     for origin in provenance:
         packages = origin.get("versions")
         named = {**(packages if isinstance(packages, Mapping) else {}), "python": origin.get("python")}
         for name, version in named.items():
             if isinstance(version, str):
-                found.setdefault(str(name), set()).add(version)
-    return {name: tuple(sorted(found[name])) for name in sorted(found)}
+                by_package.setdefault(str(name), set()).add(version)
+    return {name: tuple(sorted(by_package[name])) for name in sorted(by_package)}
 
 
 def texts(provenance: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]:

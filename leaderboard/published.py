@@ -304,14 +304,14 @@ def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:
     """Read a parquet file that must hold exactly these columns, without empty cells."""
     try:
         file = pyarrow.parquet.ParquetFile(path)
-        found = {
+        types = {
             field.name: "list<double>"
             if pyarrow.types.is_list(field.type) and pyarrow.types.is_float64(field.type.value_type)
             else str(field.type)
             for field in file.schema_arrow
         }
-        if found != dict(columns):
-            raise StoreError(f"{path}: columns are {found}, and should be {dict(columns)}")
+        if types != dict(columns):
+            raise StoreError(f"{path}: columns are {types}, and should be {dict(columns)}")
         meta = file.metadata
         size = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
         if size > MAX_BYTES or meta.num_rows * 8 > MAX_BYTES:

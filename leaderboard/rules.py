@@ -77,22 +77,22 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     """
     registered = registry.load().get("significance_tests", name)
     spec = cast(SignificanceTestSpec, registered.spec)
-    where = f"significance test '{name}' of distribution '{registered.distribution}'"
+    origin = f"significance test '{name}' of distribution '{registered.distribution}'"
     try:
         rule = resolve(spec.factory)()
     except Exception as error:
-        raise PluginError(f"{where}: {spec.factory} fails: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{origin}: {spec.factory} fails: {type(error).__name__}: {error}") from error
     if registered.distribution == "qrlsuite":
         return cast(SignificanceRule, rule)
     if not isinstance(rule, SignificanceRule) or not callable(rule):
         raise PluginError(
-            f"{where}: {type(rule).__name__} is no rule: it needs a name, a promise and "
+            f"{origin}: {type(rule).__name__} is no rule: it needs a name, a promise and "
             "__call__(first, second), see qrlsuite.statistics.SignificanceRule"
         )
     promise = rule.promise
     if not isinstance(promise, str) or not promise.strip():
-        raise PluginError(f"{where}: its promise must be a sentence, not {promise!r}")
-    return _Fenced(rule, name, promise, where)
+        raise PluginError(f"{origin}: its promise must be a sentence, not {promise!r}")
+    return _Fenced(rule, name, promise, origin)
 
 
 class _Fenced:
@@ -110,8 +110,8 @@ class _Fenced:
         What to call it in messages.
     """
 
-    def __init__(self, rule: SignificanceRule, name: str, promise: str, where: str) -> None:
-        self._rule, self._where = rule, where
+    def __init__(self, rule: SignificanceRule, name: str, promise: str, origin: str) -> None:
+        self._rule, self._origin = rule, origin
         self.name = name
         self.promise = promise
         self.paired = bool(getattr(rule, "paired", False))
@@ -130,6 +130,6 @@ class _Fenced:
         try:
             return check_signs(judge(), shape, self)
         except OptionError as error:
-            raise PluginError(f"{self._where}: {error}") from error
+            raise PluginError(f"{self._origin}: {error}") from error
         except Exception as error:
-            raise PluginError(f"{self._where} fails: {type(error).__name__}: {error}") from error
+            raise PluginError(f"{self._origin} fails: {type(error).__name__}: {error}") from error

@@ -70,18 +70,18 @@ def check(study: Study) -> None:
         If a picture is unknown, or a setting is unknown or has a bad value.
     """
     for place, picture in enumerate(study.file.pictures):
-        where = f"{study.source}: pictures.{place}"
+        location = f"{study.source}: pictures.{place}"
         if picture.kind not in pictures.KINDS:
             raise UnknownNameError(
-                f"{where}.kind: unknown picture '{picture.kind}'{nearest(picture.kind, pictures.KINDS)}"
+                f"{location}.kind: unknown picture '{picture.kind}'{nearest(picture.kind, pictures.KINDS)}"
             )
         kind = pictures.KINDS[picture.kind]
-        options.build(specs.resolve(kind.options), picture.settings, f"{where}.settings")
+        options.build(specs.resolve(kind.options), picture.settings, f"{location}.settings")
         if kind.data is None and picture.entries:
-            raise OptionError(f"{where}.entries: picture '{picture.kind}' shows no entries")
+            raise OptionError(f"{location}.entries: picture '{picture.kind}' shows no entries")
         if (picture.evaluation is not None) != (kind.data == "episodes"):
             rule = "needs" if kind.data == "episodes" else "takes no"
-            raise OptionError(f"{where}.evaluation: picture '{picture.kind}' {rule} evaluation")
+            raise OptionError(f"{location}.evaluation: picture '{picture.kind}' {rule} evaluation")
 
 
 def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
@@ -92,15 +92,15 @@ def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
     StoreError
         If an entry's folder is damaged.
     """
-    found = {}
+    curves_by_name = {}
     for member in members:
         store = EntryStore.find(runs, member.entry)
-        if member.entry.name in found or not (store.path / "entry.json").exists():
+        if member.entry.name in curves_by_name or not (store.path / "entry.json").exists():
             continue
         curves = read_entry(store)
         if curves is not None:
-            found[member.entry.name] = curves
-    return found
+            curves_by_name[member.entry.name] = curves
+    return curves_by_name
 
 
 def draw(
@@ -122,12 +122,12 @@ def draw(
         If an entry's folder is damaged.
     """
     check(study)
-    there = read(runs, members)
+    curves_by_name = read(runs, members)
     drawn = []
     for picture in study.file.pictures:
         shown = [m for m in members if not picture.entries or m.group in picture.entries]
         unique = {member.entry.name: member for member in shown}
-        present = [there[name] for name in unique if name in there]
+        present = [curves_by_name[name] for name in unique if name in curves_by_name]
         longest = max((_steps(entry) for entry in present), default=0)
         entries = [entry for entry in present if _steps(entry) == longest]
         counts = {entry.name: len(entry.seeds) for entry in entries}

@@ -86,8 +86,8 @@ def notes(section: Section) -> list[str]:
             "both are at the cap"
         )
     if any(row.provisional for row in section.rows):
-        wanted = section.rows[0].entry.task_file.protocol.seeds
-        lines.append(f"* provisional: the protocol asks for {wanted} seeds")
+        protocol_seeds = section.rows[0].entry.task_file.protocol.seeds
+        lines.append(f"* provisional: the protocol asks for {protocol_seeds} seeds")
     if any(row.reference.unsettled for row in section.rows):
         lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
     if any(row.entry.parameters[1] for row in section.rows):
@@ -177,7 +177,7 @@ def section_table(section: Section, width: int = WIDE) -> Table:
     shown = [name for name in COLUMNS if name not in left_out]
     if left_out:
         remarks.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
-    found = table(
+    result = table(
         shown,
         title=title(section),
         caption="\n".join(remarks),
@@ -186,8 +186,8 @@ def section_table(section: Section, width: int = WIDE) -> Table:
     )
     for row in section.rows:
         texts = dict(zip(COLUMNS, cells(section, row)))
-        found.add_row(*(Text(texts[name]) for name in shown))
-    return found
+        result.add_row(*(Text(texts[name]) for name in shown))
+    return result
 
 
 def table(
@@ -211,7 +211,7 @@ def table(
     fixed:
         Columns that are never broken into several lines.
     """
-    found = Table(
+    result = Table(
         title=None if title is None else Text(title),
         title_justify="left",
         header_style="bold",
@@ -222,8 +222,8 @@ def table(
     )
     for name in columns:
         justify: Literal["left", "right"] = "left" if name in left else "right"
-        found.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
-    return found
+        result.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
+    return result
 
 
 NARROW = 105
@@ -250,7 +250,7 @@ def times_table(section: Section, width: int = WIDE) -> Table:
         )
     kept = [place for place, name in enumerate(columns) if name not in left_out]
     shown = [columns[place] for place in kept]
-    found = table(
+    result = table(
         shown,
         title=times_title(section),
         caption="\n".join(remarks),
@@ -259,18 +259,18 @@ def times_table(section: Section, width: int = WIDE) -> Table:
     )
     for row in times.rows:
         texts = times.cells(row)
-        found.add_row(*(Text(texts[place]) for place in kept))
-    return found
+        result.add_row(*(Text(texts[place]) for place in kept))
+    return result
 
 
 def across_table(board: AcrossBoard) -> Table:
     """Return a comparison over several tasks as a table."""
     columns = board.columns()
     fixed = [name for name in columns if name not in NAMES]
-    found = table(columns, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed)
+    result = table(columns, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed)
     for place in range(len(board.order)):
-        found.add_row(*map(Text, board.cells(place)))
-    return found
+        result.add_row(*map(Text, board.cells(place)))
+    return result
 
 
 def markdown(board: Leaderboard) -> str:
@@ -393,19 +393,19 @@ def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
 def comparison_table(comparison: Comparison) -> Table:
     """Return a comparison as a table: a sign per cell of the grid."""
     heading, rows, deltas = _levels(comparison)
-    found = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(heading), title_justify="left")
-    found.add_column("", justify="right")
+    result = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(heading), title_justify="left")
+    result.add_column("", justify="right")
     for delta in deltas:
-        found.add_column(Text(delta), justify="center")
+        result.add_column(Text(delta), justify="center")
     for name, verdicts in zip(rows, comparison.verdicts):
-        found.add_row(Text(name), *(Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts))
-    return found
+        result.add_row(Text(name), *(Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts))
+    return result
 
 
 def legend(comparison: Comparison) -> str:
     """Explain the signs that occur in a comparison's table."""
-    there = {str(verdict) for row in comparison.verdicts for verdict in row}
-    return ", ".join(f"{sign} {words}" for name, (sign, _, words) in SYMBOLS.items() if name in there)
+    occurring = {str(verdict) for row in comparison.verdicts for verdict in row}
+    return ", ".join(f"{sign} {meaning}" for name, (sign, _, meaning) in SYMBOLS.items() if name in occurring)
 
 
 def comparison_html(comparison: Comparison, headline: str, further: Sequence[str] = ()) -> str:

@@ -82,13 +82,13 @@ def sources(folder: Path) -> list[EntryStore]:
     """
     if (folder / "entry.json").is_file():
         return [EntryStore(folder.resolve())]
-    found = entries(folder) if folder.is_dir() else []
-    if not found:
+    stores = entries(folder) if folder.is_dir() else []
+    if not stores:
         raise StoreError(
             f"{folder} holds no entry: give a results folder, a folder that `qrlsuite export` wrote, or one entry's "
             "folder in it (the one with entry.json)"
         )
-    return found
+    return stores
 
 
 def take_over(source: EntryStore, runs: Path) -> TakenOver:
@@ -115,14 +115,14 @@ def take_over(source: EntryStore, runs: Path) -> TakenOver:
     seeds = [seed for seed in held if seed < TUNING_SEEDS]
     if not seeds:
         raise StoreError(f"{source.path} holds no seed")
-    found = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
-    for run in found.values():  # all of them, before anything is written
+    runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
+    for run in runs_by_seed.values():  # all of them, before anything is written
         _check(run, entry, source.seed(run.seed))
     store = EntryStore.create(runs, entry)
     claim = acquire(store, seeds)
     try:
         return (
-            _from_runs(source, found, entry, store)
+            _from_runs(source, runs_by_seed, entry, store)
             if exported is None
             else _from_export(exported, entry, store)
         )
@@ -276,11 +276,11 @@ def _differences(seeds: Sequence[int]) -> list[str]:
 def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:
     """Say which versions the seeds were made with, where they are not those that are installed here."""
     here = provenance.collect(entry.distributions())["versions"]
-    there = origin.versions(list(made_with))
-    wanted = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}
+    versions_there = origin.versions(list(made_with))
+    relevant = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}
     other = [
         f"{name} {', '.join(known)} (here {here[name]})"
-        for name, known in there.items()
-        if name in wanted and name in here and set(known) != {here[name]}
+        for name, known in versions_there.items()
+        if name in relevant and name in here and set(known) != {here[name]}
     ]
     return [f"made with {'; '.join(other)}; boards say where versions mix"] if other else []

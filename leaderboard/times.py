@@ -253,7 +253,7 @@ class TimeRanking:
 
     def _thresholds(self, i: int, j: int) -> str:
         """Name the thresholds at which an entry needs significantly fewer steps than another."""
-        levels = [level for level, found in zip(self.levels, self.board.signs[i, j]) if found > 0]
+        levels = [level for level, sign in zip(self.levels, self.board.signs[i, j]) if sign > 0]
         return f"{self.kind} {', '.join(levels)}" if levels else ""
 
     def _label(self, index: int) -> str:

@@ -69,12 +69,12 @@ def find(path: Path) -> list[Path]:
     """
     if (path / "entry.json").exists():
         return [path]
-    found = sorted(
+    folders = sorted(
         {p.parent for p in path.glob("*/*/entry.json")} | {p.parent for p in path.glob("*/entry.json")}
     )
-    if not found:
+    if not folders:
         raise QrlSuiteError(f"{path} holds no published entry: qrlsuite export ENTRY --out {path}")
-    return found
+    return folders
 
 
 def verify(
@@ -130,14 +130,14 @@ def _beginning(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
         "the first epoch's episodes": (here.episodes, stated.episodes),
         "the score before training": (here.before, stated.before),
     }
-    for words, (computed, published_values) in parts.items():
-        given = published_values[list(places)]
-        if computed.shape != given.shape:
-            return f"seeds {_list(seeds)}: {words} are of another number"
-        away = np.abs(computed - given) > AGREEMENT * np.maximum(1, np.abs(given))
+    for name, (computed, published_values) in parts.items():
+        published_part = published_values[list(places)]
+        if computed.shape != published_part.shape:
+            return f"seeds {_list(seeds)}: {name} are of another number"
+        away = np.abs(computed - published_part) > AGREEMENT * np.maximum(1, np.abs(published_part))
         if away.any():
-            most = np.abs(computed - given).max()
-            return f"seeds {_list(seeds)}: {words} differ by {most:.2g}, more than {AGREEMENT:g}"
+            most = np.abs(computed - published_part).max()
+            return f"seeds {_list(seeds)}: {name} differ by {most:.2g}, more than {AGREEMENT:g}"
     return None
 
 
@@ -166,18 +166,18 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
     """
     here = provenance.collect(made_by.distributions())
     for place in places:
-        there = entry.provenance[place]
-        if provenance.device_kind(there) != "cpu":
-            name = there["device"].get("name", "unknown")
-            return f"trained on the CPU here, on {provenance.device_kind(there)} ({name}) there"
-        versions = there.get("versions")
+        record = entry.provenance[place]
+        if provenance.device_kind(record) != "cpu":
+            name = record["device"].get("name", "unknown")
+            return f"trained on the CPU here, on {provenance.device_kind(record)} ({name}) there"
+        versions = record.get("versions")
         versions = versions if isinstance(versions, dict) else {}
         for name, version in here["versions"].items():
             if versions.get(name) != version and (name in versions or name in provenance.PACKAGES):
                 return f"{name} {version} here, {versions.get(name)} there"
         for name in ("processor", "system", "python"):
-            if there.get(name) != here[name]:
-                return f"{name} {here[name]} here, {there.get(name)} there"
+            if record.get(name) != here[name]:
+                return f"{name} {here[name]} here, {record.get(name)} there"
     return None
 
 

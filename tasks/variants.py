@@ -18,11 +18,11 @@ _BASE = Path(__file__).parent / "beam6g.toml"
 def files() -> dict[str, str]:
     """Return the content of every such task file by its name."""
     base = _BASE.read_text(encoding="utf-8")
-    found = {"beam6g-text.toml": _text(base)}
+    texts = {"beam6g-text.toml": _text(base)}
     for antennas in COUNTS:
         for index in range(PER_COUNT):
-            found[f"beam6g-a{antennas}-{index}.toml"] = _placement(base, antennas, index)
-    return found
+            texts[f"beam6g-a{antennas}-{index}.toml"] = _placement(base, antennas, index)
+    return texts
 
 
 def _text(base: str) -> str:

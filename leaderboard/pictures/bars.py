@@ -63,16 +63,16 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     axes = figure.subplots()
     centers = np.arange(n_levels)[:, None] + np.arange(n_deltas)[None, :] * (n_levels + 0.35)
     handles: list[Patch] = []
-    for k, (name, entry, found) in enumerate(zip(style.labels(entries), entries, measured)):
+    for k, (name, entry, complexities) in enumerate(zip(style.labels(entries), entries, measured)):
         look = style.of(entry, k)
         places = centers + (k - (len(entries) - 1) / 2) * width
         text = f"{name}: {style.parameters_text(entry)} parameters, {style.seeds_text(entry)}"
         handles.append(Patch(facecolor=look.color, edgecolor="white", hatch=look.hatch, lw=0, label=text))
         for i, j in np.ndindex(*grid.shape):
-            alpha = 0.3 if found.at_cap[i, j] else 1.0
+            alpha = 0.3 if complexities.at_cap[i, j] else 1.0
             axes.bar(
                 places[i, j],
-                found.points[i, j],
+                complexities.points[i, j],
                 width * 0.94,
                 color=look.color,
                 hatch=look.hatch,
@@ -80,7 +80,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
                 lw=0,
                 alpha=alpha,
             )
-            low, high = found.intervals[i, j]
+            low, high = complexities.intervals[i, j]
             axes.plot([places[i, j]] * 2, [low, high], color="black", lw=1, alpha=max(alpha, 0.55))
             for end in (low, high):
                 axes.plot(
@@ -90,7 +90,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
                     lw=1,
                     alpha=max(alpha, 0.55),
                 )
-            if found.unsettled[i, j]:
+            if complexities.unsettled[i, j]:
                 axes.text(float(places[i, j]), high + 0.012 * horizon, "≥", ha="center", fontsize=9, zorder=5)
     axes.axhline(horizon, color="#505050", lw=0.9, ls=":")
     axes.set_xticks(
@@ -115,8 +115,8 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     axes.grid(axis="x", visible=False)
     title = f"{style.heading(entries)}: sample complexity Ŝ, whiskers 5th to 95th percentile"
     style.legend(figure, title, handles)
-    faded = any(found.at_cap.any() for found in measured)
-    bounded = any(found.unsettled.any() for found in measured)
+    faded = any(complexities.at_cap.any() for complexities in measured)
+    bounded = any(complexities.unsettled.any() for complexities in measured)
     style.footnotes(
         figure,
         "faded: the 95th percentile is at the cap" if faded else "",

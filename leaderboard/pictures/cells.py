@@ -70,17 +70,17 @@ def choose_grid(
         If epsilons are asked for on a task without a known maximum, or thresholds and epsilons together.
     """
     ranking = entry.task_file.ranking
-    wanted = deltas if deltas is not None else ranking.deltas
+    chosen_deltas = deltas if deltas is not None else ranking.deltas
     if epsilons is not None and thresholds is not None:
         raise OptionError("give epsilons or thresholds, not both")
     if thresholds is not None:
-        return Grid.absolute(thresholds, wanted)
+        return Grid.absolute(thresholds, chosen_deltas)
     if epsilons is not None:
         if ranking.epsilons is None:
             raise OptionError(
                 f"task '{entry.task}' has no known maximum: give thresholds instead of epsilons"
             )
-        return Grid.relative(epsilons, wanted)
+        return Grid.relative(epsilons, chosen_deltas)
     own = ranking.grid
     if deltas is None:
         return own
@@ -89,18 +89,18 @@ def choose_grid(
     return Grid.absolute(own.thresholds, deltas)
 
 
-def choose_horizon(entries: Sequence[EntryCurves], wanted: int | None = None) -> int:
+def choose_horizon(entries: Sequence[EntryCurves], requested: int | None = None) -> int:
     """Return the steps to which all entries are cut: the task's longest horizon that all of them reach.
 
     Where one is shorter than all of the task's horizons, its length.
     """
     lengths = {entry.label: int(entry.curves.shape[1]) * entry.steps_per_epoch for entry in entries}
     shortest = min(lengths.values())
-    if wanted is not None:
-        if wanted > shortest:
+    if requested is not None:
+        if requested > shortest:
             label = next(label for label, length in lengths.items() if length == shortest)
-            raise OptionError(f"horizon = {wanted}: '{label}' ends at {shortest} steps")
-        return wanted
+            raise OptionError(f"horizon = {requested}: '{label}' ends at {shortest} steps")
+        return requested
     reached = [steps for steps in entries[0].task_file.ranking.horizons if steps <= shortest]
     return max(reached, default=shortest)
 

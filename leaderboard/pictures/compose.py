@@ -82,32 +82,32 @@ def compose(
     data = pictures.KINDS[kind].data
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
-    given = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
+    selection = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
     if data is None:
-        if any(given.values()):
-            name = next(name for name, value in given.items() if value)
+        if any(selection.values()):
+            name = next(name for name, value in selection.items() if value)
             raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
         return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
     lookup.check_tasks(runs, *tasks)
-    found, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
+    selected, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
     if not entries:
-        found.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
-        found = [replace(entry, color=place) for place, entry in enumerate(found)]
+        selected.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
+        selected = [replace(entry, color=place) for place, entry in enumerate(selected)]
         if cuts:
-            found, short = collect.equally_long(found)
+            selected, short = collect.equally_long(selected)
             left_out += short
-    held = sorted({entry.task for entry in found})
-    if not found:
-        wanted = f" of task {' or '.join(tasks)}" if tasks else ""
+    held = sorted({entry.task for entry in selected})
+    if not selected:
+        of_task = f" of task {' or '.join(tasks)}" if tasks else ""
         raise UnknownNameError(
-            f"{runs} holds no results{wanted} yet: qrlsuite run; --published draws those that come with the suite"
+            f"{runs} holds no results{of_task} yet: qrlsuite run; --published draws those that come with the suite"
         )
     if len(held) > 1 and not tasks and not entries:
         raise OptionError(f"{runs} holds several tasks; choose with --task {' or --task '.join(held)}")
-    figure = pictures.draw(kind, found, **{**own, **settings})
-    return Composed(figure, tuple(found), tuple(dict.fromkeys(e.task for e in found)), tuple(left_out))
+    figure = pictures.draw(kind, selected, **{**own, **settings})
+    return Composed(figure, tuple(selected), tuple(dict.fromkeys(e.task for e in selected)), tuple(left_out))
 
 
 def settings_of(kind: str, tasks: Sequence[str] = ()) -> list[dict[str, Any]]:
@@ -127,12 +127,12 @@ def summaries() -> dict[str, str]:
 
 def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
     """Return the pictures that environments bring: by picture, then by environment."""
-    found: dict[str, dict[str, PictureSpec]] = {}
+    by_name: dict[str, dict[str, PictureSpec]] = {}
     for registered in registry.load().entries["environments"].values():
         spec = cast(EnvironmentSpec, registered.spec)
         for picture in spec.pictures:
-            found.setdefault(picture.name, {})[spec.name] = picture
-    return found
+            by_name.setdefault(picture.name, {})[spec.name] = picture
+    return by_name
 
 
 def find(kind: str, tasks: Sequence[str]) -> PictureSpec | None:

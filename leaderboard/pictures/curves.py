@@ -64,9 +64,9 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     style.tidy(axes)
     title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
     axes.set_title(title, fontsize="medium", loc="left")
-    words = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
+    legend = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
     if many:
-        figure.legend(loc="outside right upper", fontsize=8, alignment="left", **words)
+        figure.legend(loc="outside right upper", fontsize=8, alignment="left", **legend)
     else:
-        axes.legend(loc="lower right", **words)
+        axes.legend(loc="lower right", **legend)
     return figure

@@ -137,9 +137,9 @@ def _figure(
     sides = (entries[0], entries[-1])
     for key, index in (("a", low), ("b", high)):
         samples = [entry.curves[runs[index]] for entry, runs in zip(sides, few.runs)]
-        found = [int(steps[index]) for steps in few.steps]
+        complexities = [int(steps[index]) for steps in few.steps]
         title = "a sample of" if key == "a" else "another sample of"
-        _learning(panels[key], sides, samples, grid, horizon, f"{title} {n_few} seeds", names, found)
+        _learning(panels[key], sides, samples, grid, horizon, f"{title} {n_few} seeds", names, complexities)
     everything = [entry.curves for entry in sides]
     whole = [
         int(complexity(learning_curves(entry).cut(horizon).values, grid, entry.steps_per_epoch)[0, 0])
@@ -161,12 +161,12 @@ def _figure(
         panels[key].set_title(f"{size} seeds each\n{drawn.words(*names)}", fontsize=8, loc="left")
     panels["e"].set_yticks([])
     level, delta = cells.levels(grid)[0], cells.probabilities(grid)[0]
-    what = (
+    subject = (
         " against ".join(names)
         if len(entries) == 2
         else f"{style.labels(entries)[0]} against itself, other seeds"
     )
-    figure.suptitle(f"{style.heading(entries)}: {what}", x=0.01, ha="left", fontsize="medium")
+    figure.suptitle(f"{style.heading(entries)}: {subject}", x=0.01, ha="left", fontsize="medium")
     many_words = "resampled from all" if len(entries) == 2 else "halves of all"
     style.footnotes(
         figure,
@@ -191,11 +191,11 @@ def _learning(
     horizon: int,
     title: str,
     names: Sequence[str],
-    found: Sequence[int],
+    complexities: Sequence[int],
     color: int = 0,
 ) -> None:
     """Draw mean and standard deviation of samples (n, T), as papers with few seeds do."""
-    for k, (entry, values, name, steps) in enumerate(zip(entries, samples, names, found)):
+    for k, (entry, values, name, steps) in enumerate(zip(entries, samples, names, complexities)):
         look = style.style(k + color)
         shown = values[:, : horizon // entry.steps_per_epoch]
         at = np.arange(1, shown.shape[1] + 1) * entry.steps_per_epoch

@@ -44,7 +44,7 @@ def draw(episodes: Mapping[str, ArrayLike], **settings: Any) -> Figure:
         If there is no policy, or one without episodes or with a value that is not finite.
     """
     chosen: HistogramOptions = options.build(HistogramOptions, settings, "picture 'histogram'")
-    values = {name: _checked(name, given) for name, given in episodes.items()}
+    values = {name: _checked(name, scores) for name, scores in episodes.items()}
     if not values:
         raise OptionError("picture 'histogram' needs at least one policy")
     low = min(float(each.min()) for each in values.values())
@@ -90,8 +90,8 @@ def draw(episodes: Mapping[str, ArrayLike], **settings: Any) -> Figure:
     return figure
 
 
-def _checked(name: str, given: ArrayLike) -> NDArray[np.float64]:
-    values = np.asarray(given, dtype=np.float64)
+def _checked(name: str, scores: ArrayLike) -> NDArray[np.float64]:
+    values = np.asarray(scores, dtype=np.float64)
     if values.size == 0:
         raise OptionError(f"policy '{name}' has no episodes")
     if not np.isfinite(values).all():

@@ -89,8 +89,10 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     place, colors = 0, 0
     for panel in panels:
         for j, i in np.ndindex(n_deltas, n_levels):
-            words = f"{cells.level_name(grid)} = {cells.levels(grid)[i]}, δ = {cells.probabilities(grid)[j]}"
-            _draw_panel(axes[place], panel, measured, (i, j), horizon, words, grid.size == 1, colors)
+            cell_title = (
+                f"{cells.level_name(grid)} = {cells.levels(grid)[i]}, δ = {cells.probabilities(grid)[j]}"
+            )
+            _draw_panel(axes[place], panel, measured, (i, j), horizon, cell_title, grid.size == 1, colors)
             place += 1
         colors = (colors + 2) % 6 if len(panels) > 1 else 0
     for each in axes[::columns]:
@@ -120,7 +122,7 @@ def _draw_panel(
     measured: Mapping[str, cells.Cells],
     cell: tuple[int, int],
     horizon: int,
-    words: str,
+    title: str,
     annotate: bool,
     colors: int,
 ) -> None:
@@ -147,9 +149,9 @@ def _draw_panel(
             label=style.plain(line.label),
         )
         for size, entry in line.members:
-            found = measured[entry.name]
-            point, (low, high) = found.points[cell], found.intervals[cell]
-            alpha = 0.4 if found.at_cap[cell] else 1.0
+            complexities = measured[entry.name]
+            point, (low, high) = complexities.points[cell], complexities.intervals[cell]
+            alpha = 0.4 if complexities.at_cap[cell] else 1.0
             axes.errorbar(
                 size * shift,
                 point,
@@ -188,7 +190,7 @@ def _draw_panel(
     axes.set_ylim(0, horizon * 1.08)
     axes.yaxis.set_major_formatter(steps_text)
     style.tidy(axes)
-    axes.set_title(f"{words}: {_seeds(panel)}", fontsize=9, loc="left")
+    axes.set_title(f"{title}: {_seeds(panel)}", fontsize=9, loc="left")
     if cell == (0, 0):
         axes.legend(facecolor="white", edgecolor="none", framealpha=0.9, fontsize=7.5)
 
@@ -259,13 +261,13 @@ def _varied(entries: Sequence[EntryCurves]) -> list[str]:
 
 
 def _model_options(entry: EntryCurves) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = entry.identity.get("model_options", {})
-    return found
+    options: Mapping[str, Any] = entry.identity.get("model_options", {})
+    return options
 
 
 def _environment_options(entry: EntryCurves) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = entry.identity.get("task", {}).get("environment_options", {})
-    return found
+    options: Mapping[str, Any] = entry.identity.get("task", {}).get("environment_options", {})
+    return options
 
 
 def _size(entry: EntryCurves, by: str) -> float:

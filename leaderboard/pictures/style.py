@@ -72,10 +72,10 @@ def plain(text: str, longest: int = 60) -> str:
 
 def note(entries: Sequence[EntryCurves]) -> str:
     """Return the sentence that explains the mark of provisional entries; empty where there is none."""
-    wanted = sorted({entry.task_file.protocol.seeds for entry in entries if provisional(entry)})
-    if not wanted:
+    protocol_seeds = sorted({entry.task_file.protocol.seeds for entry in entries if provisional(entry)})
+    if not protocol_seeds:
         return ""
-    return f"* provisional: the protocol asks for {' or '.join(map(str, wanted))} seeds"
+    return f"* provisional: the protocol asks for {' or '.join(map(str, protocol_seeds))} seeds"
 
 
 def relative(entries: Sequence[EntryCurves]) -> bool:
@@ -111,7 +111,9 @@ def parameters_text(entry: EntryCurves) -> str:
 
 def heading(entries: Sequence[EntryCurves]) -> str:
     """Return what entries have in common: the task, and the algorithm where it is one."""
-    tasks, algorithms = ({getattr(entry, what) for entry in entries} for what in ("task", "algorithm"))
+    tasks, algorithms = (
+        {getattr(entry, attribute) for entry in entries} for attribute in ("task", "algorithm")
+    )
     return plain(", ".join([*sorted(tasks)[:1], *(algorithms if len(algorithms) == 1 else [])]))
 
 

@@ -79,14 +79,14 @@ def _maps(
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axes in panels[len(entries) :]:
         axes.set_visible(False)
-    for axes, entry, name, found in zip(panels, entries, style.labels(entries), measured):
-        image = axes.imshow(found.points, cmap="cividis_r", vmin=0, vmax=horizon, aspect="auto")
+    for axes, entry, name, complexities in zip(panels, entries, style.labels(entries), measured):
+        image = axes.imshow(complexities.points, cmap="cividis_r", vmin=0, vmax=horizon, aspect="auto")
         for i, j in np.ndindex(*grid.shape):
-            value = float(found.points[i, j])
+            value = float(complexities.points[i, j])
             ink = "white" if value > 0.55 * horizon else "black"
-            sign = "≥" if found.unsettled[i, j] else ""
+            sign = "≥" if complexities.unsettled[i, j] else ""
             axes.text(j, i, f"{sign}{value / 1000:.3g}", ha="center", va="center", fontsize=6.5, color=ink)
-            if found.at_cap[i, j]:
+            if complexities.at_cap[i, j]:
                 axes.add_patch(
                     Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, hatch="////", ec="#ffffff48", lw=0)
                 )
@@ -112,7 +112,7 @@ def _maps(
     style.footnotes(
         figure,
         "Ŝ in thousands of steps",
-        "≥: a lower bound" if any(found.unsettled.any() for found in measured) else "",
+        "≥: a lower bound" if any(complexities.unsettled.any() for complexities in measured) else "",
         "hatched: the 95th percentile is at the cap" if any(f.at_cap.any() for f in measured) else "",
         cells.cut_note(entries, horizon),
         style.note(entries),
@@ -137,13 +137,20 @@ def _box(
     deltas = np.array([float(delta) for delta in grid.deltas])
     x, y = np.meshgrid(levels, deltas, indexing="ij")
     handles = []
-    for i, (entry, name, found) in enumerate(zip(entries, style.labels(entries), measured)):
+    for i, (entry, name, complexities) in enumerate(zip(entries, style.labels(entries), measured)):
         look = style.style(i)
         axes.plot_surface(
-            x, y, found.points, color=look.color, alpha=0.5, edgecolor="white", lw=0.7, shade=False
+            x, y, complexities.points, color=look.color, alpha=0.5, edgecolor="white", lw=0.7, shade=False
         )
         axes.plot(
-            x.ravel(), y.ravel(), found.points.ravel(), look.marker, ls="", color=look.color, ms=3, mew=0
+            x.ravel(),
+            y.ravel(),
+            complexities.points.ravel(),
+            look.marker,
+            ls="",
+            color=look.color,
+            ms=3,
+            mew=0,
         )
         text = f"{name}: {style.parameters_text(entry)} parameters, {style.seeds_text(entry)}"
         handles.append(Line2D([], [], color=look.color, marker=look.marker, lw=4, alpha=0.7, label=text))

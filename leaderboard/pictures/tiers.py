@@ -60,13 +60,13 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     axes = figure.subplots()
     states = _table(axes, board)
     _name_rows_and_columns(axes, entries, board, shown)
-    words = {
+    texts = {
         "win": "the row outperforms the column",
         "loss": "the reverse",
         "neither": "neither",
         "undecided": "undecided: fewer than 20 seeds",
     }
-    handles = [Patch(**LOOKS[state], lw=0, label=text) for state, text in words.items() if state in states]
+    handles = [Patch(**LOOKS[state], lw=0, label=text) for state, text in texts.items() if state in states]
     title = f"{style.heading(entries)}: significant outperformance, up to {steps_text(horizon)} steps"
     style.legend(figure, title, handles)
     style.footnotes(

@@ -61,8 +61,8 @@ def pack(values: NDArray[np.float64], low: float, high: float) -> str:
     codes = np.where(finite, np.rint(share * (MISSING - 1)), MISSING).astype(np.uint32)
     odd = len(codes) % 2
     pairs = np.append(codes, [0] * odd).astype(np.uint32).reshape(-1, 2)
-    words = (pairs[:, 0] << 12) | pairs[:, 1]
-    octets = np.stack([words >> 16, (words >> 8) & 255, words & 255], axis=1).astype(np.uint8)
+    joined = (pairs[:, 0] << 12) | pairs[:, 1]
+    octets = np.stack([joined >> 16, (joined >> 8) & 255, joined & 255], axis=1).astype(np.uint8)
     text = base64.b64encode(octets.tobytes()).decode("ascii")
     return text[: len(text) - 2 * odd]
 

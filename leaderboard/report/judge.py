@@ -70,8 +70,8 @@ class Judgement:
 
     def pair(self, one: int, other: int) -> Pair:
         """Return the pair of two places on the board, in either order."""
-        wanted = (min(one, other), max(one, other))
-        return next(pair for pair in self.pairs if (pair.first, pair.second) == wanted)
+        key = (min(one, other), max(one, other))
+        return next(pair for pair in self.pairs if (pair.first, pair.second) == key)
 
     def beats(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """Return, shape (M, M), whether the row's entry outperforms the column's."""

@@ -147,9 +147,9 @@ def _look(outcome: DecisionOutcome, index: int) -> LookLine:
     spent = 2 * plan.spending.spent([seeds / plan.looks[-1]], plan.alpha / 2)[0]
     cells = []
     for pair in outcome.pairs:
-        there = index < len(pair.p)
+        has_p = index < len(pair.p)
         last = index == len(pair.p) - 1
-        cells.append((f"{pair.p[index]:.2g}" if there else "", there and last and pair.differs))
+        cells.append((f"{pair.p[index]:.2g}" if has_p else "", has_p and last and pair.differs))
     return LookLine(
         seeds=seeds,
         taken=_minute(taken[seeds]) if seeds in taken else "–",

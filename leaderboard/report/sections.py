@@ -50,7 +50,7 @@ class SectionView:
     horizon: str
     lead: str
     rows: tuple[RowView, ...]
-    wanted: int
+    protocol_seeds: int
     missing: str
     first_alone: str
     tuning: str
@@ -110,7 +110,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         horizon=steps_text(section.horizon),
         lead=_lead(rows),
         rows=rows,
-        wanted=section.rows[0].entry.task_file.protocol.seeds,
+        protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
         first_alone=", ".join(row.entry.label for row in rows if row.row.entry.first_network_alone),
         tuning=clean("; ".join(tables.unequal_tuning(section))),

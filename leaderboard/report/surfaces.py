@@ -33,7 +33,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
     point, interval = evidence.point, evidence.interval()
     capped = at_cap(interval, horizon)
     open_end = unsettled(evidence.entry.values, grid)
-    wanted = ranking.reference.epsilon if grid.epsilons else ranking.reference.threshold
+    reference_level = ranking.reference.epsilon if grid.epsilons else ranking.reference.threshold
     lines = []
     for i, value in enumerate(grid.levels):
         cells = []
@@ -48,7 +48,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
                     level=min(LEVELS - 1, int(LEVELS * share)),
                     capped=bool(capped[i, j]),
                     unsettled=bool(open_end[i, j]),
-                    reference=value == wanted and float(delta) == ranking.reference.delta,
+                    reference=value == reference_level and float(delta) == ranking.reference.delta,
                     title=f"{sign}{steps_text(float(point[i, j]))} ({low} to {high}{mark})",
                 )
             )

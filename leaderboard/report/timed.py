@@ -78,7 +78,7 @@ def _cell(ranking: TimeRanking, rows: tuple[TimeRowView, ...], one: int, other: 
     if direction is Direction.UNDECIDED:
         return "?", "tie", "undecided: fewer than 20 seeds"
     names = f"{rows[one].entry.label} against {rows[other].entry.label}"
-    words = f"{names}: {direction}, adjusted p = {board.adjusted[i, j]:.4g}"
+    title = f"{names}: {direction}, adjusted p = {board.adjusted[i, j]:.4g}"
     if board.few[i, j]:
-        words += "; unequal numbers of seeds, the smaller below 50: errors are likelier than alpha says"
-    return p_text(board.adjusted[i, j]) + "!" * bool(board.few[i, j]), STYLES.get(direction, "tie"), words
+        title += "; unequal numbers of seeds, the smaller below 50: errors are likelier than alpha says"
+    return p_text(board.adjusted[i, j]) + "!" * bool(board.few[i, j]), STYLES.get(direction, "tie"), title

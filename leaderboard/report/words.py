@@ -11,9 +11,9 @@ def in_unit(steps: float, unit: int) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def listed(words: Sequence[str]) -> str:
+def listed(items: Sequence[str]) -> str:
     """Join words: `a, b and c`."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 def ranges(numbers: Iterable[int]) -> str:

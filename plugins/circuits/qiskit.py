@@ -293,27 +293,27 @@ def _simulator(options: QiskitOptions, qubits: int) -> Any:
     return aer.AerSimulator.from_backend(fake, **exact)
 
 
-def _needs_shots(options: QiskitOptions, qubits: int, what: str) -> None:
+def _needs_shots(options: QiskitOptions, qubits: int, setting: str) -> None:
     """Refuse density matrices that do not fit into memory."""
     if options.shots is None and qubits > DENSITY_QUBITS:
         raise OptionError(
-            f"noise on {what} cannot be simulated exactly (at most {DENSITY_QUBITS}); give a number of shots"
+            f"noise on {setting} cannot be simulated exactly (at most {DENSITY_QUBITS}); give a number of shots"
         )
 
 
 def _fake_backend(name: str) -> Any:
     """Return a snapshot of a device by the name of its class."""
-    what = f"noise_model = '{name}' (not 'depolarizing', hence a fake backend)"
-    fake_provider = _package("qiskit_ibm_runtime.fake_provider", what, "qiskit-ibm-runtime")
+    setting = f"noise_model = '{name}' (not 'depolarizing', hence a fake backend)"
+    fake_provider = _package("qiskit_ibm_runtime.fake_provider", setting, "qiskit-ibm-runtime")
     known = [n for n in dir(fake_provider) if n.startswith("Fake") and n != "FakeProviderForBackendV2"]
     if name not in known:
         raise OptionError(f"noise_model = '{name}' is unknown{nearest(name, ['depolarizing', *known])}")
     return getattr(fake_provider, name)()
 
 
-def _package(module: str, what: str, pip: str) -> Any:
+def _package(module: str, setting: str, pip: str) -> Any:
     """Import an optional package, or say how to install it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise OptionError(f"{what}: package '{error.name}' is missing; pip install {pip}") from error
+        raise OptionError(f"{setting}: package '{error.name}' is missing; pip install {pip}") from error

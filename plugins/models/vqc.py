@@ -82,19 +82,19 @@ class VQCOptions:
 
     @field_validator("ansatz_options")
     @classmethod
-    def _ansatz_options(cls, given: dict[str, OptionValue], info: ValidationInfo) -> dict[str, OptionValue]:
+    def _ansatz_options(cls, values: dict[str, OptionValue], info: ValidationInfo) -> dict[str, OptionValue]:
         """Leave out what the hash does not cover, see `qrlsuite.options.Since`."""
         try:
             return (
-                without_later(specs.resolve(registry.ansatz(info.data["ansatz"]).options), given)
-                if given
+                without_later(specs.resolve(registry.ansatz(info.data["ansatz"]).options), values)
+                if values
                 else {}
             )
         except (
             KeyError,
             QrlSuiteError,
         ):  # an ansatz that cannot be found is refused by `check`, in better words
-            return given
+            return values
 
     def check(self) -> None:
         """Build the circuit once, so that one that cannot be built is refused before anything is trained.
@@ -324,12 +324,12 @@ def build_circuit(options: VQCOptions) -> Circuit:
     OptionError
         If the ansatz has no such option or size.
     """
-    given: dict[str, Any] = dict(options.ansatz_options)
+    ansatz_options: dict[str, Any] = dict(options.ansatz_options)
     if "gate" in field_names(specs.resolve(registry.ansatz(options.ansatz).options)):
-        given.setdefault("gate", options.gate)
+        ansatz_options.setdefault("gate", options.gate)
     elif options.gate != "rot":
         raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")
-    return ansatz(options.ansatz, options.qubits, options.layers, **given)
+    return ansatz(options.ansatz, options.qubits, options.layers, **ansatz_options)
 
 
 def _scales(circuit: Circuit) -> set[str]:

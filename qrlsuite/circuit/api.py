@@ -240,15 +240,15 @@ def _dtype(inputs: Any, dtype: torch.dtype | str | None) -> torch.dtype:
 
     known = {"float32": torch.float32, "float64": torch.float64}
     if dtype is None:
-        given = str(getattr(inputs, "dtype", "float64")).removeprefix("torch.")
-        return known.get(given, torch.float64)
+        input_dtype = str(getattr(inputs, "dtype", "float64")).removeprefix("torch.")
+        return known.get(input_dtype, torch.float64)
     name = str(dtype).removeprefix("torch.")
     if name not in known:
         raise OptionError(f"dtype = {name}: circuits are computed in float32 or float64")
     return known[name]
 
 
-def _tensor(value: Any, what: str, dtype: torch.dtype) -> torch.Tensor:
+def _tensor(value: Any, name: str, dtype: torch.dtype) -> torch.Tensor:
     """Convert to a finite tensor of a precision, keeping the gradient of one that has it."""
     import torch
 
@@ -257,8 +257,8 @@ def _tensor(value: Any, what: str, dtype: torch.dtype) -> torch.Tensor:
             value if isinstance(value, torch.Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
         )
     except (TypeError, ValueError) as error:
-        raise OptionError(f"{what} are not an array of numbers: {error}") from error
+        raise OptionError(f"{name} are not an array of numbers: {error}") from error
     tensor = tensor.to(dtype)
     if not bool(torch.isfinite(tensor.detach()).all()):
-        raise OptionError(f"{what}: every number must be finite, found nan or infinity")
+        raise OptionError(f"{name}: every number must be finite, found nan or infinity")
     return tensor

@@ -113,10 +113,10 @@ def jacobian_rank(circuit: Circuit, seed: int = 0) -> int | None:
         return 0
     rows = []
     for output in range(outputs):
-        found = torch.autograd.grad(
+        gradients = torch.autograd.grad(
             values[..., output].sum(), list(leaves.values()), retain_graph=True, materialize_grads=True
         )
-        rows.append(torch.cat([gradient.reshape(points, -1) for gradient in found], dim=1))
+        rows.append(torch.cat([gradient.reshape(points, -1) for gradient in gradients], dim=1))
     return int(torch.linalg.matrix_rank(torch.cat(rows), rtol=RANK_TOLERANCE))
 
 

@@ -136,7 +136,7 @@ def build() -> typer.Typer:
     return app
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"qrlsuite {qrlsuite.__version__}")
         raise typer.Exit

@@ -28,7 +28,7 @@ def table_console(least: int = 130) -> Console:
     return console if console.is_terminal else Console(width=max(console.width, least), highlight=False)
 
 
-def command(*words: str, runs: Path | None = None) -> str:
+def command(*arguments: str, runs: Path | None = None) -> str:
     """Return a `qrlsuite` command line that works where it is pasted: quoted, with the results folder that it needs.
 
     Where the shell does not find this installation's `qrlsuite`, for its virtual environment is not active, the line
@@ -41,7 +41,7 @@ def command(*words: str, runs: Path | None = None) -> str:
     """
     default = Path(os.environ.get("QRLSUITE_RUNS") or "runs")
     runs_option = [] if runs is None or runs == default else ["--runs", str(runs)]
-    return f"{_program()} {shlex.join([*words, *runs_option])}"
+    return f"{_program()} {shlex.join([*arguments, *runs_option])}"
 
 
 def _program() -> str:

@@ -273,13 +273,13 @@ def board_false_winners(
     """
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
     boards = whole(n_boards, "n_boards", at_least=1)
-    found = 0
+    boards_with_winners = 0
     for _ in range(boards):
         entries = [model.draw(count, generator) for count in n_runs]
-        found += bool(outperformance(entries, grid, rule, resampling).outperforms.any())
+        boards_with_winners += bool(outperformance(entries, grid, rule, resampling).outperforms.any())
         if tick is not None:
             tick()
-    return found / boards
+    return boards_with_winners / boards
 
 
 def slower(entry: LearningCurves, factor: float) -> LearningCurves:
@@ -453,15 +453,15 @@ def judge(
         If a rule answers something else than signs of the grid's shape.
     """
     n_runs = (0, 0)
-    judged: list[list[IntArray]] = [[] for _ in rules]
+    signs_by_rule: list[list[IntArray]] = [[] for _ in rules]
     for pair in pairs:
         n_runs = pair[0].n_runs, pair[1].n_runs
         first, second = (Evidence(entry, grid, min(n_runs), resampling) for entry in pair)
-        for rule, found in zip(rules, judged):
-            found.append(check_signs(rule(first, second), grid.shape, rule))
+        for rule, signs in zip(rules, signs_by_rule):
+            signs.append(check_signs(rule(first, second), grid.shape, rule))
         if tick is not None:
             tick()
-    return tuple(_rates(rule, n_runs, np.stack(found)) for rule, found in zip(rules, judged))
+    return tuple(_rates(rule, n_runs, np.stack(signs)) for rule, signs in zip(rules, signs_by_rule))
 
 
 def _rates(rule: SignificanceRule, n_runs: tuple[int, int], signs: IntArray) -> Rates:

@@ -216,14 +216,14 @@ def compare(
     n_runs = min(first.n_runs, second.n_runs)
     pair = [Evidence(entry.cut(steps), grid, n_runs, resampling) for entry in (first, second)]
     intervals = np.stack([evidence.interval(shown_percentiles(chosen)) for evidence in pair])
-    judged = judge_cells(chosen, pair[0], [pair[1]], steps) if n_runs >= MIN_RUNS else None
+    judgement = judge_cells(chosen, pair[0], [pair[1]], steps) if n_runs >= MIN_RUNS else None
     return Comparison(
         names=(first.name, second.name),
         rule=chosen.name,
         grid=grid,
         horizon=steps,
         n_runs=n_runs,
-        verdicts=_verdicts(judged, grid),
+        verdicts=_verdicts(judgement, grid),
         points=np.stack([evidence.point for evidence in pair]),
         intervals=intervals,
         not_reached=(never_reached(first.cut(steps), grid), never_reached(second.cut(steps), grid)),
@@ -258,11 +258,11 @@ def judge_cells(
     return signs, capped
 
 
-def _verdicts(judged: tuple[Signs, BoolArray] | None, grid: Grid) -> tuple[tuple[Verdict, ...], ...]:
+def _verdicts(judgement: tuple[Signs, BoolArray] | None, grid: Grid) -> tuple[tuple[Verdict, ...], ...]:
     n_thresholds, n_deltas = grid.shape
-    if judged is None:
+    if judgement is None:
         return ((Verdict.UNDECIDED,) * n_deltas,) * n_thresholds
-    signs, capped = (cells[0] for cells in judged)
+    signs, capped = (cells[0] for cells in judgement)
     named = {1: Verdict.WIN, -1: Verdict.LOSS}
     return tuple(
         tuple(

@@ -14,7 +14,7 @@ from qrlsuite.statistics.grid import BoolArray, Grid, whole
 Curve = NDArray[np.floating[Any]]
 
 
-def checked(curves: ArrayLike, *, relative: bool = False, what: str = "curves") -> Curve:
+def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") -> Curve:
     """Return learning curves as a floating-point array of shape (N, T).
 
     Parameters
@@ -36,23 +36,23 @@ def checked(curves: ArrayLike, *, relative: bool = False, what: str = "curves") 
     try:
         values = np.asarray(curves)
     except ValueError:
-        raise OptionError(f"{what}: the runs differ in length; cut them to as many epochs") from None
+        raise OptionError(f"{name}: the runs differ in length; cut them to as many epochs") from None
     if values.dtype.kind in "iub":
         values = values.astype(np.float64)
     if values.dtype.kind != "f":
-        raise OptionError(f"{what}: expected numbers, not dtype {values.dtype}")
+        raise OptionError(f"{name}: expected numbers, not dtype {values.dtype}")
     if values.ndim != 2:
-        raise OptionError(f"{what}: expected shape (runs, epochs), got {values.shape}")
+        raise OptionError(f"{name}: expected shape (runs, epochs), got {values.shape}")
     if values.size == 0:
-        raise OptionError(f"{what}: there is no run or no epoch in shape {values.shape}")
+        raise OptionError(f"{name}: there is no run or no epoch in shape {values.shape}")
     bad = np.isnan(values)
     if bad.any():
         run, epoch = np.argwhere(bad)[0]
-        raise OptionError(f"{what}: run {run} is NaN at epoch {epoch} ({int(bad.sum())} such values)")
+        raise OptionError(f"{name}: run {run} is NaN at epoch {epoch} ({int(bad.sum())} such values)")
     if relative and (values.min() < 0 or values.max() > 1):
         run, epoch = np.argwhere((values < 0) | (values > 1))[0]
         raise OptionError(
-            f"{what}: run {run} has score {values[run, epoch]:.6g} at epoch {epoch}, outside [0, 1]; "
+            f"{name}: run {run} has score {values[run, epoch]:.6g} at epoch {epoch}, outside [0, 1]; "
             "without a known maximum give thresholds instead of epsilons"
         )
     return values

@@ -27,7 +27,7 @@ BoolArray = NDArray[np.bool_]
 _DIGITS = Context(prec=12)
 
 
-def whole(value: object, what: str, *, at_least: int) -> int:
+def whole(value: object, name: str, *, at_least: int) -> int:
     """Return an integer option as an `int`.
 
     Raises
@@ -36,17 +36,17 @@ def whole(value: object, what: str, *, at_least: int) -> int:
         If it is not an integer, or smaller than `at_least`.
     """
     if isinstance(value, (bool, np.bool_)):
-        raise OptionError(f"{what} = {value!r} is not an integer")
+        raise OptionError(f"{name} = {value!r} is not an integer")
     try:
         number = operator.index(value)  # type: ignore[arg-type]  # anything may arrive here: that is the check
     except TypeError:
-        raise OptionError(f"{what} = {value!r} is not an integer") from None
+        raise OptionError(f"{name} = {value!r} is not an integer") from None
     if number < at_least:
-        raise OptionError(f"{what} = {number} is smaller than {at_least}")
+        raise OptionError(f"{name} = {number} is smaller than {at_least}")
     return number
 
 
-def exact(value: object, what: str) -> Decimal:
+def exact(value: object, name: str) -> Decimal:
     """Return a number as the decimal its author typed, to 12 significant digits.
 
     A float32 is read by its own shortest form, so `numpy.float32(0.3)` means 0.3; the noise of
@@ -60,16 +60,16 @@ def exact(value: object, what: str) -> Decimal:
     try:
         number = _DIGITS.create_decimal(str(value))
     except InvalidOperation:
-        raise OptionError(f"{what} = {value!r} is not a number") from None
+        raise OptionError(f"{name} = {value!r} is not a number") from None
     if not number.is_finite():
-        raise OptionError(f"{what} = {value!r} is not finite")
+        raise OptionError(f"{name} = {value!r} is not finite")
     return number
 
 
-def _values(values: ArrayLike | Iterable[Any], what: str) -> list[Decimal]:
+def _values(values: ArrayLike | Iterable[Any], name: str) -> list[Decimal]:
     """Read a non-empty one-dimensional list of numbers; a single number is a list of one."""
     if isinstance(values, np.ndarray) and values.ndim > 1:
-        raise OptionError(f"{what}: expected a list of numbers, not an array of shape {values.shape}")
+        raise OptionError(f"{name}: expected a list of numbers, not an array of shape {values.shape}")
     if isinstance(values, np.ndarray) and values.ndim == 0:
         listed: list[Any] = [values[()]]
     elif isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
@@ -77,8 +77,8 @@ def _values(values: ArrayLike | Iterable[Any], what: str) -> list[Decimal]:
     else:
         listed = list(values)
     if not listed:
-        raise OptionError(f"{what}: the list is empty")
-    return [exact(value, f"{what}[{index}]") for index, value in enumerate(listed)]
+        raise OptionError(f"{name}: the list is empty")
+    return [exact(value, f"{name}[{index}]") for index, value in enumerate(listed)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,13 +56,13 @@ def relabelings_for(level: float) -> int:
     OptionError
         If the level is outside (0, 1), or needs more than `MOST`.
     """
-    wanted = 20 / check_probability(level, "level")
-    if wanted > MOST:
+    needed = 20 / check_probability(level, "level")
+    if needed > MOST:
         raise OptionError(
-            f"a level of {level:.2g} for each test takes {wanted:.2g} relabelings, more than {MOST:,}: "
+            f"a level of {level:.2g} for each test takes {needed:.2g} relabelings, more than {MOST:,}: "
             "choose a larger alpha, or fewer entries"
         )
-    return CHUNK * max(1, math.ceil(wanted / CHUNK))
+    return CHUNK * max(1, math.ceil(needed / CHUNK))
 
 
 @functools.lru_cache(maxsize=12)  # all pairs of equal sizes share their relabelings

@@ -135,20 +135,20 @@ def runs_at_difference(decision: Decision, pair: PairDecision, power: float = 0.
 
 def _fixed(drawn: Sequence[IntArray], powers: Sequence[float], alpha: float, most: int) -> list[int | None]:
     """Return, for each power, the runs that reach it, interpolated between two rungs of the ladder."""
-    tried, found = [0], [0.0]
+    tried, reached_powers = [0], [0.0]
     for n_runs in sorted({*(rung for rung in LADDER if rung < most), most}):
         rates = judge_times(drawn[0][:, :n_runs], drawn[1][:, :n_runs], alpha)
         tried.append(n_runs)
-        found.append(max(rates.first, found[-1]))
-        if found[-1] >= max(powers):
+        reached_powers.append(max(rates.first, reached_powers[-1]))
+        if reached_powers[-1] >= max(powers):
             break
     needed: list[int | None] = []
     for power in powers:
-        if found[-1] < power:
+        if reached_powers[-1] < power:
             needed.append(None)
             continue
-        rung = int(np.argmax(np.array(found) >= power))
-        low, high = found[rung - 1], found[rung]
+        rung = int(np.argmax(np.array(reached_powers) >= power))
+        low, high = reached_powers[rung - 1], reached_powers[rung]
         between = tried[rung - 1] + (tried[rung] - tried[rung - 1]) * (power - low) / (high - low)
         needed.append(max(MIN_RUNS, math.ceil(between)))
     return needed

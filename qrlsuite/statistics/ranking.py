@@ -150,18 +150,18 @@ def _relation(
     if len(set(names)) != size:
         twice = next(name for name in names if list(names).count(name) > 1)
         raise OptionError(f"two entries are called '{twice}'")
-    for what, matrix in (("outperforms", beats), ("decided", known)):
+    for name, matrix in (("outperforms", beats), ("decided", known)):
         if matrix.shape != (size, size):
-            raise OptionError(f"{what}: expected shape ({size}, {size}) for {size} names, got {matrix.shape}")
+            raise OptionError(f"{name}: expected shape ({size}, {size}) for {size} names, got {matrix.shape}")
     np.fill_diagonal(known, False)
     if (known != known.T).any():
         raise OptionError("decided: the matrix is not symmetric")
     for row, column in np.argwhere(beats & (beats.T | ~known)).tolist():
-        where = f"'{names[row]}' outperforms '{names[column]}'"
+        claim = f"'{names[row]}' outperforms '{names[column]}'"
         if row == column:
-            raise OptionError(f"{where}: an entry cannot outperform itself")
+            raise OptionError(f"{claim}: an entry cannot outperform itself")
         problem = "also the reverse" if beats[column, row] else "the pair is undecided"
-        raise OptionError(f"{where}, but {problem}")
+        raise OptionError(f"{claim}, but {problem}")
     return beats, known
 
 

@@ -161,9 +161,11 @@ def times_board(
     for index, (i, j) in enumerate(pairs):
         p[i, j] = p[j, i] = test.p[index]
         adjusted[i, j] = adjusted[j, i] = corrected[index]
-        found = np.where(test.p_each[index] <= alpha / len(pairs), np.sign(test.t[index]), 0).astype(np.int64)
-        signs[i, j], signs[j, i] = found, -found
-        sign = direction(test.t[index], found) if corrected[index] <= alpha else None
+        signs_by_threshold = np.where(
+            test.p_each[index] <= alpha / len(pairs), np.sign(test.t[index]), 0
+        ).astype(np.int64)
+        signs[i, j], signs[j, i] = signs_by_threshold, -signs_by_threshold
+        sign = direction(test.t[index], signs_by_threshold) if corrected[index] <= alpha else None
         directions[i][j], directions[j][i] = _named(sign), _named(None if sign is None else -sign)
     difference, interval = _differences(times, 1 - alpha)
     better = np.array([[each is Direction.FEWER for each in row] for row in directions], bool).reshape(

@@ -116,10 +116,10 @@ def mean_time(entry: LearningCurves, grid: Grid, level: float = 0.95) -> MeanTim
     return MeanTime(mean, interval, (times == horizon).mean(axis=0), half)
 
 
-def check_probability(value: float, what: str) -> float:
+def check_probability(value: float, name: str) -> float:
     """Return a number between 0 and 1, or raise OptionError."""
     if not 0 < value < 1:
-        raise OptionError(f"{what} = {value!r} is outside (0, 1)")
+        raise OptionError(f"{name} = {value!r} is outside (0, 1)")
     return float(value)
 
 

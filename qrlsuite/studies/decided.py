@@ -205,7 +205,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutco
     tasks:
         Only plans of these tasks; all where empty.
     """
-    found, refused = [], []
+    outcomes, refused = [], []
     for path in sorted((runs / decisions.FOLDER).glob("*/plan.toml")):
         try:
             outcome = read(path, runs)
@@ -214,8 +214,8 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutco
             continue
         task = next(iter(outcome.study.entries.values())).task.name
         if outcome.study.begun and (not tasks or task in tasks):
-            found.append(outcome)
-    return found, refused
+            outcomes.append(outcome)
+    return outcomes, refused
 
 
 def hours(study: DecisionStudy, name: str, seeds: int) -> Hours | None:
@@ -224,8 +224,8 @@ def hours(study: DecisionStudy, name: str, seeds: int) -> Hours | None:
     if done:
         own = seeds * study.hours(name) / done
         return own, own
-    found = speed.known(study.folder, study.runs).estimate(study.entries[name], None)
-    span = found.range(abs(seeds) * study.file.epochs)
+    estimate = speed.known(study.folder, study.runs).estimate(study.entries[name], None)
+    span = estimate.range(abs(seeds) * study.file.epochs)
     if span is None:
         return None
     low, high = (math.copysign(end / 3600, seeds) for end in span)
@@ -288,12 +288,13 @@ def needs_text(study: DecisionStudy, needs: Mapping[str, Any] | None) -> str:
     """Say what an open pair needs, as `as_dict` gives it."""
     if needs is None or study.ended:
         return ""
-    words = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"
+    requirement = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"
     about = needs["seeds_at_this_difference"]
     if about is None:
-        return words
+        return requirement
     last = study.plan.looks[-1]
-    return f"{words}; about {about if about <= 10 * last else f'over {10 * last}'} if the difference is as it looks"
+    seeds = f"{about}" if about <= 10 * last else f"over {10 * last}"
+    return f"{requirement}; about {seeds} if the difference stays as it is now"
 
 
 def _about(span: Hours | None) -> str:

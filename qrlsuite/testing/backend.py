@@ -206,15 +206,15 @@ def _values(factory: Any, options: Any) -> None:
         )
 
 
-def _mean_field(factory: Any, given: Any) -> None:
+def _mean_field(factory: Any, options: Any) -> None:
     circuit = every_gate(mean_field=True)
-    difference = _distance(factory, circuit, given)
+    difference = _distance(factory, circuit, options)
     require(
         difference < 1e-6,
         f"the spec says mean_field=True, and values of a mean-field circuit differ from density matrices by "
         f"{difference:.2g}: after every gate on two qubits only the reduced state of each may be kept",
     )
-    run = factory(circuit, given)
+    run = factory(circuit, options)
     _gradients(run, circuit)
     _independence(run, circuit, None)
 

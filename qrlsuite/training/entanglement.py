@@ -70,8 +70,8 @@ class Entanglement:
             "episodes": int(self.values[MEASURES[0]][PARAMETERS[0]].shape[1]),
             "steps": self.steps.tolist(),
             **{
-                measure: {which: evaluation.distribution(v[~np.isnan(v)]) for which, v in found.items()}
-                for measure, found in self.values.items()
+                measure: {which: evaluation.distribution(v[~np.isnan(v)]) for which, v in by_network.items()}
+                for measure, by_network in self.values.items()
             },
         }
 
@@ -121,19 +121,19 @@ def along_episodes(
     states_of(Trainer(entry, [0], device).models.built[0], entry, torch.zeros(1, 1, 0), check=True)
     seeds, _, _ = evaluation.best_runs(store, best)
     agents = evaluation.trained_agents(entry, store, seeds, device)
-    given, lengths = _play(entry, agents, len(seeds), min(episodes, EPISODES), seed)
-    steps = np.unique(np.linspace(0, len(given) - 1, STEPS).round().astype(np.int64))
+    inputs, lengths = _play(entry, agents, len(seeds), min(episodes, EPISODES), seed)
+    steps = np.unique(np.linspace(0, len(inputs) - 1, STEPS).round().astype(np.int64))
     networks = {"trained": agents.models.built[0], "initial": Trainer(entry, seeds, device).models.built[0]}
     values: Values = {measure: {} for measure in MEASURES}
     qubits = 0
     for which, network in networks.items():
         rows = []
         for step in steps.tolist():
-            states = states_of(network, entry, given[step])
+            states = states_of(network, entry, inputs[step])
             qubits = states.shape[-1].bit_length() - 1
             rows.append([meyer_wallach(states), half_cut_entropy(states)])
-        for measure, found in zip(MEASURES, zip(*rows)):
-            array = torch.stack(list(found), dim=-1).double().cpu().numpy()
+        for measure, per_step in zip(MEASURES, zip(*rows)):
+            array = torch.stack(list(per_step), dim=-1).double().cpu().numpy()
             values[measure][which] = np.where(steps < lengths[..., None], array, np.nan)
     return Entanglement(entry.label, qubits, tuple(seeds), steps, values)
 
@@ -169,13 +169,13 @@ def _play(
     envs = build_envs(entry, count * episodes, lambda: None)
     envs.inner.autoreset = False
     envs.seed_lanes([streams.numpy("evaluation", key) for _ in range(count) for key in range(episodes)])
-    given: list[Tensor] = []
+    inputs: list[Tensor] = []
     # registered after the standardization's own, so that it sees what the network computes with
     hook = agents.models.built[0].register_forward_pre_hook(
-        lambda module, args: given.append(args[0].clone())
+        lambda module, args: inputs.append(args[0].clone())
     )
     try:
         ended = play_episodes(envs, lambda: agents.act)
     finally:
         hook.remove()
-    return given, ended.lengths.reshape(count, episodes)
+    return inputs, ended.lengths.reshape(count, episodes)

@@ -205,8 +205,8 @@ def _misfit(expected: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[A
         dtype = str(value.dtype).removeprefix("torch.")
         scalar = value.dim() == 0 and stored_value.shape == (1,)  # how a number per agent is stored
         if not (stored_value.shape == tuple(value.shape) or scalar) or stored_value.dtype.name != dtype:
-            found = f"{stored_value.dtype.name} of shape {stored_value.shape}"
-            return f"'{name}' is {found}, not {dtype} of shape {tuple(value.shape)}"
+            stored_form = f"{stored_value.dtype.name} of shape {stored_value.shape}"
+            return f"'{name}' is {stored_form}, not {dtype} of shape {tuple(value.shape)}"
     return None
 
 

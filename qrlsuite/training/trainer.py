@@ -208,8 +208,8 @@ class ModelBuilder:
             if any(parameter.requires_grad for parameter in module.parameters())
         ]
         classical, quantum, fixed = (sum(numbers[kind] for numbers in counted) for kind in range(3))
-        found = {"classical": classical, "quantum": quantum, "networks": len(counted)}
-        return {**found, "fixed": fixed} if fixed else found
+        counts = {"classical": classical, "quantum": quantum, "networks": len(counted)}
+        return {**counts, "fixed": fixed} if fixed else counts
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""

@@ -284,12 +284,12 @@ class Halving(Search):
 
     def _how(self) -> dict[str, Any]:
         """Return what the record says of how settings were chosen."""
-        found = {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space}
+        ranges = {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space}
         edges = ", ".join(name.partition(".")[2] for name in self.at_edge)
         return {
             "trials": len({trial.number for trial in self.trials}),
             "planned": self.settings,
-            "space": found,
+            "space": ranges,
             "budget": self.budget_text,
             "rungs": self.rungs,
             "note": f"nothing was tried beyond the best {edges}" if edges else None,

@@ -50,9 +50,9 @@ def both(label: str, share: float, seeds: int = 20) -> list[EntryCurves]:
 def test_shares_means_and_decided_pairs_by_hand() -> None:
     board = across.compare([*both("slow", 0.6), *both("quick", 0.2)], TASKS)
     assert board.shares.horizons == (200_000, 500_000)
-    assert [board.found.names[i] for i in board.order] == ["quick", "slow"]
-    assert board.found.mean[list(board.order)] == pytest.approx([0.225, 0.625])
-    assert board.found.interquartile_mean[list(board.order)] == pytest.approx([0.225, 0.625])
+    assert [board.results.names[i] for i in board.order] == ["quick", "slow"]
+    assert board.results.mean[list(board.order)] == pytest.approx([0.225, 0.625])
+    assert board.results.interquartile_mean[list(board.order)] == pytest.approx([0.225, 0.625])
     assert board.cells(0)[4:] == ("1.00", "slow", "-")
     assert board.cells(1)[4:] == ("-", "-", "quick")
     assert board.cells(0)[2].startswith("0.225 (0.2")
@@ -71,7 +71,7 @@ def test_a_configuration_is_algorithm_model_and_options() -> None:
     assert across.configuration(runs_of("same", "beam6g", [1], **options)) != across.configuration(one)
     mixed = [one, runs_of("same", "cartpole", [1] * 20, **options)]
     board = across.compare([*both("quick", 0.2), *mixed], TASKS)
-    assert board.found.names == ("quick",)
+    assert board.results.names == ("quick",)
     assert {line.partition(":")[2] for line in board.refused} == {
         " no result with these options on cartpole",
         " no result with these options on beam6g",
@@ -87,7 +87,7 @@ def test_what_is_left_out_says_why() -> None:
     assert "cartpole: short: ends at 100000 of 500000 steps" in board.refused
     assert "few: 19 seeds on beam6g, fewer than 20: undecided" in board.refused
     cut = across.compare(entries, TASKS, horizon=100_000)
-    assert set(cut.found.names) == {"quick", "short"}
+    assert set(cut.results.names) == {"quick", "short"}
     assert cut.shares.horizons == (100_000, 100_000)
     with pytest.raises(OptionError, match=r"alpha = 1.5 is outside \(0, 1\)"):
         across.compare(entries, TASKS, alpha=1.5)
@@ -117,12 +117,14 @@ def test_rliable_says_the_same() -> None:
         entries.append(runs_of(label, "cartpole", (5 * shift + generator.integers(0, 200, 25)).tolist()))
     board = across.compare(entries, TASKS)
     arrays = board.shares.rliable()
-    for index, name in enumerate(board.found.names):
-        assert 1 - metrics.aggregate_mean(arrays[name]) == pytest.approx(board.found.mean[index])
-        assert 1 - metrics.aggregate_iqm(arrays[name]) == pytest.approx(board.found.interquartile_mean[index])
-    one, two = (board.found.names.index(name) for name in ("one", "two"))
+    for index, name in enumerate(board.results.names):
+        assert 1 - metrics.aggregate_mean(arrays[name]) == pytest.approx(board.results.mean[index])
+        assert 1 - metrics.aggregate_iqm(arrays[name]) == pytest.approx(
+            board.results.interquartile_mean[index]
+        )
+    one, two = (board.results.names.index(name) for name in ("one", "two"))
     improvement = metrics.probability_of_improvement(arrays["one"], arrays["two"])
-    assert improvement == pytest.approx(board.found.improvement[one, two])
+    assert improvement == pytest.approx(board.results.improvement[one, two])
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,7 @@ def calibrate(
         numbers=[_pair(word) for word in seeds] if seeds else calibration.NUMBERS,
         board=board,
     )
-    found = _compute(jobs, json_output)
+    results = _compute(jobs, json_output)
     if json_output:
         content = {
             "task": chosen[0].task,
@@ -94,18 +94,20 @@ def calibrate(
             "board": board,
             "rules": {judge.name: judge.promise for judge in judges},
             "entries": {curves.name: curves.n_runs for curves in setup.curves},
-            "rates": [finding.as_dict() for finding in found],
+            "rates": [finding.as_dict() for finding in results],
         }
         typer.echo(json.dumps(content))
         return
-    for heading, lines in findings.tables(found, setup.grid.size, board):
+    for heading, lines in findings.tables(results, setup.grid.size, board):
         _show(heading, lines)
     for judge in judges:
         typer.echo(f"'{judge.name}' promises {judge.promise}")
-    if said := [words for judge in judges if (words := findings.summary(found, judge.name, board))]:
+    if summaries := [
+        summary for judge in judges if (summary := findings.summary(results, judge.name, board))
+    ]:
         typer.echo("\nOn these entries:")
-        for words in said:
-            typer.echo(f"- {words}")
+        for summary in summaries:
+            typer.echo(f"- {summary}")
 
 
 def _pair(word: str) -> tuple[int, int]:
@@ -129,7 +131,7 @@ def _compute(jobs: Sequence[Job], quiet: bool) -> list[CalibrationResult]:
         f"{len(jobs)} lines, {total} simulated comparisons: about {duration(seconds)} here (three of each kind were "
         "timed); --draws and --part change that. Ctrl-C stops."
     )
-    found = []
+    results = []
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -142,8 +144,8 @@ def _compute(jobs: Sequence[Job], quiet: bool) -> list[CalibrationResult]:
         bar = live.add_task("", total=total)
         for job in jobs:
             live.update(bar, description=f"{job.part}, {job.entry}, {job.rule}")
-            found.append(job.run(lambda: live.advance(bar)))
-    return found
+            results.append(job.run(lambda: live.advance(bar)))
+    return results
 
 
 def _show(heading: str, rows: Sequence[Sequence[str]]) -> None:

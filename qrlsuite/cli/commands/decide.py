@@ -160,7 +160,7 @@ def run(
     console = Console(stderr=True, quiet=json_output, highlight=False)
     try:
         outcome = decided.run(
-            study, chosen_execution, json_output, looked=lambda found: _say_look(found.decision, console)
+            study, chosen_execution, json_output, looked=lambda so_far: _say_look(so_far.decision, console)
         )
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
@@ -249,11 +249,11 @@ def _show_plan(study: DecisionStudy) -> None:
             console.print(f"  {asked} {'; '.join(' / '.join(pair) for pair in pairs)}")
     for look, seeds in enumerate(plan.looks):
         equal = plan.equal_level(look)
-        words = "" if equal is None else f"; equal at p <= {equal:.4f} on both sides"
+        equality = "" if equal is None else f"; equal at p <= {equal:.4f} on both sides"
         console.print(
             f"  look at {seeds} seeds: different at p <= {plan.level(look, family):.4f}"
             + (" while all pairs are open" if family > 1 else "")
-            + words
+            + equality
         )
     if note := decided.reason_note(study):
         console.print(note)

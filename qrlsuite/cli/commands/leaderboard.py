@@ -169,15 +169,15 @@ def _across(
         raise OptionError(f"--across {across[0]}: leave --task {task} out, --across names the tasks")
     if rule is not None:
         raise OptionError(f"--rule {rule} judges single tasks: leave it out with --across")
-    found, refused = several.collected(runs, across, entries, published, horizon, min_seeds)
-    board = several.compare(found, across, horizon, alpha, refused)
+    selected, refused = several.collected(runs, across, entries, published, horizon, min_seeds)
+    board = several.compare(selected, across, horizon, alpha, refused)
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
     if format_ is Format.html:
-        single = boards.build(found, board.refused, horizon=horizon, alpha=alpha)
+        single = boards.build(selected, board.refused, horizon=horizon, alpha=alpha)
         _page(single, output, runs, across, board)
     elif format_ is Format.table:
         table_console(tables.WIDE).print(tables.across_table(board))

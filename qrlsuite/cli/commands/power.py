@@ -55,55 +55,55 @@ def power(
     Example: qrlsuite power "mlp width=64" --published
     """
     lookup.check_tasks(runs, task)
-    found = [
+    entries = [
         collect.find(runs, name, published, [task] if task else [])
         for name in (first, second)
         if name is not None
     ]
-    for entry in found:
+    for entry in entries:
         if len(entry.seeds) < 2:
             raise OptionError(f"'{entry.label}' has a single seed, which has no spread: train two or more")
-    if len({entry.task_hash for entry in found}) > 1:
+    if len({entry.task_hash for entry in entries}) > 1:
         raise OptionError(
-            f"'{found[0].label}' is of task {found[0].task}, '{found[1].label}' of {found[1].task}"
+            f"'{entries[0].label}' is of task {entries[0].task}, '{entries[1].label}' of {entries[1].task}"
         )
-    curves = [board.learning_curves(entry) for entry in found]
+    curves = [board.learning_curves(entry) for entry in entries]
     horizon = common_horizon(curves[0], curves[-1])
     curves = [each.cut(horizon) for each in curves]
-    ranking = board.ranking_of(found)
+    ranking = board.ranking_of(entries)
     grid = ranking.grid
     bounds = (0.0, 1.0) if ranking.thresholds is None else None
     pilots = [SmoothedRuns(each, bounds=bounds) for each in curves]
 
     jobs: list[tuple[str, Callable[[], tuple[Need, ...]]]] = []
-    if len(found) == 2:
+    if len(entries) == 2:
         order = sorted((0, 1), key=lambda index: mean_time(curves[index], grid).mean)
         better, worse = (pilots[index] for index in order)
         ratio = mean_time(worse.entry, grid).mean / max(1e-9, mean_time(better.entry, grid).mean) - 1
-        words = f"{found[order[1]].label} against {found[order[0]].label}: {100 * ratio:.0f}% slower"
-        jobs.append((words, functools.partial(runs_needed, better, worse, grid, POWERS, n_pairs=draws)))
+        title = f"{entries[order[1]].label} against {entries[order[0]].label}: {100 * ratio:.0f}% slower"
+        jobs.append((title, functools.partial(runs_needed, better, worse, grid, POWERS, n_pairs=draws)))
     for share in SLOWER:
         detect = functools.partial(runs_to_detect, pilots[0], grid, share, powers=POWERS, n_pairs=draws)
-        jobs += [(f"{100 * share:.0f}% slower than {found[0].label}", detect)]
-    per_seed, basis = _core_hours(found, curves, runs)
+        jobs += [(f"{100 * share:.0f}% slower than {entries[0].label}", detect)]
+    per_seed, basis = _core_hours(entries, curves, runs)
     console = Console(stderr=True, quiet=json_output, highlight=False)
     rows = []
-    for words, job in jobs:
-        with console.status(Text(f"simulating: {words}")):
-            rows += [_row(words, need, per_seed) for need in job()]
+    for title, job in jobs:
+        with console.status(Text(f"simulating: {title}")):
+            rows += [_row(title, need, per_seed) for need in job()]
     if json_output:
-        typer.echo(json.dumps(_as_dict(found, horizon, rows, basis, draws)))
+        typer.echo(json.dumps(_as_dict(entries, horizon, rows, basis, draws)))
         return
-    _show(found, horizon, rows, per_seed, basis, draws)
+    _show(entries, horizon, rows, per_seed, basis, draws)
 
 
 def _core_hours(
-    found: list[EntryCurves], curves: list[LearningCurves], runs: Path
+    entries: list[EntryCurves], curves: list[LearningCurves], runs: Path
 ) -> tuple[float | None, str]:
     """Return the core-hours of a seed of each of two entries together, None where unknown; and what that rests on."""
     speeds = speed.known(runs)
     total, bases = 0.0, []
-    for entry, learned in ((found[0], curves[0]), (found[-1], curves[-1])):
+    for entry, learned in ((entries[0], curves[0]), (entries[-1], curves[-1])):
         try:
             estimate = speeds.estimate(EntryStore(entry.folder).entry(), None)
         except StoreError:  # imported curves, or an entry of another version
@@ -115,14 +115,14 @@ def _core_hours(
     return total, "; ".join(dict.fromkeys(bases))
 
 
-def _row(words: str, need: Need, per_pair: float | None) -> dict[str, Any]:
+def _row(title: str, need: Need, per_pair: float | None) -> dict[str, Any]:
     def hours(seeds: float | None) -> float | None:
         return None if seeds is None or per_pair is None else seeds * per_pair
 
     mean = need.mean_runs if need.looks else None
     most = need.looks[-1] if need.looks else None
     return {
-        "difference": words,
+        "difference": title,
         "power": need.power,
         "fixed_seeds": need.fixed,
         "fixed_core_hours": hours(need.fixed),
@@ -135,12 +135,12 @@ def _row(words: str, need: Need, per_pair: float | None) -> dict[str, Any]:
 
 
 def _as_dict(
-    found: list[EntryCurves], horizon: int, rows: list[dict[str, Any]], basis: str, draws: int
+    entries: list[EntryCurves], horizon: int, rows: list[dict[str, Any]], basis: str, draws: int
 ) -> dict[str, Any]:
     return {
-        "task": found[0].task,
+        "task": entries[0].task,
         "entries": [
-            {"entry": entry.name, "label": entry.label, "seeds": len(entry.seeds)} for entry in found
+            {"entry": entry.name, "label": entry.label, "seeds": len(entry.seeds)} for entry in entries
         ],
         "horizon": horizon,
         "draws": draws,
@@ -150,7 +150,7 @@ def _as_dict(
 
 
 def _show(
-    found: list[EntryCurves],
+    entries: list[EntryCurves],
     horizon: int,
     rows: list[dict[str, Any]],
     per_pair: float | None,
@@ -171,11 +171,11 @@ def _show(
         before = row["difference"]
         table.add_row(*(Text(cell) for cell in (shown, f"{row['power']:g}", fixed, mean, looks)))
     table_console().print(table)
-    pilots = " and ".join(f"{len(entry.seeds)} seeds of {entry.label}" for entry in found)
+    pilots = " and ".join(f"{len(entry.seeds)} seeds of {entry.label}" for entry in entries)
     typer.echo(f"Seeds of each of the two entries, with the core-hours of both. Simulated from {pilots},")
     error = (0.8 * 0.2 / draws) ** 0.5
     typer.echo(f"{horizon} steps, {draws} pairs per line (power to within {100 * error:.0f} points or so).")
-    if min(len(entry.seeds) for entry in found) < 20:
+    if min(len(entry.seeds) for entry in entries) < 20:
         typer.echo("Fewer than 20 seeds are a weak pilot: rare failures may be missing from it.")
     typer.echo(f"Core-hours: {basis}." if per_pair is not None else f"Core-hours are {basis}.")
 

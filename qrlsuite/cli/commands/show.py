@@ -137,9 +137,9 @@ def _draw(
     drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
     counted = dataclasses.asdict(drawing.resources(drawn))
     content["resources"] = {}
-    for what, count in counted.items():
-        content["resources"][what] = count
-        if what == "parameters":
+    for resource, count in counted.items():
+        content["resources"][resource] = count
+        if resource == "parameters":
             rank = jacobian_rank(drawn)
             text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
             content["resources"]["jacobian_rank"] = text if rank is None else rank
