@@ -92,7 +92,7 @@ class LearningCurves:
     name: str = "entry"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", checked(self.values, what=f"'{self.name}'"))
+        object.__setattr__(self, "values", checked(self.values, name=f"'{self.name}'"))
         steps = whole(self.steps_per_epoch, f"'{self.name}': steps_per_epoch", at_least=1)
         object.__setattr__(self, "steps_per_epoch", steps)
 
@@ -130,7 +130,7 @@ class LearningCurves:
 
     def require_unit_interval(self) -> None:
         """Raise OptionError unless every score lies in [0, 1], as tolerances epsilon presuppose."""
-        checked(self.values, relative=True, what=f"'{self.name}'")
+        checked(self.values, relative=True, name=f"'{self.name}'")
 
 
 def common_horizon(first: LearningCurves, second: LearningCurves, horizon: int | None = None) -> int:

@@ -147,8 +147,8 @@ def _manager(plugin: Any) -> pluggy.PluginManager:
 
 def _lazy(module: str) -> None:
     result = fresh_process((module,), ())
-    require("crash" not in result, f"a fresh process fails: {result.get('crash')}")
-    require(not result["modules"], f"in a fresh process: {result['modules'].get(module)}")
+    error = result.get("crash") or result["modules"].get(module)
+    require(error is None, f"in a fresh process: {error}")
     require(
         not result["heavy"],
         f"importing '{module}' imports {', '.join(result['heavy'])}: import it inside the hook, so that commands "

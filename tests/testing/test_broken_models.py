@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from qrlsuite import population
 from qrlsuite.specs import ModelSpec
-from tests.testing.broken import Broken, assert_breaks, own_rules
+from tests.testing.broken import Broken, Cases, assert_breaks, ids, own_rules
 
 HERE = __name__
 
@@ -49,6 +49,35 @@ def narrow(obs: int, out: int, options: Options, generator: torch.Generator) -> 
     return Good(obs, out - 1, generator)
 
 
+class Pair(Good):
+    def forward(self, x: Tensor) -> Any:
+        return super().forward(x), x
+
+
+class Double(Good):
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x).double()
+
+
+class Infinite(Good):
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x) / 0
+
+
+class Listed(Good):
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.layers = [nn.utils.skip_init(nn.Linear, 1, 1)]
+        for parameter in self.layers[0].parameters():
+            parameter.data = torch.ones_like(parameter)
+
+
+class Frozen(Good):
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.requires_grad_(False)
+
+
 class Hidden(Good):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -69,6 +98,11 @@ class Mislabeled(Good):
         return {"linear.weight"}
 
 
+class Misspelled(Good):
+    def quantum_parameters(self) -> set[str]:
+        return {"weights"}
+
+
 class Unseeded(Good):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -78,6 +112,11 @@ class Unseeded(Good):
 class Constant(Good):
     def __init__(self, obs: int, out: int, generator: torch.Generator) -> None:
         super().__init__(obs, out, torch.Generator().manual_seed(0))
+
+
+class Reseeded(Good):
+    def __init__(self, obs: int, out: int, generator: torch.Generator) -> None:
+        super().__init__(obs, out, torch.Generator().manual_seed(generator.initial_seed()))
 
 
 class Greedy(Good):
@@ -94,6 +133,41 @@ class InPlace(Good):
         return y
 
 
+class Counting(Good):
+    count: Tensor
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.register_buffer("count", torch.zeros(1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.count += 1
+        return super().forward(x) * self.count
+
+
+class Detached(Good):
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x).detach()
+
+
+class Steep(Good):
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.edge = nn.Parameter(torch.zeros(1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x) + self.edge.sqrt()
+
+
+class Flat(Good):
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.edge = nn.Parameter(torch.zeros(1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x) + 0 * self.edge
+
+
 class Unused(Good):
     def __init__(self, obs: int, out: int, generator: torch.Generator) -> None:
         super().__init__(obs, out, generator)
@@ -104,6 +178,11 @@ class HalfGradient(Good):
     def forward(self, x: Tensor) -> Tensor:
         y = super().forward(x)
         return y + (y.detach() - y) / 2
+
+
+class Redrawn(Good):
+    def __deepcopy__(self, memo: Any) -> Redrawn:
+        return Redrawn(4, 3, torch.Generator().manual_seed(99))
 
 
 class Shared(Good):
@@ -138,53 +217,130 @@ def forgetful(agents: Sequence[nn.Module], options: Options) -> nn.Module:
     return together
 
 
+def short(agents: Sequence[nn.Module], options: Options) -> nn.Module:
+    together = population.stack(list(agents))
+    together.register_forward_hook(lambda module, given, y: y[:, :, :2])
+    return together
+
+
+class Wrapped(nn.Module):
+    def __init__(self, together: nn.Module) -> None:
+        super().__init__()
+        self.inner = together
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.inner(x)
+        return y
+
+
+def wrapped(agents: Sequence[nn.Module], options: Options) -> nn.Module:
+    return Wrapped(population.stack(list(agents)))
+
+
+class Quantum(Good):
+    def quantum_parameters(self) -> set[str]:
+        return {"linear.weight"}
+
+
+def classical_population(agents: Sequence[nn.Module], options: Options) -> nn.Module:
+    together = population.stack(list(agents))
+    together.quantum_parameters = set  # type: ignore[assignment]
+    return together
+
+
+def deaf(agents: Sequence[nn.Module], options: Options) -> nn.Module:
+    together = population.stack(list(agents))
+    together.load_state_dict = lambda state: None  # type: ignore[method-assign,assignment,misc]
+    return together
+
+
+class WithOneCounter(nn.Module):
+    """A population written by hand, whose counter has no axis of seeds."""
+
+    def __init__(self, agents: Sequence[Any], options: Options) -> None:
+        super().__init__()
+        self.linear = nn.Module()
+        self.linear.weight = nn.Parameter(torch.stack([agent.linear.weight.detach() for agent in agents]))
+        self.linear.bias = nn.Parameter(torch.stack([agent.linear.bias.detach() for agent in agents]))
+        self.register_buffer("steps", torch.tensor(0))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return population.linear(x, self.linear.weight, self.linear.bias)
+
+
 def spec(build: str = f"{HERE}:good", **more: Any) -> ModelSpec:
     given = {"family": "classical", "options": f"{HERE}:Options", **more}
     return ModelSpec(name="broken", summary="Breaks a rule", build=build, **given)
 
 
-BROKEN = {
-    "builds": Broken(spec(f"{HERE}:nothing"), r"returned NoneType, not a torch.nn.Module: is `return` there"),
-    "shapes": Broken(spec(f"{HERE}:narrow"), r"maps \(6, 4\) to \(6, 2\), and it must give \(6, 3\)"),
-    "parameters registered": Broken(spec(build_of(Hidden)), r"self.scales is a tensor .* nn.ParameterList"),
-    "nothing hidden": Broken(
+NO_GRADIENT = frozenset({"gradients", "seed independence"})
+COUNTS = frozenset({"finite differences"})
+
+BROKEN: Cases = [
+    ("builds", Broken(spec(f"{HERE}:nothing"), r"returned NoneType, not a torch.nn.Module: is `return` there")),
+    ("shapes", Broken(spec(f"{HERE}:narrow"), r"maps \(6, 4\) to \(6, 2\), and it must give \(6, 3\)")),
+    ("parameters registered", Broken(spec(build_of(Hidden)), r"self.scales is a tensor .* nn.ParameterList")),
+    ("nothing hidden", Broken(
         spec(build_of(Drawn)), r"self\.offsets\['all'\] differs between seeds.*self\.register_buffer"
-    ),
-    "quantum parameters": Broken(spec(build_of(Mislabeled)), r"names \['linear.weight'\]: is it 'quantum'"),
-    "same seed": Broken(
+    )),
+    ("quantum parameters", Broken(spec(build_of(Mislabeled)), r"names \['linear.weight'\]: is it 'quantum'")),
+    ("same seed", Broken(
         spec(build_of(Unseeded)),
         r"same seed differ in 'linear.bias': draw every number",
         frozenset({"population"}),
-    ),
-    "different seed": Broken(spec(build_of(Constant)), r"different seeds give the same parameters"),
-    "global randomness": Broken(spec(build_of(Greedy)), r"draws from torch's global generator"),
-    "pure": Broken(
+    )),
+    ("different seed", Broken(spec(build_of(Constant)), r"different seeds give the same parameters")),
+    ("global randomness", Broken(spec(build_of(Greedy)), r"draws from torch's global generator")),
+    ("pure", Broken(
         spec(build_of(InPlace)),
         r"changes its input in place: avoid",
         frozenset({"finite differences", "copies", "population"}),
-    ),
-    "gradients": Broken(
+    )),
+    ("gradients", Broken(
         spec(build_of(Unused)), r"'unused' gets no gradient", frozenset({"seed independence"})
-    ),
-    "finite differences": Broken(spec(build_of(HalfGradient)), r"finite differences give .*backward pass"),
-    "copies": Broken(spec(build_of(Shared)), r"deep copy shares 'linear.weight' with its original"),
-    "population": Broken(
+    )),
+    ("finite differences", Broken(spec(build_of(HalfGradient)), r"finite differences give .*backward pass")),
+    ("copies", Broken(spec(build_of(Shared)), r"deep copy shares 'linear.weight' with its original")),
+    ("population", Broken(
         spec(population=f"{HERE}:reversed_population"),
         r"slice 0 of the population differs from agent 0 alone",
-    ),
-    "seed independence": Broken(
+    )),
+    ("seed independence", Broken(
         spec(population=f"{HERE}:coupled"), r"among themselves compute other values", frozenset({"state"})
-    ),
-    "state": Broken(spec(population=f"{HERE}:forgetful"), r"is not in state_dict\(\); register it"),
-}
+    )),
+    ("state", Broken(spec(population=f"{HERE}:forgetful"), r"is not in state_dict\(\); register it")),
+    ("shapes", Broken(spec(build_of(Pair)), r"forward returned tuple, not a tensor")),
+    ("shapes", Broken(spec(build_of(Double)), r"float32 give torch.float64: end forward with \.to\(x\.dtype\)")),
+    ("shapes", Broken(spec(build_of(Infinite)), r"outputs are not finite")),
+    ("parameters registered", Broken(spec(build_of(Listed)), r"self\.layers holds a module .* use nn.ModuleList")),
+    ("parameters registered", Broken(spec(build_of(Frozen)), r"no trainable parameter", NO_GRADIENT)),
+    ("quantum parameters", Broken(
+        spec(build_of(Misspelled), family="quantum"), r"names \['weights'\], which are none of \['linear.bias'"
+    )),
+    ("quantum parameters", Broken(spec(family="quantum"), r"no parameter is declared quantum.* quantum_lr")),
+    ("different seed", Broken(spec(build_of(Reseeded)), r"second network from one generator .* only read its seed")),
+    ("pure", Broken(spec(build_of(Counting)), r"two passes over the same input differ: dropout", COUNTS)),
+    ("gradients", Broken(spec(build_of(Detached)), r"outputs have no gradient: is there a \.detach\(\)", NO_GRADIENT)),
+    ("gradients", Broken(spec(build_of(Steep)), r"gradient of 'edge' is not finite")),
+    ("gradients", Broken(spec(build_of(Flat)), r"gradient of 'edge' is zero for 6 random inputs")),
+    ("copies", Broken(spec(build_of(Redrawn)), r"copy\.deepcopy, which makes target networks, changes 'linear")),
+    ("population", Broken(spec(population=f"{HERE}:short"), r"population maps \(5, 6, 4\) to \(5, 6, 2\)")),
+    ("population", Broken(spec(population=f"{HERE}:wrapped"), r"same names, with a leading axis of seeds")),
+    ("population", Broken(
+        spec(build_of(Quantum), family="quantum", population=f"{HERE}:classical_population"),
+        r"declares other quantum parameters than its agents",
+    )),
+    ("state", Broken(spec(population=f"{HERE}:deaf"), r"is not restored by load_state_dict")),
+    ("state", Broken(spec(population=f"{HERE}:WithOneCounter"), r"'steps' of shape \(\) has no leading axis")),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("rule", BROKEN)
-def test_one_rule_is_broken(rule: str) -> None:
-    assert_breaks("models", rule, BROKEN[rule])
+@pytest.mark.parametrize(("rule", "case"), BROKEN, ids=ids(BROKEN))
+def test_one_rule_is_broken(rule: str, case: Broken) -> None:
+    assert_breaks("models", rule, case)
 
 
 def test_every_rule_has_a_model_that_breaks_it() -> None:
     findings = own_rules("models", spec())
     assert all(finding.ok for finding in findings), findings
-    assert {finding.rule for finding in findings} == BROKEN.keys()
+    assert {finding.rule for finding in findings} == {rule for rule, _ in BROKEN}
