@@ -11,7 +11,7 @@ both, and of the whole call from torch.
 
 Work: the paper's hybrid circuit (`iqp`, `rot`, 4 layers), gradients by inputs, scalings and weights. Peers are
 PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), lightning.qubit with
-adjoint gradients, Qiskit's EstimatorQNN (4 samples, extrapolated) and JAX, jit and vmap, written by hand
+adjoint gradients, Qiskit (values by Aer, native gradients) and JAX, jit and vmap, written by hand
 (`pip install jax`). Figures are medians of processor time: on shared cores the clock charges long calls for their
 neighbors, and short ones not, which would flatter the faster side. Ratios are to PennyLane's default.qubit.
 """
@@ -248,8 +248,8 @@ def main() -> None:
                 circuit, "pennylane", torch.float64, batch=4, device="lightning.qubit", diff_method="adjoint"
             )
             peers["lightning.qubit adjoint"] = (lightning, BATCH / 4)
-            if n <= 4:
-                peers["Qiskit EstimatorQNN"] = (torch_call(circuit, "qiskit", torch.float64, batch=1), BATCH)
+            if n <= 10:
+                peers["Qiskit Aer"] = (torch_call(circuit, "qiskit", torch.float64), 1.0)
             if n <= 12 and (arguments.ansatz, arguments.gate) == ("iqp", "rot"):
                 try:
                     peers["JAX jit + vmap"] = (jax_call(n, arguments.layers), 1.0)

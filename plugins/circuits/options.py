@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from qrlsuite.options import Since
+
 DiffMethod = Literal["auto", "backprop", "adjoint", "parameter-shift"]
 
 
@@ -27,19 +29,27 @@ class PennyLaneOptions:
     ] = None
 
 
+NOISE_RATE = "depolarizing probability of a two-qubit gate; a tenth of it of one-qubit gates"
+READOUT_ERROR = "probability that a measured bit is read wrongly, with noise_model = depolarizing"
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class QiskitOptions:
     """Options of the Qiskit backend."""
 
     estimator: Annotated[
         Literal["statevector", "aer"],
-        Field(description="V2 primitive: statevector (exact), or aer (needs an extra)"),
+        Field(
+            description="V2 primitive of Aer: statevector (exact; with shots, Gaussian noise), or aer (with shots, bit "
+            "strings; takes a noise model)"
+        ),
     ] = "statevector"
     gradient: Annotated[
-        Literal["auto", "reverse", "parameter-shift", "lin-comb", "spsa"],
+        Literal["auto", "adjoint", "reverse", "parameter-shift", "lin-comb", "spsa"],
         Field(
-            description="auto: where exact, reverse if qiskit-algorithms is installed, else lin-comb (linear "
-            "combination of unitaries); with shots or aer, parameter-shift"
+            description="auto: where exact, adjoint (the same function, differentiated by the native simulator); with "
+            "shots or noise, parameter-shift. spsa: a guess from two circuits. reverse and lin-comb (linear "
+            "combination of unitaries) are Qiskit's own: exact and slow"
         ),
     ] = "auto"
     shots: Annotated[
@@ -47,13 +57,10 @@ class QiskitOptions:
     ] = None
     noise_model: Annotated[
         str | None,
-        Field(description="with aer: depolarizing, or a fake backend such as FakeManilaV2; absent: none"),
-    ] = None
-    noise_rate: Annotated[
-        float,
         Field(
-            ge=0.0,
-            le=1.0,
-            description="depolarizing probability of a two-qubit gate; a tenth of it of one-qubit gates",
+            description="with aer: depolarizing, or the device whose noise is simulated: GenericBackendV2 (a chain of "
+            "qubits), or a fake backend such as FakeManilaV2; absent: none"
         ),
-    ] = 0.01
+    ] = None
+    noise_rate: Annotated[float, Field(ge=0.0, le=1.0, description=NOISE_RATE)] = 0.01
+    readout_error: Annotated[float, Field(ge=0.0, le=0.5, description=READOUT_ERROR), Since("0.2.0")] = 0.0

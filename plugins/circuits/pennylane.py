@@ -26,7 +26,7 @@ from torch.utils.checkpoint import checkpoint
 
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit, Operation
-from qrlsuite.circuit.shifts import shifted_angles, vector_jacobian
+from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.plugins.circuits.options import PennyLaneOptions
 
@@ -100,10 +100,11 @@ class PennyLaneBackend:
         S, B = angles.shape[1:]
         if self.shots is not None:
             entropy = [None] * S if seeds is None else seeds
-            results = [self._shifted(angles[:, s], _entropy(seed), B) for s, seed in enumerate(entropy)]
-            return torch.stack(results)
+            return torch.stack(
+                [self._shifted(angles[:, s], _entropy(seed)) for s, seed in enumerate(entropy)]
+            )
         if self.diff_method == "parameter-shift":
-            return torch.stack([self._shifted(angles[:, s], None, B) for s in range(S)])
+            return torch.stack([self._shifted(angles[:, s], None) for s in range(S)])
         step = self._seeds_per_pass(S, B, angles.requires_grad)
         if step >= S:
             return self._pass(angles)
@@ -154,10 +155,14 @@ class PennyLaneBackend:
         width = padded.shape[2]
         return self.execute(padded.reshape(count, S * width), S * width).reshape(S, width, -1)[:, :B]
 
-    def _shifted(self, angles: Tensor, seed: int | None, lanes: int) -> Tensor:
+    def _shifted(self, angles: Tensor, seed: int | None) -> Tensor:
         """Return one seed's values (B, observables) from its angles (A, B), differentiated by shifts."""
-        result: Tensor = _Shift.apply(angles, self, seed, lanes)  # type: ignore[no-untyped-call]
-        return result
+
+        def execute(some: Tensor, call: int) -> Tensor:
+            own = seed if seed is None or call == 0 else _entropy(seed, 1, call - 1)
+            return self.execute(some, some.shape[1], own)
+
+        return measured(angles, execute, shift_rule(self.table.controlled), self.lanes_per_pass())
 
     def lanes_per_pass(self) -> int:
         """Return how many lanes one execution without gradients takes, so that its states fit in memory."""
@@ -201,28 +206,6 @@ class PennyLaneBackend:
             f"device = {self.options.device!r} with diff_method = {self.diff_method!r} cannot run this circuit: "
             f"{_one_line(error)}"
         )
-
-
-class _Shift(torch.autograd.Function):
-    """Values of all lanes, and their gradient by the parameter-shift rule."""
-
-    @staticmethod
-    def forward(ctx: Any, angles: Tensor, backend: PennyLaneBackend, seed: int | None, lanes: int) -> Tensor:
-        ctx.save_for_backward(angles)
-        ctx.backend, ctx.seed = backend, seed
-        return backend.execute(angles.detach(), lanes, seed)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
-        (angles,) = ctx.saved_tensors
-        backend, (grad,) = ctx.backend, grads
-        shifted, plan = shifted_angles(angles, backend.table.controlled)
-        values = []
-        with torch.no_grad():
-            for part, some in enumerate(torch.split(shifted, backend.lanes_per_pass(), dim=1)):
-                seed = None if ctx.seed is None else _entropy(ctx.seed, 1, part)
-                values.append(backend.execute(some, some.shape[1], seed))
-        return vector_jacobian(torch.cat(values), grad, plan), None, None, None
 
 
 class _DeviceGradient(torch.autograd.Function):

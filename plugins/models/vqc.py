@@ -151,15 +151,18 @@ class ExecutionCounter:
     forward:
         Circuits executed in forward passes: one per input.
     gradient:
-        Circuits that the parameter-shift rule would need for the gradients taken, as on hardware: per input two for
-        every variable angle of an uncontrolled rotation, four for one of a controlled rotation. Exact simulators
-        differentiate otherwise; the number makes entries comparable.
+        Circuits executed for gradients, where shots or noise are simulated. Exact simulators differentiate otherwise;
+        so that entries can be compared, theirs are the circuits that the parameter-shift rule would need for the
+        gradients taken, as on hardware: per input two for every variable angle of an uncontrolled rotation, four for
+        one of a controlled rotation.
+    per_gradient:
+        The number of these circuits for the gradient at one input.
     """
 
-    def __init__(self, shots: int | None, shift_evaluations: int, mean_field: bool = False) -> None:
+    def __init__(self, shots: int | None, per_gradient: int, mean_field: bool = False) -> None:
         self.mean_field = mean_field
         self.shots = shots
-        self.shift_evaluations = shift_evaluations
+        self.per_gradient = per_gradient
         self.forward = 0
         self.gradient = 0
 
@@ -176,7 +179,7 @@ class ExecutionCounter:
         return counts
 
     def _backward(self, inputs: int) -> None:
-        self.gradient += inputs * self.shift_evaluations
+        self.gradient += inputs * self.per_gradient
 
 
 class _Runner:
@@ -196,7 +199,16 @@ class _Runner:
             self._backend = create_backend(
                 self.options.backend, self.circuit, **_backend_options(self.options)
             )
+            if self.draws:
+                self.executions.per_gradient = getattr(
+                    self._backend, "gradient_circuits", self.executions.per_gradient
+                )
         return self._backend
+
+    @property
+    def draws(self) -> bool:
+        """Whether the backend's results are random."""
+        return bool(getattr(self.backend, "draws", self.backend.shots is not None))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Runner:
         return self
@@ -271,7 +283,7 @@ class _Hybrid(nn.Module):
 
     def _shot_seeds(self) -> list[int] | None:
         """Return this pass's sampling seed of every agent, from its key and the number of its passes so far."""
-        if self._runner.executions.shots is None:
+        if not self._runner.draws:
             return None
         keys, counts = self.shot_key.reshape(-1).tolist(), self.shot_count.reshape(-1).tolist()
         self.shot_count += 1

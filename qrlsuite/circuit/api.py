@@ -40,6 +40,14 @@ class CircuitBackend(Protocol):
     ----------
     shots:
         Circuit repetitions per expectation value; None means exact.
+
+    Two more attributes are read where a backend has them:
+
+    draws (bool):
+        Whether results are random, so that `seeds` are needed; by default where `shots` is finite.
+    gradient_circuits (int):
+        Circuits that it executes per input for a gradient; by default those of the parameter-shift rule. They are
+        counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
     """
 
     shots: int | None
@@ -59,7 +67,7 @@ class CircuitBackend(Protocol):
         parameters:
             Every declared parameter by name, (S, *shape), of the inputs' dtype.
         seeds:
-            S non-negative integers below 2^63, used where `shots` is finite: the sampling of seed s, in the
+            S non-negative integers below 2^63, used where results are random: the sampling of seed s, in the
             backward pass too, depends on `seeds[s]` alone. None draws fresh entropy.
 
         Returns

@@ -1,6 +1,7 @@
 """What every circuit backend must do, run on every registered ansatz and backend."""
 
 import functools
+import importlib
 import pkgutil
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import GATES, Circuit, ansatz, create_backend, expectations
+from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError
 from qrlsuite.options import field_names
+from qrlsuite.plugins.circuits.qiskit import QiskitBackend
 
 BACKENDS = registry.load().names("circuit_backends")
-SLOW = {"qiskit"}
 VARIANTS = [
     (name, gate)
     for name in registry.load().names("ansatzes")
@@ -58,12 +60,7 @@ def reference(name, gate, qubits):
 
 @pytest.mark.parametrize(
     ("backend", "qubits"),
-    [
-        pytest.param(name, qubits, marks=[pytest.mark.long] if name in SLOW and qubits > 3 else [])
-        for name in BACKENDS
-        if name != "pennylane"
-        for qubits in (2, 3, 5)
-    ],
+    [(name, qubits) for name in BACKENDS if name != "pennylane" for qubits in (2, 3, 5)],
 )
 @pytest.mark.parametrize(("name", "gate"), VARIANTS)
 def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate, qubits):
@@ -146,7 +143,7 @@ def every_gate():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_gate_against_dense_matrices(backend):
     circuit = every_gate()
-    inputs, parameters, cotangent = draw(circuit, 2, 3 if backend not in SLOW else 1)
+    inputs, parameters, cotangent = draw(circuit, 2, 3)
     got = evaluate(create_backend(backend, circuit), inputs, parameters, cotangent)
     tolerance = 1e-10
 
@@ -341,7 +338,7 @@ def test_without_seeds_samples_are_fresh(backend, options):
     ("backend", "where", "argument"),
     [
         ("pennylane", "qrlsuite.plugins.circuits.pennylane._device", 2),
-        ("qiskit", "qrlsuite.plugins.circuits.qiskit.QiskitBackend._estimator", 2),
+        ("qiskit", "qrlsuite.plugins.circuits.qiskit.QiskitBackend._call", 2),
     ],
 )
 def test_forward_and_backward_pass_do_not_share_their_samples(monkeypatch, backend, where, argument):
@@ -394,12 +391,17 @@ def test_pennylane_differentiates_by_the_fastest_way_that_the_device_has(options
     assert create_backend("pennylane", ansatz("cz", 2, 1), **options).diff_method == method
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_qiskit_differentiates_by_the_fastest_way_that_is_installed(monkeypatch, installed):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: object() if installed else None)
-    circuit = ansatz("cz", 2, 1)
-    assert create_backend("qiskit", circuit).gradient == ("reverse" if installed else "lin-comb")
-    assert create_backend("qiskit", circuit, shots=10).gradient == "parameter-shift"
+@pytest.mark.parametrize(
+    ("options", "gradient"),
+    [
+        ({}, "adjoint"),
+        ({"estimator": "aer"}, "adjoint"),
+        ({"shots": 10}, "parameter-shift"),
+        ({"estimator": "aer", "noise_model": "depolarizing"}, "parameter-shift"),
+    ],
+)
+def test_qiskit_differentiates_by_the_adjoint_method_where_it_is_exact(options, gradient):
+    assert create_backend("qiskit", ansatz("cz", 2, 1), **options).gradient == gradient
 
 
 # What cannot be done.
@@ -419,7 +421,10 @@ def test_qiskit_differentiates_by_the_fastest_way_that_is_installed(monkeypatch,
         ("pennylane", {"shots": 0}, "shots = 0: .*greater than or equal to 1"),
         ("qiskit", {"estimator": "air"}, "estimator = 'air'"),
         ("qiskit", {"gradient": "revers"}, "gradient = 'revers'"),
-        ("qiskit", {"gradient": "reverse", "shots": 10}, "'reverse' needs .* without shots"),
+        ("qiskit", {"gradient": "reverse", "shots": 10}, "'reverse' needs exact states"),
+        ("qiskit", {"gradient": "adjoint", "shots": 10}, "'adjoint' needs exact states, without shots"),
+        ("qiskit", {"shots": 0}, "shots = 0: .*greater than or equal to 1"),
+        ("qiskit", {"readout_error": 0.1}, "readout_error = 0.1 needs noise_model = 'depolarizing'"),
         ("qiskit", {"noise_model": "depolarizing"}, "needs estimator = 'aer'"),
         ("qiskit", {"noise_rate": 1.5}, "noise_rate = 1.5"),
     ],
@@ -444,30 +449,17 @@ def test_a_backend_without_options_says_that_it_has_none():
         create_backend("native", ansatz("cz", 2, 1), shots=10)
 
 
-@pytest.mark.parametrize(
-    ("missing", "options", "command"),
-    [
-        ("qiskit_algorithms", {"gradient": "reverse"}, r"pip install qiskit-algorithms"),
-        ("qiskit_aer", {"estimator": "aer"}, r"pip install 'qrlsuite\[aer\]'"),
-        ("psutil", {"estimator": "aer"}, r"pip install 'qrlsuite\[aer\]'"),
-    ],
-)
-def test_missing_packages_are_named_with_their_command(monkeypatch, missing, options, command):
-    import importlib
-
+def test_a_missing_package_is_named_with_its_command(monkeypatch):
     import_module = importlib.import_module
 
     def without(name, package=None):
-        if name.split(".")[0] == missing:
-            raise ModuleNotFoundError(f"No module named '{missing}'", name=missing)
-        return object() if name.split(".")[0] in ("qiskit_aer", "psutil") else import_module(name, package)
+        if name.startswith("qiskit_algorithms"):
+            raise ModuleNotFoundError(f"No module named '{name}'", name="qiskit_algorithms")
+        return import_module(name, package)
 
-    monkeypatch.setattr("qrlsuite.plugins.circuits.qiskit.importlib.import_module", without)
-    from qrlsuite.plugins.circuits.options import QiskitOptions
-    from qrlsuite.plugins.circuits.qiskit import QiskitBackend
-
-    with pytest.raises(OptionError, match=f"'{missing}' is missing; {command}"):
-        QiskitBackend(ansatz("cz", 2, 1), QiskitOptions(**options))
+    monkeypatch.setattr(importlib, "import_module", without)
+    with pytest.raises(OptionError, match="'qiskit_algorithms' is missing; pip install qiskit-algorithms"):
+        create_backend("qiskit", ansatz("cz", 2, 1), gradient="reverse")
 
 
 @pytest.mark.parametrize("gradient", ["parameter-shift", "lin-comb"])
@@ -476,6 +468,57 @@ def test_qiskits_other_gradients(gradient):
     given = draw(circuit, 1, 1)
     got = evaluate(create_backend("qiskit", circuit, gradient=gradient), *given)
     assert_close(got, evaluate(create_backend("pennylane", circuit), *given), 1e-10)
+
+
+def test_estimator_qnn_and_torch_connector_give_the_same_numbers():
+    from qiskit_machine_learning.connectors import TorchConnector
+
+    circuit = ansatz("iqp", 2, 1)
+    backend = create_backend("qiskit", circuit)
+    inputs, parameters, cotangent = draw(circuit, 1, 2)
+    angles = backend.table(inputs, parameters)[:, 0]
+    rotations = backend.elementary(angles).T.float().requires_grad_()
+    values = TorchConnector(backend.network(), initial_weights=np.zeros(0))(rotations)
+    values.backward(cotangent[0].float())
+
+    again = rotations.detach().double().requires_grad_()
+    ours = create_backend("qiskit", circuit, gradient="parameter-shift")
+    got = measured(again.T, lambda some, call: ours._execute(some), shift_rule([False] * again.shape[1]))
+    got.backward(cotangent[0])
+    assert_close([values.detach(), rotations.grad], [got.detach(), again.grad], 1e-6)
+    assert_close([values.detach()], [backend(inputs, parameters)[0]], 1e-6)
+
+
+def test_qiskit_runs_all_lanes_and_all_shifts_of_them_in_one_call(monkeypatch):
+    circuit = ansatz("cz", 2, 1)
+    lanes = []
+    call = QiskitBackend._call
+    monkeypatch.setattr(QiskitBackend, "_call", lambda self, r, s: lanes.append(len(r)) or call(self, r, s))
+    given = draw(circuit, 3, 4)
+    evaluate(create_backend("qiskit", circuit), *given)
+    assert lanes == [12]  # the gradient is the native simulator's
+    lanes.clear()
+    evaluate(create_backend("qiskit", circuit, gradient="parameter-shift"), *given)
+    assert lanes == [12, 12 * 2 * 6]  # 6 rotations
+
+
+def test_a_lane_of_qiskit_has_the_same_bits_alone_and_among_many():
+    circuit = ansatz("iqp", 4, 2)
+    inputs, parameters, _ = draw(circuit, 8, 64)
+    backend = create_backend("qiskit", circuit)
+    one = {name: value[5:6] for name, value in parameters.items()}
+    assert torch.equal(backend(inputs, parameters)[5], backend(inputs[5:6], one)[0])
+
+
+def test_exact_values_differentiated_by_spsa_are_the_same_with_the_same_seeds():
+    circuit = ansatz("cz", 2, 1)
+    given = draw(circuit, 2, 3)
+    backend = create_backend("qiskit", circuit, gradient="spsa")
+    assert backend.draws
+    first, again, other = (evaluate(backend, *given, seeds=seeds) for seeds in ([1, 2], [1, 2], [1, 3]))
+    assert all(torch.equal(a, b) for a, b in zip(first, again))
+    assert torch.equal(first[2][0], other[2][0])
+    assert not torch.equal(first[2][1], other[2][1])
 
 
 def test_qiskits_spsa_is_an_unbiased_guess():
@@ -487,8 +530,6 @@ def test_qiskits_spsa_is_an_unbiased_guess():
 
 
 def test_aer_is_exact_and_loses_contrast_under_noise():
-    pytest.importorskip("qiskit_aer")
-    pytest.importorskip("psutil")
     circuit = ansatz("iqp", 2, 1, gate="u3")
     given = draw(circuit, 1, 1)
     expected = evaluate(create_backend("pennylane", circuit), *given)
@@ -498,3 +539,32 @@ def test_aer_is_exact_and_loses_contrast_under_noise():
     assert_close(got, expected, 1e-10)
     weaker = create_backend("qiskit", circuit, **noisy, noise_rate=0.2)(given[0], given[1])
     assert float(weaker.abs().max()) < float(expected[0].abs().max())
+
+
+@pytest.mark.parametrize("shots", [None, 20000])
+def test_qiskits_readout_errors_shrink_expectation_values(shots):
+    circuit = Circuit(1)
+    circuit.append("RY", 0, circuit.input(0))
+    x = torch.tensor([[[0.0], [np.pi], [1.0]]], dtype=torch.float64)
+    noise = {"estimator": "aer", "noise_model": "depolarizing", "noise_rate": 0.0, "readout_error": 0.1}
+    values = create_backend("qiskit", circuit, shots=shots, **noise)(x, {}, [1])
+    tolerance = 1e-12 if shots is None else 4 / np.sqrt(20000)
+    assert_close([values], [0.8 * torch.cos(x)], tolerance)
+
+
+@pytest.mark.parametrize("shots", [None, 1000])
+def test_a_circuit_is_transpiled_for_a_device_and_takes_its_noise(shots):
+    circuit = ansatz("iqp", 3, 1)  # a ring; the device is a chain
+    inputs, parameters, _ = draw(circuit, 1, 4)
+    exact = create_backend("qiskit", circuit)(inputs, parameters)
+    device = {"estimator": "aer", "noise_model": "GenericBackendV2", "shots": shots}
+    values = create_backend("qiskit", circuit, **device)(inputs, parameters, [1])
+    error = float((values - exact).abs().max())
+    assert 1e-4 < error < (0.1 if shots is None else 0.25)
+
+
+def test_a_device_that_is_too_small_is_refused():
+    pytest.importorskip("qiskit_ibm_runtime")
+    device = {"estimator": "aer", "noise_model": "FakeManilaV2"}
+    with pytest.raises(OptionError, match="'FakeManilaV2' has 5 qubits, the circuit 6"):
+        create_backend("qiskit", ansatz("cz", 6, 1), **device)

@@ -11,7 +11,6 @@ from qrlsuite.plugins.models.vqc import VQCNativeOptions, VQCOptions, VQCPennyLa
 
 CLASSES = {"pennylane": VQCPennyLaneOptions, "native": VQCNativeOptions, "qiskit": VQCQiskitOptions}
 BACKENDS = [name for name in CLASSES if name in registry.load().names("circuit_backends")]
-FAST = [name for name in BACKENDS if name != "qiskit"]
 
 
 def small(backend="pennylane", **values):
@@ -113,7 +112,7 @@ WIDE = (16, 3, 1, "float32")  # wide enough for batched matrix products
     ("backend", "qubits", "out", "batch", "dtype"),
     [
         (backend, *shape)
-        for backend in FAST
+        for backend in BACKENDS
         for shape in (SHAPES if backend == "pennylane" else [*SHAPES, WIDE])
     ],
 )
