@@ -5,14 +5,10 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long docs install install-dev
+.PHONY: quickstart test test-long verify docs site dist demo-of-wheel install install-dev
 
 quickstart: install
-	$(BIN)/qrlsuite run --task beam6g --model mlp --quick --epochs 5 --minutes 2 --runs $(RUNS)
-	$(BIN)/qrlsuite run --task beam6g --model vqc-pennylane --quick --epochs 5 --minutes 2 --runs $(RUNS)
-	$(BIN)/qrlsuite plot curves --task beam6g --entry mlp --entry vqc-pennylane --runs $(RUNS) \
-	  || $(BIN)/qrlsuite plot curves --task beam6g --runs $(RUNS)  # a busy machine may not have finished an epoch of both
-	$(BIN)/qrlsuite leaderboard --task beam6g --runs $(RUNS)
+	$(BIN)/qrlsuite demo --runs $(RUNS)
 	@echo 'next: source $(BIN)/activate    (makes the command qrlsuite known to this terminal)'
 
 test: install-dev
@@ -27,10 +23,36 @@ test: install-dev
 test-long: install-dev
 	$(BIN)/python -m pytest -q -m long --durations=0
 
+# Published entries: hashes, files, and RERUN seeds of each trained again. ENTRIES names folders, by default those in
+# which this checkout differs from BASE.
+BASE ?= origin/main
+RERUN ?= 2
+ENTRIES ?= $(shell git diff --name-only --diff-filter=d $(BASE) -- leaderboard/entries | cut -d/ -f1-4 | sort -u)
+verify: install
+	@if [ -z "$(ENTRIES)" ]; then echo 'no entry differs from $(BASE)'; \
+	else $(BIN)/qrlsuite leaderboard verify $(ENTRIES) --rerun $(RERUN); fi
+
 # Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
 docs: install-dev
 	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
 	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The documentation, and the leaderboard of published entries beside it, in one folder whose links are all checked.
+site: docs
+	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board
+	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board/index.html
+
+# What a release publishes; and what a user gets of it, who has no clone.
+dist: $(BIN)/python
+	rm -rf dist
+	$(BIN)/pip install --quiet build
+	$(BIN)/python -m build --outdir dist .
+demo-of-wheel: dist
+	$(MAKE) $(VENV)-wheel/bin/python VENV=$(VENV)-wheel
+	$(VENV)-wheel/bin/pip install --quiet --force-reinstall --no-deps dist/*.whl
+	$(VENV)-wheel/bin/pip install --quiet dist/*.whl
+	mkdir -p $(VENV)-wheel/elsewhere
+	cd $(VENV)-wheel/elsewhere && ../bin/qrlsuite demo
 
 install: $(BIN)/python
 	rm -f $(VENV)/editable

@@ -39,6 +39,7 @@ _ROOM = "qrlsuite.cli.commands"
 BUILT_IN = {
     command.name: command
     for command in (
+        LazyCommand("demo", "Train two small models and compare them: 5 minutes.", f"{_ROOM}.demo:demo"),
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
         LazyCommand("status", "Show what is running, waiting and stopped.", f"{_ROOM}.status:status"),
         LazyCommand("runs", "List the results folder: entries, seeds, size.", f"{_ROOM}.runs:runs"),
@@ -107,10 +108,9 @@ def build() -> typer.Typer:
             "Does a quantum model really beat a classical one at reinforcement learning, or did five lucky seeds "
             "say so? Train many seeds, estimate sample complexity with confidence intervals, and rank by "
             "significant outperformance.\n\n"
-            "Start with:  qrlsuite run --task beam6g --model mlp --quick"
+            "Start with:  qrlsuite demo"
         ),
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-TaskOption = Annotated[str | None, typer.Option("--task", help="Only this task.")]
+
+def names_of(kind: str) -> Callable[[str], list[str]]:
+    """Return what completes the beginning of a registered name: `kind` is as in `qrlsuite list`."""
+
+    def complete(incomplete: str) -> list[str]:
+        from qrlsuite import registry
+
+        return [name for name in registry.load().names(kind) if name.startswith(incomplete)]
+
+    return complete
+
+
+TaskOption = Annotated[
+    str | None, typer.Option("--task", help="Only this task.", autocompletion=names_of("tasks"))
+]
 AmongOption = Annotated[
     str | None, typer.Option("--task", help="Look for ENTRY among the entries of this task only.")
 ]

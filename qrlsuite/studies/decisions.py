@@ -204,7 +204,7 @@ def write(
         If there are fewer than two entries, they would end at different horizons, or a name, an option or a number
         cannot be used.
     """
-    drafts = [_draft(text, algorithm, preset) for text in names]
+    drafts = [_read_entry(text, algorithm, preset) for text in names]
     entries = [draft.resolve(task) for draft in drafts]
     if len(entries) < 2:
         raise OptionError(f"{len(entries)} of two or more entries: write each as 'MODEL NAME=VALUE ...'")
@@ -243,7 +243,7 @@ def write(
 
 
 @dataclass(frozen=True)
-class _Draft:
+class _WrittenEntry:
     """An entry of a new plan as it was written."""
 
     algorithm: str | None
@@ -286,7 +286,7 @@ def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
     }
 
 
-def _draft(text: str, algorithm: str | None, preset: str | None) -> _Draft:
+def _read_entry(text: str, algorithm: str | None, preset: str | None) -> _WrittenEntry:
     """Split `[ALGORITHM] MODEL NAME=VALUE ...` into its parts."""
     plain = [word for word in text.split() if "=" not in word]
     if len(plain) not in (1, 2) or text.split()[: len(plain)] != plain:
@@ -294,7 +294,7 @@ def _draft(text: str, algorithm: str | None, preset: str | None) -> _Draft:
     settings = [options.parse_setting(word) for word in text.split()[len(plain) :]]
     values = {".".join(part for part in (each.side, each.name) if part): each.value for each in settings}
     chosen = str(values.pop("preset", preset or "")) or None
-    return _Draft(plain[0] if len(plain) == 2 else algorithm, plain[-1], chosen, values)
+    return _WrittenEntry(plain[0] if len(plain) == 2 else algorithm, plain[-1], chosen, values)
 
 
 def _next_block(file: PlanFile) -> int:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite import options, registry, specs
-from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -34,13 +34,28 @@ QUICK_QUBITS = 4
 
 def run(
     task: Annotated[
-        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+        str,
+        typer.Option(
+            "--task",
+            help="A task (see `qrlsuite list tasks`) or a task file's path.",
+            autocompletion=names_of("tasks"),
+        ),
     ],
     model: Annotated[
-        str, typer.Option("--model", help="A function approximator (see `qrlsuite list models`).")
+        str,
+        typer.Option(
+            "--model",
+            help="A function approximator (see `qrlsuite list models`).",
+            autocompletion=names_of("models"),
+        ),
     ],
     algorithm: Annotated[
-        str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
+        str | None,
+        typer.Option(
+            "--algorithm",
+            help="A learning algorithm; default: the task's.",
+            autocompletion=names_of("algorithms"),
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,
