@@ -1,4 +1,4 @@
-"""Writes the task files that are `beam6g.toml` but for a few lines: the text's physics, and the random placements.
+"""Writes the task files that are `beam6g.toml` but for a few lines: degrees, the text's physics, random placements.
 
     python -m qrlsuite.tasks.variants
 
@@ -12,6 +12,7 @@ from pathlib import Path
 
 from qrlsuite.plugins.environments.beam6g.placements import COUNTS, PER_COUNT, SEED, placement
 
+DEGREES = (4, 5, 6)
 _BASE = Path(__file__).parent / "beam6g.toml"
 
 
@@ -19,6 +20,8 @@ def files() -> dict[str, str]:
     """Return the content of every such task file by its name."""
     base = _BASE.read_text(encoding="utf-8")
     texts = {"beam6g-text.toml": _text(base)}
+    for degree in DEGREES:
+        texts[f"beam6g-degree{degree}.toml"] = _degree(base, degree)
     for antennas in COUNTS:
         for index in range(PER_COUNT):
             texts[f"beam6g-a{antennas}-{index}.toml"] = _placement(base, antennas, index)
@@ -35,6 +38,17 @@ def _text(base: str) -> str:
     )
     physics = '\n# The text\'s intensity and codebook; the published results come from "released".\nphysics = "text"'
     return _replaced(changed, r"^steps = 200$", f"steps = 200{physics}")
+
+
+def _degree(base: str, degree: int) -> str:
+    """Return the task file of paths of another degree."""
+    changed = _headed(
+        base,
+        f"# a3-main with paths through {degree} support points (the paper's appendix on task complexity).",
+        f"beam6g-degree{degree}",
+        f"Beam management with paths of degree {degree}, else as beam6g",
+    )
+    return _replaced(changed, r"^degree = 3$", f"degree = {degree}")
 
 
 def _placement(base: str, antennas: int, index: int) -> str:

@@ -19,8 +19,11 @@ def test_there_are_ten_to_fifteen_terms_each_once() -> None:
     assert 10 <= len(terms) == len(set(terms)) <= 15
 
 
-@pytest.mark.parametrize(("term", "meaning", "module"), ROWS, ids=[row[0] for row in ROWS])
-def test_a_term_is_found_where_the_glossary_says(term: str, meaning: str, module: str) -> None:
+@pytest.mark.parametrize(
+    ("term", "module"),
+    [(term, module) for term, _, modules in ROWS for module in modules.split("`, `")],
+)
+def test_a_term_is_found_where_the_glossary_says(term: str, module: str) -> None:
     found = importlib.util.find_spec(module)
     assert found is not None
     assert found.origin is not None

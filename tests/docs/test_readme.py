@@ -44,9 +44,13 @@ def test_the_core_hours_are_the_boards(board: list[dict[str, str]]) -> None:
 @pytest.mark.parametrize(
     ("first", "second", "sentence"),
     [
-        ("mlp width=16 lr=0.002", "vqc-native qubits=6", "it outperforms 6 qubits in {} of 49 cells"),
-        ("mlp width=16 lr=0.002", "vqc-native qubits=8", "and 8 qubits in {}"),
-        ("vqc-native qubits=10", "mlp width=16 lr=0.002", "10 qubits are ahead of it in {}"),
+        (
+            "mlp width=16 lr=0.002",
+            "vqc-native qubits=6",
+            "outperforms the circuit of 6 qubits in {} of 49 cells",
+        ),
+        ("mlp width=16 lr=0.002", "vqc-native qubits=8", "and the one of 8 qubits in {}"),
+        ("vqc-native qubits=10", "mlp width=16 lr=0.002", "the circuit of 10 qubits is ahead of it in {}"),
     ],
 )
 def test_the_cells_of_the_retuned_network(first: str, second: str, sentence: str) -> None:
@@ -68,6 +72,5 @@ def test_the_two_halves_of_the_seeds() -> None:
         return comparison.count(Verdict.WIN)
 
     assert ahead(slice(0, 50)) == 0
-    assert f"the other fifty 10 qubits are ahead in {ahead(slice(50, 100))} cells" in FIRST_SCREEN.replace(
-        "\n", " "
-    )
+    sentence = f"on seeds 50 to 99 the circuit is ahead in {ahead(slice(50, 100))} cells"
+    assert sentence in FIRST_SCREEN.replace("\n", " ")
