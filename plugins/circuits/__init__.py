@@ -32,8 +32,8 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
     register(
         CircuitBackendSpec(
             name="native",
-            summary="The suite's own batched simulator with adjoint gradients; exact, no options",
-            options=f"{_HERE}.native:NativeOptions",
+            summary="The suite's own batched simulator; options: shots, gradient, noise_model, trajectories",
+            options=f"{_HERE}.options:NativeOptions",
             factory=f"{_HERE}.native:NativeBackend",
             mean_field=True,
         )
@@ -49,7 +49,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
     register(
         CircuitBackendSpec(
             name="qiskit",
-            summary="EstimatorQNN over a V2 primitive; options: estimator, gradient, shots, noise_model",
+            summary="Qiskit's simulator Aer; options: estimator, gradient, shots, noise_model",
             options=f"{_HERE}.options:QiskitOptions",
             factory=f"{_HERE}.qiskit:QiskitBackend",
         )

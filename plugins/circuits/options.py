@@ -34,6 +34,40 @@ READOUT_ERROR = "probability that a measured bit is read wrongly, with noise_mod
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class NativeOptions:
+    """Options of the native simulator: exact, unless shots or noise are asked for."""
+
+    shots: Annotated[
+        int | None,
+        Field(ge=1, description="repetitions per expectation value; absent: exact"),
+        Since("0.2.0"),
+    ] = None
+    gradient: Annotated[
+        Literal["auto", "parameter-shift", "spsa"],
+        Field(
+            description="auto: without shots adjoint, with shots parameter-shift (every shifted circuit is sampled). "
+            "spsa: a guess from two circuits"
+        ),
+        Since("0.2.0"),
+    ] = "auto"
+    noise_model: Annotated[
+        Literal["depolarizing"] | None,
+        Field(description="depolarizing: random Pauli errors after every gate; absent: none"),
+        Since("0.2.0"),
+    ] = None
+    noise_rate: Annotated[float, Field(ge=0.0, le=1.0, description=NOISE_RATE), Since("0.2.0")] = 0.01
+    readout_error: Annotated[float, Field(ge=0.0, le=0.5, description=READOUT_ERROR), Since("0.2.0")] = 0.0
+    trajectories: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="draws of all errors of a circuit over which noise is averaged; shots are shared among them",
+        ),
+        Since("0.2.0"),
+    ] = 100
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class QiskitOptions:
     """Options of the Qiskit backend."""
 

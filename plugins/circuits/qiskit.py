@@ -31,7 +31,7 @@ from torch import Tensor
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit
 from qrlsuite.circuit.elementary import Elementary
-from qrlsuite.circuit.shifts import measured, shift_rule, spsa_rule
+from qrlsuite.circuit.shifts import measured, random_signs, shift_rule, spsa_rule, stream
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.plugins.circuits.native import NativeBackend
 from qrlsuite.plugins.circuits.options import QiskitOptions
@@ -159,13 +159,13 @@ class QiskitBackend:
         own = np.random.SeedSequence(seed).entropy
         rule = shift_rule([False] * self.elementary.rotations)
         if self.gradient == "spsa":
-            rule = spsa_rule(_signs(_stream(own, 0, 0, 0)))
+            rule = spsa_rule(random_signs(stream(own, 0, 0, 0)))
         return measured(rotations, lambda some, call: self._execute(some, own, call), rule)
 
     def _execute(self, rotations: Tensor, entropy: Any = 0, call: int = 0) -> Tensor:
         """Run the circuit once per lane: rotation angles (R, lanes) to expectation values (lanes, observables)."""
         values = [
-            self._call(some.T.numpy(), _stream(entropy, call, number))
+            self._call(some.T.numpy(), stream(entropy, call, number))
             for number, some in enumerate(rotations.split(LANES_PER_CALL, dim=1))
         ]
         return torch.from_numpy(np.concatenate(values))
@@ -240,17 +240,6 @@ class _Network(torch.autograd.Function):
         (rotations,) = ctx.saved_tensors
         jacobian, _ = ctx.network.backward(rotations.T.numpy(), [])
         return torch.einsum("bo,bor->rb", grads[0], torch.from_numpy(jacobian)), None
-
-
-def _stream(entropy: Any, *path: int) -> np.random.SeedSequence:
-    """Return the stream of one part of one pass."""
-    return np.random.SeedSequence(entropy, spawn_key=path)
-
-
-def _signs(seed: np.random.SeedSequence) -> Any:
-    """Return what draws tensors of +1 and -1."""
-    source = np.random.default_rng(seed)
-    return lambda shape: torch.from_numpy(source.choice([-1.0, 1.0], shape))
 
 
 def _gradient(options: QiskitOptions) -> str:

@@ -27,7 +27,7 @@ from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
-from qrlsuite.plugins.circuits.options import PennyLaneOptions, QiskitOptions
+from qrlsuite.plugins.circuits.options import NativeOptions, PennyLaneOptions, QiskitOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
@@ -135,7 +135,7 @@ class VQCQiskitOptions(QiskitOptions, VQCOptions):
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class VQCNativeOptions(VQCOptions):
+class VQCNativeOptions(NativeOptions, VQCOptions):
     """Options of `vqc-native`."""
 
     backend: ClassVar[str] = "native"

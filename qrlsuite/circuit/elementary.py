@@ -33,8 +33,6 @@ class Elementary:
         The gates in order: RX, RY, RZ, H, X, Y, Z, S, T, CNOT, CZ, SWAP.
     rotations:
         Number R of rotations.
-    variable:
-        The rotations whose angle depends on an input or a parameter.
     """
 
     def __init__(self, circuit: Circuit, table: AngleTable) -> None:
@@ -43,24 +41,22 @@ class Elementary:
         for operation, rows in zip(circuit, table.rows):
             self._append(operation.gate, operation.wires, rows, operation.control)
         self.rotations = len(self._terms)
-        self.variable = [
-            r for r, terms in enumerate(self._terms) if any(isinstance(s, int) for _, s in terms)
-        ]
         variable = [[(f, s) for f, s in terms if isinstance(s, int)] for terms in self._terms]
         depth = max(map(len, variable), default=0)
         padded = [[*terms, *[(0.0, 0)] * (depth - len(terms))] for terms in variable]
-        self._factors = torch.tensor([[f for f, _ in terms] for terms in padded], dtype=torch.float64)
-        self._sources = torch.tensor([[s for _, s in terms] for terms in padded], dtype=torch.int64)
+        # (depth, R): the k-th term of every rotation
+        self._factors = torch.tensor([[f for f, _ in column] for column in zip(*padded)], dtype=torch.float64)
+        self._sources = torch.tensor([[s for _, s in column] for column in zip(*padded)], dtype=torch.int64)
         self._constants = torch.tensor(
             [sum(f * s for f, s in terms if not isinstance(s, int)) for terms in self._terms],
             dtype=torch.float64,
         )
 
     def __call__(self, angles: Tensor) -> Tensor:
-        """Return rotation angles (R, lanes) from the circuit's angles (A, lanes), radians, float64."""
+        """Return rotation angles (R, lanes) from the circuit's angles (A, lanes), radians."""
         # A sum in fixed order: a matrix product's bits could depend on the number of lanes.
-        total = self._constants[:, None].expand(-1, angles.shape[1])
-        for factors, sources in zip(self._factors.T, self._sources.T):
+        total = self._constants.to(angles)[:, None].expand(-1, angles.shape[1])
+        for factors, sources in zip(self._factors.to(angles), self._sources):
             total = total + factors[:, None] * angles.index_select(0, sources)
         return total
 

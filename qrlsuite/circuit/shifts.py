@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -93,6 +94,17 @@ def shift_rule(controlled: Sequence[bool]) -> Rule:
         return shifted, lambda values, grad: vector_jacobian(values, grad, plan)
 
     return rule
+
+
+def stream(entropy: Any, *path: int) -> np.random.SeedSequence:
+    """Return the random stream of one part of one pass; `entropy` is a seed's, see `numpy.random.SeedSequence`."""
+    return np.random.SeedSequence(entropy, spawn_key=path)
+
+
+def random_signs(seed: np.random.SeedSequence) -> Callable[[tuple[int, ...]], Tensor]:
+    """Return what draws tensors of +1 and -1."""
+    source = np.random.default_rng(seed)
+    return lambda shape: torch.from_numpy(source.choice([-1.0, 1.0], shape))
 
 
 def spsa_rule(signs: Callable[[tuple[int, ...]], Tensor]) -> Rule:

@@ -42,7 +42,7 @@ RULES = {
 """Rules of each kind, after those that all have in common."""
 
 WHERE_OFFERED = {
-    ("circuit_backends", "native"): ["mean field"],
+    ("circuit_backends", "native"): ["mean field", "shots"],
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
     ("significance_tests", "intervals"): ["against"],

@@ -8,28 +8,26 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.plugins.circuits.native.program import Program, compile_circuit
+from qrlsuite.plugins.circuits.options import NativeOptions
 
 if TYPE_CHECKING:
     from qrlsuite.plugins.circuits.native.cpu import Simulator
+    from qrlsuite.plugins.circuits.native.sampling import Sampler
 
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class NativeOptions:
-    """The native simulator has no options: it is exact, and works in the precision of its inputs."""
+NOT_FINITE = "the circuit's inputs or parameters are not finite (NaN or infinite)"
 
 
 class NativeBackend:
-    """Batched statevector simulation with adjoint gradients, see `qrlsuite.circuit.CircuitBackend`.
+    """Batched statevector simulation, see `qrlsuite.circuit.CircuitBackend`.
 
-    On the CPU compiled kernels run on one thread; tensors on another device are computed there, by plain torch
+    Exact values have adjoint gradients; shots and noise are described in `sampling`, and computed on the CPU. There
+    compiled kernels run on one thread; tensors on another device are computed there, by plain torch
     operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state. Mean-field approximations of
     circuits take 3 numbers per qubit and 6 per gate.
 
@@ -38,16 +36,36 @@ class NativeBackend:
     circuit:
         What to run; its whole content is copied here, later changes have no effect.
     options:
-        None are needed.
-    """
+        Shots, noise and gradient; by default values are exact.
 
-    shots: int | None = None
+    Attributes
+    ----------
+    draws, gradient_circuits:
+        Whether results are random, and if so how many circuits a gradient takes per input.
+
+    Raises
+    ------
+    OptionError
+        If gates connect too many qubits, options do nothing without others, or a mean-field approximation has shots.
+    """
 
     def __init__(self, circuit: Circuit, options: NativeOptions | None = None) -> None:
         circuit.require_simulable()
+        self.options = NativeOptions() if options is None else options
+        _check(self.options, circuit)
+        self.shots = self.options.shots
+        self.draws = (
+            self.shots is not None or self.options.noise_model is not None or self.options.gradient == "spsa"
+        )
         self.circuit = copy.deepcopy(circuit)
         self.shapes = {name: p.shape for name, p in circuit.parameters.items()}
         self._simulator: Simulator | None = None
+        self._sampler: Sampler | None = None
+        if self.draws or self.options.gradient != "auto":
+            from qrlsuite.plugins.circuits.native.sampling import Sampler
+
+            self._sampler = Sampler(self.circuit, self.options)
+            self.gradient_circuits = self._sampler.gradient_circuits
 
     def __call__(
         self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None = None
@@ -61,7 +79,7 @@ class NativeBackend:
         parameters:
             Every declared parameter by name, (S, *shape), of the inputs' dtype and device.
         seeds:
-            Without meaning here: the values are exact.
+            One per seed where shots or noise are simulated; see `qrlsuite.circuit.CircuitBackend`.
 
         Raises
         ------
@@ -69,6 +87,11 @@ class NativeBackend:
             For wrong shapes or dtypes, missing parameters, or values that are not finite.
         """
         self._check(inputs, parameters)
+        if self._sampler is not None:
+            there = {name: value.cpu() for name, value in parameters.items()}
+            if not all(bool(torch.isfinite(v.detach().sum())) for v in (inputs, *there.values())):
+                raise OptionError(NOT_FINITE)
+            return self._sampler(inputs.cpu(), there, seeds).to(inputs)
         size = inputs.shape[0]
         if self.shapes:
             flat = torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
@@ -77,7 +100,7 @@ class NativeBackend:
         run = self.simulator() if inputs.device.type == "cpu" else self.by_torch
         result = run(inputs, flat)
         if not bool(torch.isfinite(result.detach().sum())):
-            raise OptionError("the circuit's inputs or parameters are not finite (NaN or infinite)")
+            raise OptionError(NOT_FINITE)
         return result
 
     def by_torch(self, inputs: Tensor, flat: Tensor) -> Tensor:
@@ -124,3 +147,17 @@ class NativeBackend:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NativeBackend:
         return self
+
+
+def _check(options: NativeOptions, circuit: Circuit) -> None:
+    """Refuse options that would do nothing, and shots or noise of what is no circuit."""
+    if options.noise_model is None:
+        defaults = NativeOptions()
+        for name in ("noise_rate", "readout_error", "trajectories"):
+            if getattr(options, name) != getattr(defaults, name):
+                raise OptionError(f"{name} = {getattr(options, name):g} needs noise_model = 'depolarizing'")
+    if circuit.mean_field and options != NativeOptions():
+        raise OptionError(
+            "the mean-field approximation of a circuit is none, so it has no shots, noise or gradient rule; leave out "
+            "shots, noise_model and gradient"
+        )
