@@ -110,6 +110,7 @@ class PublishedEntry:
             devices=origin.devices(provenance),
             executions=int(self.executions.sum()),
             tuning=record["tuning"],
+            plan=record.get("plan"),
             source="published",
             records={
                 seed: {

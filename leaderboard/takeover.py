@@ -91,8 +91,13 @@ def sources(folder: Path) -> list[EntryStore]:
     return stores
 
 
-def take_over(source: EntryStore, runs: Path) -> TakenOver:
+def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenOver:
     """Copy the seeds of an entry that are not in a results folder yet.
+
+    Parameters
+    ----------
+    plan:
+        Hash of the decision plan that the results folder belongs to, if it does.
 
     Raises
     ------
@@ -102,7 +107,7 @@ def take_over(source: EntryStore, runs: Path) -> TakenOver:
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
     entry = source.entry()  # computes the hash anew
-    if entry.plan is not None:
+    if entry.plan != plan:
         raise StoreError(
             f"{source.path} belongs to a decision plan, whose number of seeds depends on what they showed: it is "
             "continued by the plan alone"
@@ -214,6 +219,7 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> T
         )
         made.write_record(
             {
+                **({} if entry.plan is None else {"plan": entry.plan}),
                 "task": entry.task.name,
                 "task_hash": entry.task.hash,
                 "entry": entry.name,

@@ -528,6 +528,47 @@ def test_a_plan_keeps_the_values_and_the_record_of_a_preset_file() -> None:
     assert (records[tuned]["trials"], records[tuned]["preset"]) == (3, "tuned.toml")
 
 
+@pytest.fixture
+def exported() -> Path:
+    """A plan of a few seeds, published."""
+    write("mlp width=16", "mlp width=4", "--looks", "3,5", "--reason", "a test", plan="p.toml")
+    answer("run", "p.toml", "--engine", "scripted")
+    result = say("export", "p.toml", "--out", "plans")
+    assert "next: " in result.stdout
+    return Path("plans/p")
+
+
+def test_a_published_plan_is_decided_by_its_curves_and_goes_on_elsewhere(exported: Path) -> None:
+    before = answer("status", "p.toml")
+    after = answer("status", str(exported))
+    for outcome in (before, after):
+        del outcome["next_core_hours"], outcome["core_hours_saved"]
+    assert [round(entry.pop("core_hours"), 6) for entry in before["entries"]] == [
+        round(entry.pop("core_hours"), 6) for entry in after["entries"]
+    ]
+    assert after == before
+    runner = CliRunner()
+    taken = runner.invoke(build(), ["import", str(exported), "--runs", "elsewhere"], catch_exceptions=False)
+    assert taken.output.count("imported seeds 10000:10005") == 2, taken.output
+    there = answer("status", "p.toml", "--runs", "elsewhere")
+    assert [pair["p"] for pair in there["pairs"]] == [pair["p"] for pair in before["pairs"]]
+    assert there["looks_taken"] == before["looks_taken"]
+    page = ["leaderboard", "--runs", "elsewhere", "--format", "html", "--out", "page.html"]
+    runner.invoke(build(), page, catch_exceptions=False)
+    assert "p: which needs fewer steps" in Path("page.html").read_text()
+    verified = runner.invoke(build(), ["leaderboard", "verify", str(exported)])
+    assert "2 of 2 entries ok" in verified.output, verified.output
+
+
+def test_a_damaged_published_plan_is_refused(exported: Path, refused: Refused) -> None:
+    text = (exported / "plan.toml").read_text()
+    (exported / "plan.toml").write_text(text.replace("alpha = 0.05", "alpha = 0.5"))
+    assert "was not trained by plan" in refused("status", str(exported))
+    assert "holds another plan" in refused("export", "p.toml", "--out", "plans")
+    (exported / "plan.toml").unlink()
+    assert "plans/p holds no plan.toml" in refused("status", str(exported))
+
+
 def test_looks_below_20_seeds_are_marked() -> None:
     write("mlp width=16", "mlp width=4", "--looks", "10,20", "--reason", "runs are dear")
     assert "NOTE: it looks below 20 seeds" in (shown := say("show", "widths.toml").stdout)

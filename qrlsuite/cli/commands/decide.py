@@ -23,6 +23,7 @@ from qrlsuite.cli.training import (
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import plans
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted, hours_range
@@ -176,16 +177,47 @@ def run(
 
 
 @app.command()
-def status(path: PlanArgument, runs: RunsOption = Path("runs"), json_output: JsonOption = False) -> None:
+def status(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PLAN.toml", help="A plan, or a folder in which `qrlsuite decide export` published one."
+        ),
+    ],
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
     """Show what is decided so far, what each open pair needs, and what was saved. Trains and writes nothing.
 
     Example: qrlsuite decide status width.toml
     """
-    outcome = decided.read(path, runs)
+    outcome = plans.read(path) if path.is_dir() else decided.read(path, runs)
     if json_output:
         typer.echo(json.dumps(outcome.as_dict()))
     else:
         _show_status(outcome)
+
+
+@app.command()
+def export(
+    path: PlanArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/NAME/.")] = Path(
+        "leaderboard/plans"
+    ),
+    runs: RunsOption = Path("runs"),
+) -> None:
+    """Write a plan with the learning curves of its seeds, so that others can compute its verdicts.
+
+    A plan that goes on may be written again. `qrlsuite decide status DIR/NAME` shows its verdicts, `qrlsuite import
+    DIR/NAME` takes its seeds over to go on with it elsewhere, and `qrlsuite leaderboard verify DIR/NAME --rerun 2`
+    trains some of them again.
+
+    Example: qrlsuite decide export width.toml
+    """
+    folder = plans.export(_study(path, runs), out)
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    typer.echo(f"wrote {folder} ({size / 1000:.0f} kB)")
+    typer.echo(f"next: {command('decide', 'status', str(folder))}")
 
 
 @app.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +11,17 @@ import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
-from qrlsuite.leaderboard import takeover
+from qrlsuite.leaderboard import plans, takeover
+from qrlsuite.leaderboard.takeover import TakenOver
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
+
+
+def _taken(folder: Path, runs: Path) -> Iterator[TakenOver]:
+    if plans.is_published(folder):
+        yield from plans.take_over(folder, runs)
+    else:
+        yield from (takeover.take_over(source, runs) for source in takeover.sources(folder))
 
 
 def import_entries(
@@ -20,7 +29,7 @@ def import_entries(
         Path,
         typer.Argument(
             metavar="FOLDER",
-            help="A results folder, a folder that `qrlsuite export` wrote, or one entry's folder in it.",
+            help="A results folder, a folder that `export` or `decide export` wrote, or one entry's folder in it.",
         ),
     ],
     runs: RunsOption = Path("runs"),
@@ -34,8 +43,7 @@ def import_entries(
     Example: qrlsuite import /mnt/cluster/runs
     """
     done = []
-    for source in takeover.sources(folder):
-        taken = takeover.take_over(source, runs)
+    for taken in _taken(folder, runs):
         done.append(taken)
         if json_output:
             continue

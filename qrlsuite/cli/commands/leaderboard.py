@@ -30,10 +30,10 @@ from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import across as several
 from qrlsuite.leaderboard import board as boards
 from qrlsuite.leaderboard import latex, report, rules, tables
+from qrlsuite.leaderboard import plans as decision_plans
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
-from qrlsuite.studies import decided
 
 
 class Format(StrEnum):
@@ -108,7 +108,7 @@ def leaderboard(
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
-    if format_ is Format.html and _page(board, output, runs, [task] if task else []):
+    if format_ is Format.html and _page(board, output, runs, [task] if task else [], published):
         return
     if not board.sections:
         raise UnknownNameError(
@@ -136,10 +136,11 @@ def _page(
     output: Path | None,
     runs: Path,
     tasks: Sequence[str],
+    published: bool,
     across: several.AcrossBoard | None = None,
 ) -> bool:
     """Write the page, with the decision plans of the tasks; returns whether there is anything to show."""
-    plans, unreadable = decided.in_folder(runs, tasks)
+    plans, unreadable = decision_plans.collected(runs, tasks, published)
     for line in unreadable:
         typer.echo(f"left out: {line}", err=True)
     if not board.sections and not plans:
@@ -178,7 +179,7 @@ def _across(
         typer.echo(f"left out: {line}", err=True)
     if format_ is Format.html:
         single = boards.build(selected, board.refused, horizon=horizon, alpha=alpha)
-        _page(single, output, runs, across, board)
+        _page(single, output, runs, across, published, board)
     elif format_ is Format.table:
         table_console(tables.WIDE).print(tables.across_table(board))
     elif format_ is Format.markdown:
