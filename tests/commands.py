@@ -13,6 +13,7 @@ import atexit
 import contextlib
 import functools
 import importlib
+import importlib.util
 import json
 import os
 import select
@@ -40,6 +41,8 @@ PRELOADED = (
     "scipy.interpolate",
     "torch",
 )
+if importlib.util.find_spec("distributed") is not None:
+    PRELOADED += ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
 HANGS = 3600
 """Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
 
@@ -122,7 +125,7 @@ def _worker(
 
 
 def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -> int:
-    """Be `python -W error -m qrlsuite WORDS`, a worker or `pytest WORDS` in a forked process."""
+    """Be `python -W error -m qrlsuite WORDS`, a worker, `pytest WORDS` or `dask WORDS` in a forked process."""
     from qrlsuite import cli, registry
     from qrlsuite.engine import local, worker
 
@@ -138,6 +141,9 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
     os.environ.update(env)
     sys.path[:0] = [path for path in env.get("PYTHONPATH", "").split(os.pathsep) if path]
     sys.argv = ["qrlsuite", *words]
+    if program == "dask":
+        importlib.import_module(f"distributed.cli.dask_{words[0]}").main(words[1:], standalone_mode=False)
+        return 0
     warnings.simplefilter("error")
     if program == "worker":
         return worker.main(words)
@@ -288,6 +294,11 @@ def start(*words: str, env: Mapping[str, str] | None = None, cwd: Path | None = 
 def start_worker(*words: str, env: Mapping[str, str] | None = None) -> Command:
     """Start `python -m qrlsuite.engine.worker WORDS` and go on."""
     return Command(list(words), env, program="worker")
+
+
+def start_dask(*words: str, env: Mapping[str, str] | None = None, cwd: Path | None = None) -> Command:
+    """Start `dask WORDS` (a scheduler or a worker) and go on."""
+    return Command(list(words), env, cwd, program="dask")
 
 
 def popen(command: list[str], *, env: Mapping[str, str], stdout: IO[bytes], **rest: object) -> Command:

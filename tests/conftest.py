@@ -237,6 +237,19 @@ def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
     return run
 
 
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 48 kB of its own: twelve pages, two seeds need nine at once."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(path)]
+    done = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"a small tmpfs cannot be mounted here: {done.stderr.strip()}")
+    yield path
+    subprocess.run(["umount", "-l", str(path)], check=True)
+
+
 def results(entry: Path, seed: int) -> tuple[bytes, bytes]:
     """The bytes that must not depend on anything but the seed: its curve and its trained agent."""
     folder = entry / f"seed-{seed:04d}"

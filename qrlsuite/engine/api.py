@@ -1,8 +1,12 @@
-"""The interface of engines: an engine runs `python -m qrlsuite.engine.worker` for every group of seeds.
+"""The interfaces of engines, which decide only *where* groups of seeds are trained.
 
-An engine decides only *where* groups run. Whatever it starts finds everything it needs in the entry's folder and
-leaves everything there, and may be started twice for the same group: the second finds the seeds claimed, or done.
-A Dask, Kubernetes or ssh engine is a plugin of one class; `qrlsuite/engine/local.py` is the shortest example.
+An `Engine` runs `python -m qrlsuite.engine.worker` for every group, on machines that share the results folder. Whatever
+it starts finds everything it needs in the entry's folder and leaves everything there, and may be started twice for the
+same group: the second finds the seeds claimed, or done. `qrlsuite/engine/local.py` is the shortest example.
+
+A `RemoteEngine` needs no shared folder: it carries tasks to workers and answers back, both bytes, and a worker calls
+`qrlsuite.training.advance.advance(task)`. Claims, trackers and the results folder stay with the process that sends the
+tasks (`qrlsuite/engine/remote.py`). `qrlsuite/engine/dask.py` is the example.
 """
 
 from __future__ import annotations
@@ -75,6 +79,71 @@ class Engine(Protocol):
         """
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What became of a task.
+
+    Attributes
+    ----------
+    key:
+        With which the task was sent.
+    content:
+        What `advance` returned for it, None where the task was lost, as when its worker died.
+    problem:
+        Why it was lost.
+    """
+
+    key: str
+    content: bytes | None
+    problem: str = ""
+
+
+class Link(Protocol):
+    """A connection to workers that call `qrlsuite.training.advance.advance`."""
+
+    def send(self, key: str, task: bytes) -> None:
+        """Have a task worked on by any worker, now or when one is free; `key` is new for every task."""
+
+    def receive(self, seconds: float) -> list[Answer]:
+        """Return the answers that have come, each once; waits for the first of them, that long at most.
+
+        Raises
+        ------
+        QrlSuiteError
+            If no further answer will come, as when the connection is lost.
+        """
+
+    def close(self) -> None:
+        """Forget the tasks that have no answer yet, and disconnect."""
+
+
+class RemoteEngine(Protocol):
+    """Workers without a shared folder; built as `factory(options)`, `options` None for a spec without options."""
+
+    def workers(self, requested: int | None) -> int:
+        """Return how many groups may be trained at a time, given what the user asked for."""
+
+    def queued(self, store: EntryStore) -> set[int]:
+        """Return the seeds of an entry that were handed to this engine before and still wait for their turn."""
+
+    def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
+        """Return a connection to workers.
+
+        Parameters
+        ----------
+        workers:
+            How many tasks will be sent at a time.
+        versions:
+            What a worker must have: versions of distributions, and of `python`. `advance` refuses where they differ;
+            a link that knows which worker has what sends it nothing.
+
+        Raises
+        ------
+        QrlSuiteError
+            If there is nobody to connect to.
+        """
+
+
 def worker_command(work: Work, group: SeedGroup) -> list[str]:
     """Return the command line that trains a group."""
     # -P: never import from the folder one stands in, which may be a source tree without its plugins
@@ -90,7 +159,7 @@ def worker_command(work: Work, group: SeedGroup) -> list[str]:
     ]
 
 
-def create(name: str, option_values: Mapping[str, Any]) -> Engine:
+def create(name: str, option_values: Mapping[str, Any]) -> Engine | RemoteEngine:
     """Build a registered engine.
 
     Parameters
@@ -115,14 +184,14 @@ def create(name: str, option_values: Mapping[str, Any]) -> Engine:
     chosen = None
     if spec.options is not None:
         chosen = options.build(specs.resolve(spec.options), chosen_values, f"engine '{name}'")
-    return cast(Engine, specs.resolve(spec.factory)(chosen))
+    return cast(Engine | RemoteEngine, specs.resolve(spec.factory)(chosen))
 
 
 class Queues:
     """Queues of submitting engines; one that fails to answer is not asked again."""
 
     def __init__(self) -> None:
-        self._engines: dict[str, Engine] = {}
+        self._engines: dict[str, Engine | RemoteEngine] = {}
         self._silent: dict[str, QrlSuiteError] = {}
 
     def waiting(self, store: EntryStore) -> set[int]:

@@ -10,7 +10,7 @@ from qrlsuite.specs import EngineSpec
 
 @hookimpl
 def register_engines(register: Callable[[EngineSpec], None]) -> None:
-    """Register `local`, `command` and `slurm`."""
+    """Register `local`, `command`, `dask` and `slurm`."""
     register(
         EngineSpec(
             name="local",
@@ -24,6 +24,16 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
             summary="Workers started by a shell command (PBS, LSF, HTCondor, ssh, Kubernetes), in a shared folder",
             factory="qrlsuite.engine.command:CommandEngine",
             options="qrlsuite.engine.command:CommandOptions",
+            remote=True,
+        )
+    )
+    register(
+        EngineSpec(
+            name="dask",
+            summary="Workers of a Dask cluster, in a cloud or a queue: no shared folder is needed",
+            factory="qrlsuite.engine.dask:DaskEngine",
+            options="qrlsuite.engine.dask:DaskOptions",
+            extras={"distributed": "pip install 'qrlsuite[dask]'"},
             remote=True,
         )
     )

@@ -11,13 +11,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
 import numpy as np
 
 from qrlsuite import registry, specs
-from qrlsuite.engine import api
-from qrlsuite.engine.api import Engine, EngineOutcome
+from qrlsuite.engine import api, remote
+from qrlsuite.engine.api import Engine, EngineOutcome, RemoteEngine
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment.entry import Entry
@@ -48,7 +48,7 @@ class Execution:
         Whether groups run on other machines than this one.
     """
 
-    engine: Engine
+    engine: Engine | RemoteEngine
     workers: int
     device: str = "cpu"
     submits: bool = False
@@ -57,9 +57,14 @@ class Execution:
 
     def run(self, work: Plan, show: api.Show) -> EngineOutcome:
         """Let the engine train the groups of a plan."""
-        return self.engine.run(
-            api.Work(work.store, work.groups, work.epochs, self.workers, self.device), show
-        )
+        handed = api.Work(work.store, work.groups, work.epochs, self.workers, self.device)
+        if _carries_bytes(self.engine):
+            return remote.train(self.engine, handed, show)
+        return self.engine.run(handed, show)
+
+
+def _carries_bytes(engine: Engine | RemoteEngine) -> TypeGuard[RemoteEngine]:
+    return hasattr(engine, "connect")
 
 
 @dataclass(frozen=True)
@@ -157,7 +162,10 @@ def plan(
     store = EntryStore.find(runs, entry)
     busy = {seed for claim in living(store) for seed in claim.seeds} | execution.engine.queued(store)
     busy &= set(requested)
-    missing = plan_groups(store, sorted(set(requested) - busy), last, execution.workers)
+    left = sorted(set(requested) - busy)
+    missing = plan_groups(store, left, last, execution.workers)
+    if missing and _carries_bytes(execution.engine):
+        missing = plan_groups(store, left, last, execution.workers, remote.seeds_per_task(entry))
     return Plan(runs, entry, store, requested, last, frozenset(busy), missing)
 
 

@@ -104,26 +104,31 @@ def _end_with(parent: int) -> bool:
     return os.getppid() == parent
 
 
-def _checkpoint_seconds() -> None:
-    """Set the time between checkpoints from the environment.
+def checkpoint_seconds(default: float) -> float:
+    """Return the time between checkpoints that the environment asks for.
 
     Raises
     ------
     StoreError
         If it is not a number of seconds.
     """
-    from qrlsuite.training import group
-
     text = os.environ.get("QRLSUITE_CHECKPOINT_SECONDS")
     if text is None:
-        return
+        return default
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
     if not seconds >= 0:
         raise StoreError(f"QRLSUITE_CHECKPOINT_SECONDS={text} is not a number of seconds")
-    group.CHECKPOINT_SECONDS = seconds
+    return seconds
+
+
+def _set_checkpoint_seconds() -> None:
+    """Set the time between checkpoints from the environment; the errors are those of `checkpoint_seconds`."""
+    from qrlsuite.training import group
+
+    group.CHECKPOINT_SECONDS = checkpoint_seconds(group.CHECKPOINT_SECONDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -140,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.follow_parent is not None and not _end_with(options.follow_parent):
         return 130
     try:
-        _checkpoint_seconds()
+        _set_checkpoint_seconds()
         train_group(
             options.folder, parse_seeds(options.seeds), options.epochs, options.device, options.follow_parent
         )

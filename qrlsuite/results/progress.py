@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -29,6 +30,11 @@ class Progress:
     epoch_seconds: float | None = None
     warnings: list[str] = field(default_factory=list)
     """What the user should know although nothing failed: a tracker that was left out."""
+
+    def finished_epoch(self, epoch: int, seed_scores: list[float]) -> None:
+        """Take in that an epoch has finished, with every seed's score after it."""
+        self.epoch, self.seed_scores = epoch, seed_scores
+        self.median_score = statistics.median(seed_scores)
 
 
 class ProgressFile:

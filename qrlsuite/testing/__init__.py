@@ -162,7 +162,10 @@ def check_study(name_or_spec: Any) -> list[Finding]:
 
 
 def check_engine(name_or_spec: Any, settings: Settings = None) -> list[Finding]:
-    """Check an engine: its methods, numbers of workers, and that a new entry waits for nothing. It starts nothing."""
+    """Check an engine: its methods, numbers of workers, that a new entry waits for nothing; it trains nothing.
+
+    An engine without a shared folder is connected to, and must answer tasks, each once.
+    """
     return check("engine", name_or_spec, settings)
 
 

@@ -10,7 +10,7 @@ import datetime
 import math
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,8 +27,171 @@ from qrlsuite.training.trainer import Epoch, Report, Trainer
 CHECKPOINT_SECONDS = 60.0
 
 
+def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
+    """Return what is recorded of an epoch, one line of `epochs.jsonl` for each seed, as plain values."""
+    lines = []
+    for s, scores in enumerate(epoch.scores):
+        line: dict[str, Any] = {"epoch": epoch.number, "scores": store.shortest(scores)}
+        for name, values in epoch.metrics.items():
+            value = float(values[s])
+            line[name] = value if math.isfinite(value) else None
+        if epoch.executions[s]:
+            line["executions"] = epoch.executions[s]
+        lines.append(line)
+    return lines
+
+
+def timing_of(epoch: Epoch, seeds: int) -> dict[str, Any]:
+    """Return a seed's line of `timings.jsonl` for an epoch of a group: the seed's share of the time, where and when."""
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    timing = {name: round(value / seeds, 6) for name, value in epoch.seconds.items()}
+    return {"epoch": epoch.number, **timing, "group": seeds, "host": socket.gethostname(), "time": now}
+
+
+class GroupFiles:
+    """The files of a group of seeds of an entry while it is trained, wherever that is done.
+
+    Parameters
+    ----------
+    entry, entry_store:
+        What is trained, and its folder.
+    seeds:
+        Protocol seeds; all at the same epoch.
+    events:
+        The trackers that are told.
+    """
+
+    def __init__(
+        self, entry: Entry, entry_store: store.EntryStore, seeds: Sequence[int], events: EventSink
+    ) -> None:
+        self.entry, self.store, self.seeds, self.events = entry, entry_store, list(seeds), events
+        self.parameters: dict[str, int] = {}
+        self.saved_epoch = 0
+
+    def resume(self) -> tuple[int, checkpoint.Arrays]:
+        """Return the epoch and the state of the newest checkpoint, 0 and nothing without one; cut what is newer.
+
+        Raises
+        ------
+        StoreError
+            If the seeds cannot be continued, or a file is damaged.
+        """
+        epoch, arrays = checkpoint.load(self.store, self.seeds)
+        for seed in self.seeds:
+            folder = self.store.seed(seed)
+            old = folder.record() or {}
+            if epoch < int(old.get("epochs", 0)) and old.get("status") == "finished":
+                raise StoreError(
+                    f"{folder.path} finished {old['epochs']} epochs and its checkpoint is gone: it cannot be "
+                    "extended; choose another folder with --runs DIR, or delete the seed's folder to start again"
+                )
+            if (held := folder.cut(epoch)) < epoch:
+                raise StoreError(
+                    f"{folder.path} holds {held} epochs, its checkpoint {epoch}: restore the file, or delete the "
+                    "seed's folder to start again"
+                )
+        self.saved_epoch = epoch
+        return epoch, arrays
+
+    def begin(self, epoch: int, parameters: Mapping[str, int], origin: Mapping[str, Any]) -> None:
+        """Write `run.json` of every seed: it is being trained from an epoch on.
+
+        Parameters
+        ----------
+        parameters:
+            The numbers of parameters, see `ModelBuilder.trained`.
+        origin:
+            Where and with which versions, see `qrlsuite.results.provenance.collect`.
+        """
+        self.parameters = dict(parameters)
+        for seed in self.seeds:
+            folder = self.store.seed(seed)
+            record = {
+                **self._seed_record(seed),
+                "status": "running",
+                "epochs": epoch,
+                "provenance": _with_origin(folder.record() or {}, origin),
+            }
+            folder.write_record(record)
+            self.events.send("run_started", run={**record, "folder": str(folder.path)})
+
+    def add_origin(self, origin: Mapping[str, Any]) -> None:
+        """Note in `run.json` of every seed where else it is trained."""
+        for seed in self.seeds:
+            folder = self.store.seed(seed)
+            record = folder.record() or {}
+            made_with = _with_origin(record, origin)
+            if made_with != record.get("provenance"):
+                del record["format_version"]
+                folder.write_record({**record, "provenance": made_with})
+
+    def _seed_record(self, seed: int) -> dict[str, Any]:
+        planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
+        return {
+            **planned,
+            "task": self.entry.task.name,
+            "task_hash": self.entry.task.hash,
+            "entry": self.entry.name,
+            "label": self.entry.label,
+            "algorithm": self.entry.algorithm.name,
+            "algorithm_options": options.plain(self.entry.algorithm_options),
+            "model": self.entry.model.name,
+            "family": self.entry.model.family,
+            "model_options": options.plain(self.entry.model_options),
+            "parameters": self.parameters,
+            "seed": seed,
+            "interactions_per_epoch": self.entry.task.file.protocol.interactions,
+        }
+
+    def record(self, lines: Sequence[Mapping[str, Any]], timing: Mapping[str, Any]) -> None:
+        """Append an epoch's line and timing to every seed, and send the line to the trackers.
+
+        Parameters
+        ----------
+        lines:
+            One for each seed, see `lines_of`.
+        """
+        timing_line = store.json_line(timing)
+        for seed, line in zip(self.seeds, lines):
+            folder = self.store.seed(seed)
+            store.append(folder.lines, store.json_line(line))
+            store.append(folder.timings, timing_line)
+            run = {**self._seed_record(seed), "folder": str(folder.path)}
+            self.events.send("epoch_finished", run=run, record=line)
+
+    def save(self, epoch: int, arrays: checkpoint.Arrays) -> None:
+        """Write the checkpoint of an epoch, if it is newer than the one on disk."""
+        if epoch <= self.saved_epoch:
+            return
+        for seed in self.seeds:
+            self.store.seed(seed).sync()
+        checkpoint.save(self.store, self.seeds, epoch, arrays)
+        self.saved_epoch = epoch
+
+    def finish(self, epoch: int, policy: checkpoint.Arrays) -> None:
+        """Publish the trained agents, compact the lines, and mark every seed as finished."""
+        for s, seed in enumerate(self.seeds):
+            folder = self.store.seed(seed)
+            agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}
+            store.write_atomically(folder.path / "final.safetensors", encode(agent))
+            folder.compact()
+            record = {
+                **(folder.record() or self._seed_record(seed)),
+                "status": "finished",
+                "epochs": epoch,
+            }
+            del record["format_version"]
+            folder.write_record(record)
+            self.events.send("run_finished", run={**record, "folder": str(folder.path)})
+
+
+def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[Any]:
+    made_with = [*record.get("provenance", [])]
+    return made_with if origin in made_with else [*made_with, origin]
+
+
 class GroupRun:
-    """The training of one group of seeds of an entry, with its files.
+    """The training of one group of seeds of an entry in this process, with its files.
 
     Parameters
     ----------
@@ -58,12 +221,12 @@ class GroupRun:
         device: str = "cpu",
         report: Report = lambda progress: None,
     ) -> None:
-        self.entry, self.store, self.epochs = entry, entry_store, epochs
+        self.entry, self.epochs = entry, epochs
         self.trainer = Trainer(entry, seeds, device, report)
-        self.seeds, self.progress, self.report = self.trainer.seeds, self.trainer.progress, report
-        self.events = EventSink(registry.load(), asked())
-        self.progress.epochs, self.progress.warnings = epochs, self.events.problems
-        self._saved_epoch = -1
+        self.progress, self.report = self.trainer.progress, report
+        events = EventSink(registry.load(), asked())
+        self.files = GroupFiles(entry, entry_store, seeds, events)
+        self.progress.epochs, self.progress.warnings = epochs, events.problems
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
 
     def run(self) -> None:
@@ -97,114 +260,31 @@ class GroupRun:
                 raise
 
     def _begin(self) -> None:
-        """Start fresh, or resume from the newest checkpoint; cut what is newer than it."""
-        epoch, arrays = checkpoint.load(self.store, self.seeds)
-        for seed in self.seeds:
-            folder = self.store.seed(seed)
-            old = folder.record() or {}
-            if epoch < int(old.get("epochs", 0)) and old.get("status") == "finished":
-                raise StoreError(
-                    f"{folder.path} finished {old['epochs']} epochs and its checkpoint is gone: it cannot be "
-                    "extended; choose another folder with --runs DIR, or delete the seed's folder to start again"
-                )
-            if (held := folder.cut(epoch)) < epoch:
-                raise StoreError(
-                    f"{folder.path} holds {held} epochs, its checkpoint {epoch}: restore the file, or delete the "
-                    "seed's folder to start again"
-                )
+        """Start fresh, or resume from the newest checkpoint."""
+        epoch, arrays = self.files.resume()
         if epoch:
             try:
                 self.trainer.restore(epoch, arrays)
             except StoreError as error:
-                raise StoreError(f"{self.store.path}: {error}") from error
-            self._saved_epoch = epoch
+                raise StoreError(f"{self.files.store.path}: {error}") from error
         else:
             self.trainer.start()
         self.progress.epoch = self.trainer.epoch
         origin = provenance.collect(self.entry.distributions(), self.trainer.device)
-        for seed in self.seeds:
-            folder = self.store.seed(seed)
-            old = folder.record() or {}
-            made_with = [*old.get("provenance", [])]
-            if origin not in made_with:
-                made_with.append(origin)
-            record = {
-                **self._seed_record(seed),
-                "status": "running",
-                "epochs": self.trainer.epoch,
-                "provenance": made_with,
-            }
-            folder.write_record(record)
-            self.events.send("run_started", run={**record, "folder": str(folder.path)})
-
-    def _seed_record(self, seed: int) -> dict[str, Any]:
-        planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
-        return {
-            **planned,
-            "task": self.entry.task.name,
-            "task_hash": self.entry.task.hash,
-            "entry": self.entry.name,
-            "label": self.entry.label,
-            "algorithm": self.entry.algorithm.name,
-            "algorithm_options": options.plain(self.entry.algorithm_options),
-            "model": self.entry.model.name,
-            "family": self.entry.model.family,
-            "model_options": options.plain(self.entry.model_options),
-            "parameters": self.trainer.models.trained(),
-            "seed": seed,
-            "interactions_per_epoch": self.entry.task.file.protocol.interactions,
-        }
+        self.files.begin(self.trainer.epoch, self.trainer.models.trained(), origin)
 
     def _record(self, epoch: Epoch) -> None:
-        """Append one line per seed, and send it to the trackers."""
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        count = len(self.seeds)
-        timing = {name: round(value / count, 6) for name, value in epoch.seconds.items()}
-        timing_line = store.json_line(
-            {"epoch": epoch.number, **timing, "group": count, "host": socket.gethostname(), "time": now}
-        )
-        for s, seed in enumerate(self.seeds):
-            folder = self.store.seed(seed)
-            line: dict[str, Any] = {"epoch": epoch.number, "scores": store.shortest(epoch.scores[s])}
-            for name, values in epoch.metrics.items():
-                value = float(values[s])
-                line[name] = value if math.isfinite(value) else None
-            if epoch.executions[s]:
-                line["executions"] = epoch.executions[s]
-            store.append(folder.lines, store.json_line(line))
-            store.append(folder.timings, timing_line)
-            run = {**self._seed_record(seed), "folder": str(folder.path)}
-            self.events.send("epoch_finished", run=run, record=line)
-        self.progress.epoch = epoch.number
-        self.progress.seed_scores = epoch.scores.mean(axis=1).tolist()
-        self.progress.median_score = float(np.median(self.progress.seed_scores))
+        """Append one line per seed, and show the progress."""
+        self.files.record(lines_of(epoch), timing_of(epoch, len(self.files.seeds)))
+        self.progress.finished_epoch(epoch.number, epoch.scores.mean(axis=1).tolist())
         self.report(self.progress)
 
     def _save(self) -> None:
         """Write the checkpoint of the last finished epoch, if it is newer than the one on disk."""
-        if self._snapshot is None or self._snapshot[0] <= self._saved_epoch:
-            return
-        epoch, arrays = self._snapshot
-        for seed in self.seeds:
-            self.store.seed(seed).sync()
-        checkpoint.save(self.store, self.seeds, epoch, arrays)
-        self._saved_epoch = epoch
+        if self._snapshot is not None:
+            self.files.save(*self._snapshot)
 
     def _finish(self) -> None:
-        """Publish the trained agents, compact the lines, and mark every seed as finished."""
-        policy = self.trainer.policy()
-        for s, seed in enumerate(self.seeds):
-            folder = self.store.seed(seed)
-            agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}
-            store.write_atomically(folder.path / "final.safetensors", encode(agent))
-            folder.compact()
-            record = {
-                **(folder.record() or self._seed_record(seed)),
-                "status": "finished",
-                "epochs": self.trainer.epoch,
-            }
-            del record["format_version"]
-            folder.write_record(record)
-            self.events.send("run_finished", run={**record, "folder": str(folder.path)})
+        self.files.finish(self.trainer.epoch, self.trainer.policy())
         self.progress.phase = "finished"
         self.report(self.progress)

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from qrlsuite import hookimpl
+from qrlsuite.engine.api import Answer
 from qrlsuite.specs import EngineSpec, SignificanceTestSpec, Spec, TrackerSpec
 from qrlsuite.testing import check
+from qrlsuite.training.advance import advance
 from tests.testing.broken import Broken, assert_breaks, own_rules
 
 HERE = __name__
@@ -130,6 +132,78 @@ class Queue(GoodEngine):
         return [0, 1]
 
 
+class GoodLink:
+    """Works on its tasks itself, when answers are asked for."""
+
+    def __init__(self) -> None:
+        self.tasks: list[tuple[str, bytes]] = []
+
+    def send(self, key: str, task: bytes) -> None:
+        self.tasks.append((key, task))
+
+    def receive(self, seconds: float) -> list[Answer]:
+        answers = [Answer(key, advance(task)) for key, task in self.tasks]
+        self.tasks.clear()
+        return answers
+
+    def close(self) -> None:
+        self.tasks.clear()
+
+
+class GoodRemote:
+    link: type[GoodLink] = GoodLink
+    workers, queued = GoodEngine.workers, GoodEngine.queued
+
+    def __init__(self, options: None) -> None:
+        pass
+
+    def connect(self, workers: int, versions: Mapping[str, str | None]) -> GoodLink:
+        return self.link()
+
+
+class ShortConnect(GoodRemote):
+    def connect(self, address: str) -> GoodLink:  # type: ignore[override]
+        return GoodLink()
+
+
+class TextLink(GoodLink):
+    def receive(self, seconds: float) -> list[Answer]:
+        return [Answer(each.key, str(each.content)) for each in super().receive(seconds)]  # type: ignore[arg-type]
+
+
+class EchoLink(GoodLink):
+    def receive(self, seconds: float) -> list[Answer]:
+        tasks = dict(self.tasks)
+        return [Answer(each.key, tasks[each.key]) for each in super().receive(seconds)]
+
+
+class MixingLink(GoodLink):
+    def receive(self, seconds: float) -> list[Answer]:
+        came = super().receive(seconds)
+        return [Answer(each.key, other.content) for each, other in zip(came, reversed(came))]
+
+
+class RepeatingLink(GoodLink):
+    def receive(self, seconds: float) -> list[Answer]:
+        return 2 * super().receive(seconds)
+
+
+class TextRemote(GoodRemote):
+    link = TextLink
+
+
+class EchoRemote(GoodRemote):
+    link = EchoLink
+
+
+class MixingRemote(GoodRemote):
+    link = MixingLink
+
+
+class RepeatingRemote(GoodRemote):
+    link = RepeatingLink
+
+
 class GoodTracker:
     def __init__(self, target: str | None) -> None:
         pass
@@ -191,6 +265,11 @@ BROKEN = [
     ("significance_tests", "signs", Broken(rule("Flat"), r"has shape \(6,\), and must have \(epsilons, deltas\)")),
     ("engines", "methods", Broken(engine("WithoutQueue"), r"has no method queued\(store\): see qrlsuite.engine.api")),
     ("engines", "workers", Broken(engine("Idle"), r"workers\(None\) returned 0, and must return how many")),
+    ("engines", "methods", Broken(engine("ShortConnect"), r"connect\(workers, versions\) cannot be called")),
+    ("engines", "answers", Broken(engine("TextRemote"), r"in the place of bytes")),
+    ("engines", "answers", Broken(engine("EchoRemote"), r"are answers mixed up, or not made by qrlsuite.training")),
+    ("engines", "answers", Broken(engine("MixingRemote"), r"answer to task 'first' is .*'token': 'third'")),
+    ("engines", "once", Broken(engine("RepeatingRemote"), r"answers came to first, first, second, second, third")),
     ("trackers", "events", Broken(tracker("Rewriting"), r"run_started changes the mapping")),
 ]  # fmt: skip
 
@@ -205,13 +284,14 @@ def test_one_rule_is_broken(kind: str, name: str, case: Broken) -> None:
     [
         ("significance_tests", rule("GoodRule")),
         ("engines", engine("GoodEngine")),
+        ("engines", engine("GoodRemote")),
         ("trackers", tracker("GoodTracker")),
     ],
 )
 def test_every_rule_is_broken_by_one(kind: str, spec: Spec) -> None:
     findings = own_rules(kind, spec)
     assert all(finding.ok for finding in findings), findings
-    optional = {"against"} if kind == "significance_tests" else set()
+    optional = {"significance_tests": {"against"}, "engines": {"answers", "once"}}.get(kind, set())
     assert {finding.rule for finding in findings} | optional == {name for k, name, _ in BROKEN if k == kind}
 
 

@@ -11,7 +11,7 @@ from qrlsuite.testing import check
 from qrlsuite.testing.selection import CheckTarget, of_distribution
 
 EVERYTHING = of_distribution("qrlsuite")
-NEEDS = {("tasks", "lunarlander"): "Box2D"}
+NEEDS = {("engines", "dask"): "distributed", ("tasks", "lunarlander"): "Box2D"}
 
 COMMON = ["name", "references", "lazy imports", "spawn"]
 OPTIONS = ["options documented", "options"]
@@ -45,6 +45,7 @@ WHERE_OFFERED = {
     ("circuit_backends", "native"): ["mean field", "shots"],
     ("circuit_backends", "pennylane"): ["shots"],
     ("circuit_backends", "qiskit"): ["shots"],
+    ("engines", "dask"): ["answers", "once"],
     ("significance_tests", "intervals"): ["against"],
     ("significance_tests", "times"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},

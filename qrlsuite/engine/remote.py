@@ -1,0 +1,353 @@
+"""Trains groups of seeds on workers that see no results folder: sends tasks, accepts answers, writes what comes.
+
+This process holds the claims, tells the trackers and writes the results folder. A group is with one worker at a time,
+for about a minute: a task has its newest checkpoint, the answer the next one with the lines between. A worker that is
+lost costs that minute. An answer is accepted once, for the group, epoch and token of the task that is waited for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import secrets
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from qrlsuite import registry
+from qrlsuite.engine.api import Answer, EngineOutcome, Link, RemoteEngine, Show, Work
+from qrlsuite.engine.local import ATTEMPTS
+from qrlsuite.engine.worker import checkpoint_seconds
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.results.checkpoint import Arrays
+from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
+from qrlsuite.results.progress import Progress, ProgressFile
+from qrlsuite.results.provenance import PACKAGES
+from qrlsuite.results.seeds import SeedGroup
+from qrlsuite.results.store import EntryStore, json_line
+from qrlsuite.training.advance import MOST_BYTES, POLICY, pack, too_large, unpack, versions
+from qrlsuite.training.trackers import EventSink, asked
+
+if TYPE_CHECKING:
+    from qrlsuite.training.group import GroupFiles  # torch, which is imported when it is needed
+
+TASK_SECONDS = 60.0
+"""How long a task trains, one epoch at least; QRLSUITE_CHECKPOINT_SECONDS replaces it."""
+
+MOST_SENT = 512 << 20
+"""Bytes of tasks that are with the engine at a time, at most: a scheduler keeps them in memory."""
+
+WAIT_SECONDS = 0.5
+"""For which an answer is waited for at a time."""
+
+HEADER_BYTES = 1 << 20
+"""Room in an answer for the lines of its epochs."""
+
+
+@functools.lru_cache(maxsize=64)
+def _bytes_per_seed(entry_hash: str, record: bytes) -> int:
+    """Return the size of one seed's checkpoint and agent."""
+    import torch
+
+    from qrlsuite.training.trainer import Trainer
+
+    threads = torch.get_num_threads()
+    try:
+        trainer = Trainer(from_record(json.loads(record), "the entry"), [0])
+    finally:
+        torch.set_num_threads(threads)  # this may be a user's notebook
+    trainer.start()
+    return sum(array.nbytes for arrays in (trainer.capture(), trainer.policy()) for array in arrays.values())
+
+
+def seeds_per_task(entry: Entry) -> int:
+    """Return how many seeds of an entry fit into a task, at most.
+
+    Raises
+    ------
+    OptionError
+        If not even one does.
+    QrlSuiteError
+        If the entry cannot be built.
+    """
+    size = _bytes_per_seed(entry.hash, json_line(entry.record()))
+    if size > MOST_BYTES - HEADER_BYTES:
+        raise OptionError(f"'{entry.label}': {too_large(size, 1)}")
+    return (MOST_BYTES - HEADER_BYTES) // size
+
+
+def train(engine: RemoteEngine, work: Work, show: Show) -> EngineOutcome:
+    """Train groups of an entry to their last epoch.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C: what was accepted is saved; what workers had begun since is lost, a minute each at most.
+    QrlSuiteError
+        If nobody can be connected to, or the connection is lost.
+    """
+    run = _Run(engine, work)
+    try:
+        return run.train(show)
+    finally:
+        run.close()
+
+
+class _Member:
+    """A group, where it stands, and the task that it waits for."""
+
+    def __init__(self, work: Work, group: SeedGroup) -> None:
+        self.group = group
+        self.progress_file = ProgressFile(work.store, group.id)
+        self.progress = Progress(phase="waiting", epoch=group.epoch, epochs=work.epochs)
+        self.epoch = group.epoch
+        self.size = 0
+        self.losses = 0
+        self.begun = False
+
+    def write(self, error: str | None = None) -> None:
+        """Write the progress."""
+        self.progress_file.write(self.progress, error, force=True)
+
+
+class _Run:
+    """The training of groups of one entry."""
+
+    def __init__(self, engine: RemoteEngine, work: Work) -> None:
+        from qrlsuite.training.group import GroupFiles  # torch
+
+        self.work, self.store = work, work.store
+        self.entry = work.store.entry()
+        self.events = EventSink(registry.load(), asked())
+        self._files = functools.partial(GroupFiles, self.entry, work.store, events=self.events)
+        found = versions([*PACKAGES, *self.entry.distributions()])
+        self.versions = {name: version for name, version in found.items() if version is not None}
+        self.seconds = checkpoint_seconds(TASK_SECONDS)
+        self.outcome = EngineOutcome()
+        self.members = [_Member(work, group) for group in work.groups]
+        self.files: dict[str, GroupFiles] = {}
+        self.sent: dict[str, _Member] = {}
+        self.claims = _Claims(work.store)
+        self.link: Link = engine.connect(work.workers, self.versions)
+
+    def train(self, show: Show) -> EngineOutcome:
+        """Send and accept until every group has finished or failed."""
+        waiting = deque(self.members)
+        for member in self.members:
+            member.progress_file.clear()
+        while waiting or self.sent:
+            while waiting and len(self.sent) < self.work.workers and self._room():
+                self._guarded(waiting.popleft(), self._resume)
+            for answer in self.link.receive(WAIT_SECONDS) if self.sent else ():
+                member = self.sent.pop(answer.key, None)
+                if member is not None:  # else it is answered twice, or was given up
+                    self._guarded(member, functools.partial(self._take, answer=answer))
+            self.claims.require()
+            show({member.group.id: member.progress_file.read() for member in self.members})
+        return self.outcome
+
+    def close(self) -> None:
+        """Disconnect, and give the seeds back."""
+        try:
+            self.link.close()
+        finally:
+            self.claims.close()
+
+    def _room(self) -> bool:
+        return sum(member.size for member in self.sent.values()) < MOST_SENT
+
+    def _guarded(self, member: _Member, step: Any) -> None:
+        """Do something for a group; where that fails, the others go on."""
+        try:
+            step(member)
+        except SeedsClaimedError as error:
+            self.outcome.taken[member.group.id] = str(error)
+        except QrlSuiteError as error:
+            self._fail(member, str(error))
+
+    def _fail(self, member: _Member, message: str) -> None:
+        self.outcome.failed[member.group.id] = message
+        self.claims.release(member.group.seeds)
+        with contextlib.suppress(StoreError):  # on a full disk the message is in the outcome alone
+            member.write(message)
+
+    def _resume(self, member: _Member) -> None:
+        """Claim a group's seeds and send its first task, from the newest checkpoint."""
+        seeds = member.group.seeds
+        self.claims.acquire(seeds)
+        if self.store.finished(seeds, self.work.epochs) == set(
+            seeds
+        ):  # by somebody else, since it was planned
+            self._finished(member)
+            return
+        self.files[member.group.id] = self._files(seeds=seeds)
+        member.epoch, arrays = self.files[member.group.id].resume()
+        self._send(member, arrays)
+
+    def _send(self, member: _Member, arrays: Arrays) -> None:
+        token = secrets.token_hex(16)
+        header = {
+            "token": token,
+            "entry": self.entry.record(),
+            "seeds": list(member.group.seeds),
+            "epoch": member.epoch,
+            "epochs": self.work.epochs,
+            "seconds": self.seconds,
+            "device": self.work.device,
+            "versions": self.versions,
+        }
+        task = pack(header, arrays)
+        if len(task) > MOST_BYTES:
+            raise StoreError(too_large(len(task), len(member.group.seeds)))
+        member.size, member.progress.phase = len(task), "sent"
+        member.write()
+        self.sent[token] = member
+        self.link.send(token, task)
+
+    def _take(self, member: _Member, answer: Answer) -> None:
+        """Accept an answer, or send the task again."""
+        if answer.content is None:
+            self._again(member, answer.problem)
+            return
+        try:
+            header, arrays = unpack(answer.content)
+            refused = header.get("refused")
+            if refused is None:
+                _require_fit(header, arrays, answer.key, member, self.work.epochs)
+        except StoreError as error:
+            refused = str(error)
+        if refused is not None:
+            self._again(member, str(refused))
+            return
+        member.losses = 0
+        self._accept(member, header, arrays)
+
+    def _again(self, member: _Member, problem: str) -> None:
+        """Send a task that was lost once more, unless that has happened too often."""
+        member.losses += 1
+        if member.losses >= ATTEMPTS:
+            raise QrlSuiteError(f"its task was lost {ATTEMPTS} times: {problem}")
+        _, arrays = self.files[member.group.id].resume()
+        self._send(member, arrays)
+
+    def _accept(self, member: _Member, header: Mapping[str, Any], arrays: Arrays) -> None:
+        """Write the lines and the checkpoint of an answer; then finish the group, or send its next task."""
+        files, progress = self.files[member.group.id], member.progress
+        if header["lines"] or header["error"] is None:
+            if member.begun:
+                files.add_origin(header["provenance"])
+            else:
+                files.begin(member.epoch, header["parameters"], header["provenance"])
+                member.begun = True
+        for lines, timing in zip(header["lines"], header["timings"]):
+            files.record(lines, timing)
+            means = [sum(line["scores"]) / len(line["scores"]) for line in lines]
+            progress.finished_epoch(timing["epoch"], means)
+            progress.epoch_seconds = len(lines) * sum(timing.get(name, 0.0) for name in ("train", "validate"))
+        policy = {name.removeprefix(POLICY): a for name, a in arrays.items() if name.startswith(POLICY)}
+        state = {name: array for name, array in arrays.items() if not name.startswith(POLICY)}
+        files.save(header["epoch"], state)
+        member.epoch = header["epoch"]
+        known = [*progress.warnings, *self.events.problems, *header["warnings"]]
+        progress.warnings = list(dict.fromkeys(known))
+        if header["error"] is not None:
+            raise QrlSuiteError(str(header["error"]))
+        if member.epoch < self.work.epochs:
+            self._send(member, state)
+            return
+        files.finish(member.epoch, policy)
+        self._finished(member)
+
+    def _finished(self, member: _Member) -> None:
+        member.progress.phase, member.progress.epoch = "finished", self.work.epochs
+        member.write()
+        self.files.pop(member.group.id, None)
+        self.claims.release(member.group.seeds)
+
+
+def _require_fit(header: Mapping[str, Any], arrays: Arrays, token: str, member: _Member, epochs: int) -> None:
+    """Refuse an answer that is not one to the task that is waited for.
+
+    Raises
+    ------
+    StoreError
+        Saying what does not fit.
+    """
+    seeds, first = list(member.group.seeds), member.epoch + 1
+    last, lines, timings = header.get("epoch"), header.get("lines"), header.get("timings")
+    problem = ""
+    if (header.get("token"), header.get("seeds")) != (token, seeds):
+        problem = "it answers another task"
+    elif not isinstance(last, int) or not isinstance(lines, list) or not isinstance(timings, list):
+        problem = "it has no epochs"
+    elif not last <= epochs or not len(lines) == len(timings) == last - member.epoch:
+        problem = f"it ends at epoch {last} with {len(lines)} epochs after {member.epoch}"
+    elif last == member.epoch < epochs and header.get("error") is None:
+        problem = "it has no new epoch and names no error"
+    else:
+        for number, (of_seeds, timing) in enumerate(zip(lines, timings), start=first):
+            numbers = [line.get("epoch") for line in of_seeds] if isinstance(of_seeds, list) else []
+            if numbers != [number] * len(seeds) or timing.get("epoch") != number:
+                problem = f"the lines of epoch {number} are not one for each seed"
+        if lines and not arrays:
+            problem = "it has no checkpoint"
+        for name, array in arrays.items():
+            if array.ndim == 0 or array.shape[0] != len(seeds):
+                problem = f"array '{name}' of shape {array.shape} is not seed-first"
+    if problem:
+        raise StoreError(f"an answer does not fit its task: {problem}")
+
+
+class _Claims(threading.Thread):
+    """The claims of this process, refreshed by a thread of their own."""
+
+    def __init__(self, store: EntryStore) -> None:
+        super().__init__(daemon=True)
+        self._store = store
+        self._held: dict[Sequence[int], Claim] = {}
+        self._lock = threading.Lock()
+        self._stopped = threading.Event()
+        self._lost = False
+        self.start()
+
+    def run(self) -> None:
+        """Refresh until closed."""
+        while not self._stopped.wait(HEARTBEAT):
+            with self._lock:
+                self._lost |= any(not claim.refresh() for claim in self._held.values())
+
+    def acquire(self, seeds: Sequence[int]) -> None:
+        """Claim seeds; the errors are those of `claims.acquire`."""
+        claim = acquire(self._store, seeds)
+        with self._lock:
+            self._held[seeds] = claim
+
+    def release(self, seeds: Sequence[int]) -> None:
+        """Give seeds back, if they are held."""
+        with self._lock:
+            claim = self._held.pop(seeds, None)
+            if claim is not None:
+                claim.release()
+
+    def require(self) -> None:
+        """Refuse to go on without a claim that was held.
+
+        Raises
+        ------
+        StoreError
+            If another process took seeds over.
+        """
+        if self._lost:
+            raise StoreError(
+                f"{self._store.path}: this process was not heard of for a while, and its seeds were taken over; "
+                "finished epochs are kept, the same command continues"
+            )
+
+    def close(self) -> None:
+        """Give everything back."""
+        self._stopped.set()
+        for seeds in list(self._held):
+            self.release(seeds)

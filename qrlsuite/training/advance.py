@@ -1,0 +1,172 @@
+"""Advances a group of seeds by a minute of training, from bytes to bytes: the work of engines without a shared folder.
+
+A *task* and its *answer* are bytes: a safetensors file with the checkpoint, in whose metadata the rest stands as JSON.
+Nothing is read from or written to a disk, and the same task gives the same answer, times aside, however often and
+wherever it is worked on.
+
+Of a task:
+
+    token           of this task alone: its answer has the same
+    entry           what is trained, as `entry.json` has it
+    seeds, epoch    the group, and the epoch of the checkpoint; at epoch 0 there is none
+    epochs          where to stop
+    seconds         how long to train; one epoch is trained at least
+    device          `cpu`, `cuda` or `cuda:1`
+    versions        of the distributions that make the numbers: a worker with others refuses the task
+
+Of an answer:
+
+    token, seeds
+    epoch           of the checkpoint in it
+    lines, timings  of every new epoch: a line of `epochs.jsonl` for each seed; the line of `timings.jsonl`
+    provenance      host, processor and versions
+    parameters      their numbers, see `ModelBuilder.trained`
+    warnings        what the user should know
+    error           why the training cannot go on; None where it can. What was finished before stays in the answer
+    refused         why this worker does not take the task; None where it did. There is then nothing else
+
+At the last epoch the answer also holds the trained agents, as arrays whose names begin with `policy.`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from qrlsuite.errors import QrlSuiteError, StoreError, listed
+from qrlsuite.experiment.entry import from_record
+from qrlsuite.results import provenance
+from qrlsuite.results.checkpoint import Arrays
+
+POLICY = "policy."
+MOST_BYTES = 32 << 20
+"""The largest task or answer: what a queue's connections and memory take without trouble."""
+
+_one_at_a_time = threading.Lock()
+"""Held while training: torch's number of threads and a worker's memory are meant for one group."""
+
+
+def pack(header: Mapping[str, Any], arrays: Arrays) -> bytes:
+    """Return a task or an answer as bytes."""
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    content: bytes = save(contiguous, metadata={"header": json.dumps(header)})
+    return content
+
+
+def unpack(content: bytes) -> tuple[dict[str, Any], Arrays]:
+    """Return the header and the arrays of a task or an answer.
+
+    Raises
+    ------
+    StoreError
+        If the bytes are none.
+    """
+    try:
+        length = int.from_bytes(content[:8], "little")
+        header = json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["header"])
+        if not isinstance(header, dict):
+            raise ValueError("its header is no object")
+        return header, load(content)
+    except (ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
+        raise StoreError(f"these {len(content)} bytes are no task and no answer: {error}") from None
+
+
+def versions(distributions: Sequence[str]) -> dict[str, str | None]:
+    """Return the installed versions of distributions, None for one that is missing, and Python's `major.minor`."""
+    found: dict[str, str | None] = {"python": ".".join(platform.python_version_tuple()[:2])}
+    for name in distributions:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def differing(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """Say in which versions a worker differs: `qrlsuite 0.0.9 instead of 0.1.0`; nothing where it does not."""
+    return listed(
+        [
+            f"{name} {version} instead of {here[name]}" if (version := there.get(name)) else f"no {name}"
+            for name in here
+            if here[name] != there.get(name)
+        ]
+    )
+
+
+def advance(task: bytes) -> bytes:
+    """Work on a task; returns the answer, and never raises what the training raises."""
+    try:
+        header, arrays = unpack(task)
+        needed = dict(header["versions"])
+        token, seeds = header["token"], [int(seed) for seed in header["seeds"]]
+    except (QrlSuiteError, KeyError, TypeError, ValueError) as error:
+        return pack({"refused": f"this is no task: {error}"}, {})
+    different = differing(needed, versions([name for name in needed if name != "python"]))
+    answer: dict[str, Any] = {"token": token, "seeds": seeds, "refused": None, "error": None}
+    if different:
+        return pack({**answer, "refused": f"{socket.gethostname()} has {different}"}, {})
+    with _one_at_a_time:
+        more, arrays = _trained(header, seeds, arrays)
+    content = pack({**answer, **more}, arrays)
+    if len(content) > MOST_BYTES:
+        error = too_large(len(content), len(seeds))
+        return pack(
+            {**answer, **more, "epoch": header["epoch"], "lines": [], "timings": [], "error": error}, {}
+        )
+    return content
+
+
+def too_large(size: int, seeds: int) -> str:
+    """Say that what would be sent is too large."""
+    least = f"{size / 2**20:.0f} MB for {seeds} seed{'s' * (seeds > 1)}"
+    return (
+        f"a checkpoint is too large to be sent: {least}, and at most {MOST_BYTES >> 20} are; an engine with a shared "
+        "folder takes it (--engine command, --engine local)"
+    )
+
+
+def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tuple[dict[str, Any], Arrays]:
+    """Train as a task says; returns the rest of the answer's header, and its arrays."""
+    from qrlsuite.training.group import lines_of, timing_of
+    from qrlsuite.training.trainer import Trainer
+
+    lines: list[Any] = []
+    timings: list[Any] = []
+    more: dict[str, Any] = {"epoch": header["epoch"], "lines": lines, "timings": timings, "warnings": []}
+    answered: Arrays = {}
+    try:
+        entry = from_record(header["entry"], "the task")
+        trainer = Trainer(entry, seeds, header["device"])
+        more["parameters"] = trainer.models.trained()
+        origin = provenance.collect(entry.distributions(), trainer.device)
+        more["provenance"] = {**origin, "host": socket.gethostname()}
+        if header["epoch"]:
+            trainer.restore(header["epoch"], arrays)
+        else:
+            trainer.start()
+        began = time.monotonic()
+        while trainer.epoch < header["epochs"]:
+            epoch = trainer.train_epoch()
+            answered = trainer.capture()
+            lines.append(lines_of(epoch))
+            timings.append(timing_of(epoch, len(seeds)))
+            more["epoch"] = epoch.number
+            if time.monotonic() - began >= header["seconds"]:
+                break
+        more["warnings"] = trainer.progress.warnings
+        if trainer.epoch == header["epochs"]:
+            answered = {**(answered or arrays)}
+            answered |= {f"{POLICY}{name}": array for name, array in trainer.policy().items()}
+    except QrlSuiteError as error:
+        more["error"] = str(error)
+    return more, answered

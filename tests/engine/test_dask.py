@@ -1,0 +1,191 @@
+"""Engine `dask`: a real scheduler and real workers, in folders of their own, killed at any moment."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from qrlsuite.results.store import EntryStore
+from tests.commands import Command, qrlsuite, start
+from tests.conftest import TINY, most_epochs, results
+from tests.engine.stress import compare, undisturbed
+
+pytest.importorskip("distributed", reason="pip install 'qrlsuite[dask]'")
+
+from tests.engine.cluster import Cluster
+
+SEEDS = 3
+ENDLESS = 1_000_000
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    with Cluster(tmp_path / "cluster") as started:
+        yield started
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return path
+
+
+def words(task: Path, runs: Path, scheduler: str, epochs: int, *more: str) -> list[str]:
+    given = ["run", "--task", str(task), "--model", "mlp", "--set", "width=16", "--seeds", str(SEEDS)]
+    given += ["--epochs", str(epochs), "--workers", str(SEEDS), "--runs", str(runs)]
+    return [*given, "--engine", "dask", "--engine-set", f"scheduler={scheduler}", *more]
+
+
+def environment(seconds: float = 0.3) -> dict[str, str]:
+    """Tasks of less than a second, and a scheduler that is gone is noticed soon."""
+    more = {"QRLSUITE_CHECKPOINT_SECONDS": str(seconds), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "2s"}
+    return {**os.environ, **more}
+
+
+def only_line(done: subprocess.CompletedProcess[str]) -> str:
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+    return line
+
+
+def further(entry: Path, run: Command) -> int:
+    """Wait until an epoch more has been accepted; returns how many there are."""
+    before = most_epochs(entry) if entry.exists() else 0
+    while not entry.exists() or most_epochs(entry) <= before:
+        assert run.poll() is None, run.communicate()[1]
+        time.sleep(0.02)
+    return most_epochs(entry)
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
+def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_path: Path) -> None:
+    """Workers above all; the client and the scheduler once in the short form, and now and then in the long one."""
+    dice, runs = random.Random(4), tmp_path / "killed"
+    straight = undisturbed(task, tmp_path / "straight", SEEDS, 1, SEEDS)
+    entry = runs / "tiny" / straight.name
+    for _ in range(3):
+        cluster.add()
+    run = start(*words(task, runs, cluster.address, ENDLESS), env=environment())
+    for kill in range(1, kills + 1):
+        further(entry, run)
+        time.sleep(dice.uniform(0, 0.3))
+        cluster.kill(dice.choice(cluster.workers))
+        if dice.random() < 0.2 and len(cluster.workers) < 4:
+            cluster.add()  # one more than was killed
+        if dice.random() < 0.8 or len(cluster.workers) < 2:
+            cluster.add()  # else there is one less from now on
+        if kill % 33 == 1:
+            further(entry, run)
+            run.kill()
+            run.wait()
+            run = start(*words(task, runs, cluster.address, ENDLESS), env=environment())
+        if kill % 33 == 2:
+            further(entry, run)
+            cluster.kill_all()
+            _, said = run.communicate()
+            assert re.search(
+                rf"^qrlsuite: .*the Dask scheduler at {cluster.address} is gone; fin", said, re.M
+            ), said
+            assert run.returncode == 2
+            assert "Traceback" not in said
+            cluster.start_scheduler()
+            for _ in range(3):
+                cluster.add()
+            run = start(*words(task, runs, cluster.address, ENDLESS), env=environment())
+    further(entry, run)
+    run.send_signal(signal.SIGINT)
+    assert run.wait() == 130
+    epochs = most_epochs(entry) + 1
+    done = qrlsuite(*words(task, runs, cluster.address, epochs), env=environment())
+    assert done.returncode == 0, done.stderr
+    compare(undisturbed(task, tmp_path / "straight", SEEDS, epochs, SEEDS), entry, SEEDS, epochs)
+
+
+def shadow(folder: Path, distribution: str, version: str) -> dict[str, str]:
+    """Return the environment of a process that finds another version of a distribution installed."""
+    site = folder / f"{distribution}-{version}"
+    info = site / f"{distribution}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
+    return {"PYTHONPATH": str(site)}
+
+
+def start_without_suite(cluster: Cluster) -> subprocess.Popen[bytes]:
+    """Start a worker in a Python that has everything but the suite."""
+    site = cluster.folder / "site"
+    site.mkdir()
+    for folder in sys.path:
+        if folder.endswith("site-packages"):
+            for path in Path(folder).iterdir():
+                if "qrlsuite" not in path.name and not (site / path.name).exists():
+                    (site / path.name).symlink_to(path)
+    program = "from distributed.cli.dask_worker import main; main()"
+    given = [cluster.address, "--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
+    return subprocess.Popen(
+        [sys.executable, "-S", "-c", program, *given, "--local-directory", str(site.parent)],
+        env={**os.environ, "PYTHONPATH": str(site)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def test_workers_of_another_version_or_without_the_suite_are_left_out_by_name(
+    task: Path, cluster: Cluster, train: Callable[..., Path], tmp_path: Path
+) -> None:
+    bare = start_without_suite(cluster)
+    try:
+        cluster.add(shadow(tmp_path, "qrlsuite", "0.0.9"))
+        cluster.wait(2)
+        refused = only_line(qrlsuite(*words(task, tmp_path / "runs", cluster.address, 2), env=environment()))
+        old = f"qrlsuite 0.0.9 instead of {metadata.version('qrlsuite')}"
+        named = re.findall(
+            r"tcp://127\.0\.0\.1:\d+ has (.*?)(?=, tcp|;)", refused.partition("can be used: ")[2]
+        )
+        assert f"no worker of the Dask scheduler at {cluster.address} can be used: " in refused
+        assert sorted(named) == ["no qrlsuite", old]
+        cluster.add()
+        cluster.wait(3)
+        done = qrlsuite(*words(task, tmp_path / "runs", cluster.address, 2), env=environment())
+        assert done.returncode == 0, done.stderr
+        left_out = re.findall(r"^worker tcp://127\.0\.0\.1:\d+ is left out: it has (.*)$", done.stderr, re.M)
+        assert sorted(left_out) == ["no qrlsuite", old]
+        straight = train("straight", list(range(SEEDS)), 2)
+        (entry,) = (tmp_path / "runs" / "tiny").iterdir()
+        for seed in range(SEEDS):
+            assert results(entry, seed) == results(straight, seed)
+            assert bare.poll() is None, "nothing was sent to it that it cannot read"
+            (origin,) = (EntryStore(entry).seed(seed).record() or {})["provenance"]
+            assert origin["host"] == os.uname().nodename
+            assert origin["versions"]["qrlsuite"] == metadata.version("qrlsuite")
+    finally:
+        bare.kill()
+        bare.wait()
+
+
+def test_a_scheduler_of_another_version(task: Path, tmp_path: Path) -> None:
+    with Cluster(tmp_path / "cluster", env=shadow(tmp_path, "distributed", "2020.1.0")) as cluster:
+        line = only_line(qrlsuite(*words(task, tmp_path / "runs", cluster.address, 1)))
+    ours = metadata.version("distributed")
+    assert line == (
+        f"qrlsuite: the Dask scheduler at {cluster.address} has distributed 2020.1.0 instead of {ours}: Dask needs the "
+        "same on both sides"
+    )
+
+
+@pytest.mark.parametrize("scheduler", ["tcp://127.0.0.1:1", "nowhere://x"])
+def test_a_scheduler_that_is_not_there(scheduler: str, task: Path, tmp_path: Path) -> None:
+    line = only_line(qrlsuite(*words(task, tmp_path / "runs", scheduler, 1, "--engine-set", "timeout=0.5")))
+    assert line.startswith(f"qrlsuite: no Dask scheduler answers at {scheduler} within 0.5 s (")
+    assert line.endswith("): is it running there, and can this machine reach it?")

@@ -1,0 +1,327 @@
+"""Training from bytes to bytes, and what is accepted of it; workers are this process, which calls the real thing."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrlsuite.engine import api, execution, remote
+from qrlsuite.engine.api import Answer, EngineOutcome, Link
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.options import parse_setting
+from qrlsuite.results import checkpoint, claims
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import SeedGroup
+from qrlsuite.results.store import EntryStore, read_lines
+from qrlsuite.training import advance as advancing
+from qrlsuite.training.advance import advance, pack, unpack
+from tests.conftest import results
+
+EPOCHS = 4
+
+
+@pytest.fixture(autouse=True)
+def _short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every task is one epoch."""
+    monkeypatch.setenv("QRLSUITE_CHECKPOINT_SECONDS", "0")
+
+
+@pytest.fixture
+def entry(tiny_task: str) -> Entry:
+    return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+
+
+@pytest.fixture
+def store(entry: Entry, tmp_path: Path) -> EntryStore:
+    return EntryStore.create(tmp_path / "runs", entry)
+
+
+class Here:
+    """An engine and its link: this process works on the newest task first."""
+
+    def __init__(self) -> None:
+        self.tasks: dict[str, bytes] = {}
+        self.sent = 0
+        self.closed = False
+
+    def workers(self, requested: int | None) -> int:
+        return requested or 1
+
+    def queued(self, store: EntryStore) -> set[int]:
+        return set()
+
+    def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
+        return self
+
+    def send(self, key: str, task: bytes) -> None:
+        self.sent += 1
+        self.tasks[key] = task
+
+    def receive(self, seconds: float) -> list[Answer]:
+        key, task = self.tasks.popitem()
+        return self.answers(key, task)
+
+    def answers(self, key: str, task: bytes) -> list[Answer]:
+        return [Answer(key, advance(task))]
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def train(
+    engine: Here, store: EntryStore, groups: list[tuple[int, ...]], epochs: int = EPOCHS
+) -> EngineOutcome:
+    work = api.Work(store, [SeedGroup(seeds, 0) for seeds in groups], epochs, len(groups))
+    outcome = remote.train(engine, work, lambda snapshot: None)
+    assert engine.closed
+    assert claims.claims(store) == []
+    return outcome
+
+
+def edited(content: bytes, **changes: Any) -> bytes:
+    header, arrays = unpack(content)
+    return pack({**header, **changes}, arrays)
+
+
+def test_bytes_are_those_of_the_local_engine(store: EntryStore, train_locally: Callable[..., Path]) -> None:
+    engine = Here()
+    assert train(engine, store, [(0, 1), (2,)]) == EngineOutcome()
+    assert engine.sent == 2 * EPOCHS, "one epoch each"
+    straight = train_locally("straight", [0, 1, 2], EPOCHS)
+    assert [results(store.path, seed) for seed in range(3)] == [results(straight, seed) for seed in range(3)]
+    assert {seed: len(read_lines(store.seed(seed).timings)) for seed in range(3)} == dict.fromkeys(
+        range(3), EPOCHS
+    )
+    assert train(Here(), store, [(0, 1), (2,)]) == EngineOutcome(), (
+        "to train again what is there sends nothing"
+    )
+
+
+@pytest.fixture
+def train_locally(train: Callable[..., Path]) -> Callable[..., Path]:
+    return train
+
+
+def test_local_and_remote_training_continue_each_other(
+    store: EntryStore, train_locally: Callable[..., Path], entry: Entry
+) -> None:
+    train_locally("runs", [0, 1], 2)
+    train(Here(), store, [(1,), (0,)], 3)
+    train_locally("runs", [0, 1], EPOCHS)
+    straight = train_locally("straight", [0, 1], EPOCHS)
+    assert [results(store.path, seed) for seed in (0, 1)] == [results(straight, seed) for seed in (0, 1)]
+
+
+class Strange(Here):
+    """Every answer comes again later, some before it with another token, seeds, epoch, lines or arrays."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.old: list[Answer] = []
+        self.wrong = iter(
+            [{"token": "x"}, {"seeds": [7]}, {"epoch": 9}, {"lines": [[{"epoch": 1}]]}, {"lines": []}]
+        )
+
+    def answers(self, key: str, task: bytes) -> list[Answer]:
+        content = advance(task)
+        changes = next(self.wrong, {})
+        came = [*self.old, Answer(key, edited(content, **changes)), Answer(key, content)]
+        self.old = [Answer(key, content), Answer("nobody's", content)]
+        return came
+
+
+def test_an_answer_is_accepted_once_and_only_where_it_fits(
+    store: EntryStore, train_locally: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote, "ATTEMPTS", 10)
+    engine = Strange()
+    assert train(engine, store, [(0, 1)]) == EngineOutcome()
+    assert engine.sent == EPOCHS + 5, "each of the five that do not fit is one more task"
+    straight = train_locally("straight", [0, 1], EPOCHS)
+    for seed in (0, 1):
+        assert results(store.path, seed) == results(straight, seed)
+        assert [line["epoch"] for line in read_lines(store.seed(seed).timings)] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (None, "its task was lost 3 times: killed by the system"),
+        (b"nonsense", "its task was lost 3 times: these 8 bytes are no task and no answer"),
+        (pack({"refused": "node7 has no numba"}, {}), "its task was lost 3 times: node7 has no numba"),
+    ],
+)
+def test_a_task_that_is_lost_again_and_again_is_given_up(
+    content: bytes | None, problem: str, store: EntryStore
+) -> None:
+    class Losing(Here):
+        def answers(self, key: str, task: bytes) -> list[Answer]:
+            if unpack(task)[0]["seeds"] == [0]:
+                return [Answer(key, content, "killed by the system")]
+            return super().answers(key, task)
+
+    engine = Losing()
+    outcome = train(engine, store, [(0,), (1,)])
+    (message,) = outcome.failed.values()
+    assert message.startswith(problem)
+    assert store.finished([0, 1], EPOCHS) == {1}, "the other group goes on"
+    assert engine.sent == 3 + EPOCHS
+
+
+def test_the_same_task_has_the_same_answer_times_aside(store: EntryStore) -> None:
+    tasks = []
+
+    class Watched(Here):
+        def answers(self, key: str, task: bytes) -> list[Answer]:
+            tasks.append(task)
+            return super().answers(key, task)
+
+    train(Watched(), store, [(0, 1)], 2)
+    for task in tasks:
+        (first, one), (second, two) = (unpack(advance(task)) for _ in range(2))
+        assert {**first, "timings": None} == {**second, "timings": None}
+        assert one.keys() == two.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], two[name])
+
+
+def test_a_worker_of_other_versions_refuses_by_name() -> None:
+    header, arrays = unpack(
+        advance(pack({"token": "t", "seeds": [0], "versions": {"torch": "1.0", "no-such": "2"}}, {}))
+    )
+    assert header["token"] == "t"
+    assert header["refused"].startswith(f"{os.uname().nodename} has torch ")
+    assert header["refused"].endswith(" instead of 1.0, no no-such")
+    assert arrays == {}
+    assert unpack(advance(b"\x08\0\0\0\0\0\0\0{}"))[0]["refused"].startswith("this is no task: ")
+
+
+def test_what_an_environment_raises_is_said_and_what_was_finished_before_stays(
+    store: EntryStore, monkeypatch: pytest.MonkeyPatch, train_locally: Callable[..., Path]
+) -> None:
+    from qrlsuite.training.trainer import Trainer
+
+    monkeypatch.setenv("QRLSUITE_CHECKPOINT_SECONDS", "1000")
+    real = Trainer.train_epoch
+
+    def failing(self: Trainer) -> Any:
+        if self.epoch == 2:
+            raise QrlSuiteError("the antenna is broken")
+        return real(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_epoch", failing)
+        outcome = train(Here(), store, [(0,)])
+    assert list(outcome.failed.values()) == ["the antenna is broken"]
+    (progress,) = [ProgressFile(store, checkpoint.group_id([0])).read()]
+    assert (progress["error"], progress["epoch"]) == ("the antenna is broken", 2)
+    assert train(Here(), store, [(0,)]) == EngineOutcome()
+    assert results(store.path, 0) == results(train_locally("straight", [0], EPOCHS), 0)
+
+
+def test_groups_are_small_enough_to_be_sent(
+    entry: Entry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: EntryStore
+) -> None:
+    fits = remote.seeds_per_task(entry)
+    size = checkpoint_bytes(store)
+    assert fits == (advancing.MOST_BYTES - remote.HEADER_BYTES) // size
+    limit = 2 * size + remote.HEADER_BYTES
+    for module in (advancing, remote):
+        monkeypatch.setattr(module, "MOST_BYTES", limit)
+    plan = execution.plan(tmp_path / "more", entry, execution.Execution(Here(), 1), list(range(5)), 2)
+    assert [group.seeds for group in plan.groups] == [(0,), (1, 2), (3, 4)]
+    for module in (advancing, remote):
+        monkeypatch.setattr(module, "MOST_BYTES", size + 10)
+    with pytest.raises(OptionError, match=r"too large to be sent: \d+ MB for 1 seed, .*--engine local"):
+        remote.seeds_per_task(entry)
+    assert advance_error(store).startswith("a checkpoint is too large to be sent")
+
+
+def checkpoint_bytes(store: EntryStore) -> int:
+    from qrlsuite.training.trainer import Trainer
+
+    trainer = Trainer(store.entry(), [0])
+    trainer.start()
+    return sum(a.nbytes for arrays in (trainer.capture(), trainer.policy()) for a in arrays.values())
+
+
+def advance_error(store: EntryStore) -> str:
+    header = {
+        "token": "t",
+        "entry": store.entry().record(),
+        "seeds": [0],
+        "epoch": 0,
+        "epochs": 1,
+        "seconds": 0,
+    }
+    answer, arrays = unpack(advance(pack({**header, "device": "cpu", "versions": {}}, {})))
+    assert (answer["epoch"], answer["lines"], arrays) == (0, [], {})
+    return str(answer["error"])
+
+
+def test_seeds_that_somebody_else_trains_are_left_to_them(store: EntryStore) -> None:
+    claim = claims.acquire(store, [0])
+    work = api.Work(store, [SeedGroup((0,), 0), SeedGroup((1,), 0)], 1, 2)
+    outcome = remote.train(Here(), work, lambda snapshot: None)
+    claim.release()
+    (message,) = outcome.taken.values()
+    assert "is being trained" in message or "are being trained" in message
+    assert store.finished([0, 1], 1) == {1}
+
+
+def test_a_claim_that_was_taken_over_ends_the_run(store: EntryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "HEARTBEAT", 0.01)
+
+    class Suspended(Here):
+        def answers(self, key: str, task: bytes) -> list[Answer]:
+            for claim in claims.claims(store):
+                claim.path.unlink()
+            return [Answer(key, None, "lost")] if self.sent > 1000 else super().answers(key, task)
+
+    with pytest.raises(StoreError, match="its seeds were taken over"):
+        train(Suspended(), store, [(0,)], 10_000)
+
+
+def test_a_full_disk_where_the_results_are(
+    disk: Path, entry: Entry, train_locally: Callable[..., Path]
+) -> None:
+    store = EntryStore.create(disk / "runs", entry)
+    outcome = train(Here(), store, [(0, 1)])
+    (message,) = outcome.failed.values()
+    assert "No space left on device" in message
+    subprocess.run(["mount", "-o", "remount,size=20m", str(disk)], check=True)
+    assert train(Here(), store, [(0, 1)]) == EngineOutcome()
+    straight = train_locally("straight", [0, 1], EPOCHS)
+    assert [results(store.path, seed) for seed in (0, 1)] == [results(straight, seed) for seed in (0, 1)]
+
+
+def test_ctrl_c_keeps_what_was_accepted(store: EntryStore, train_locally: Callable[..., Path]) -> None:
+    def show(snapshot: api.Snapshot) -> None:
+        if any(state.get("epoch") == 2 for state in snapshot.values()):
+            raise KeyboardInterrupt
+
+    work = api.Work(store, [SeedGroup((0,), 0)], EPOCHS, 1)
+    engine = Here()
+    with pytest.raises(KeyboardInterrupt):
+        remote.train(engine, work, show)
+    assert engine.closed
+    assert claims.claims(store) == []
+    assert checkpoint.load(store, [0])[0] == 2
+    assert train(Here(), store, [(0,)]) == EngineOutcome()
+    assert results(store.path, 0) == results(train_locally("straight", [0], EPOCHS), 0)
+
+
+def test_numbers_that_json_rounds_survive() -> None:
+    header = {"x": [0.1, 1 / 3, math.pi, 5e-324]}
+    again, arrays = unpack(pack(header, {"a": np.arange(6.0).reshape(2, 3).T}))
+    assert again == json.loads(json.dumps(header)) == header
+    np.testing.assert_array_equal(arrays["a"], np.arange(6.0).reshape(2, 3).T)
