@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import evaluation
+from qrlsuite.training.deployment import Deployment, steps_per_episode
 from qrlsuite.training.entanglement import PARAMETERS, Entanglement, along_episodes
 from qrlsuite.training.evaluation import Played
 
@@ -172,6 +173,9 @@ def evaluate(
     device: str = "cpu",
     progress: bool = True,
     entanglement: bool = False,
+    backend: str | None = None,
+    backend_options: Mapping[str, Any] | None = None,
+    yes: bool = False,
 ) -> Evaluation:
     """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
 
@@ -189,6 +193,11 @@ def evaluate(
         Whether to show a bar.
     entanglement:
         Measure the entanglement of every entry's circuit, too.
+    backend, backend_options:
+        Play every entry with its circuits on this backend, too, see `qrlsuite.training.deployment`. What this costs is
+        said first; finished episodes are kept.
+    yes:
+        Execute circuits on a device that is no simulator.
 
     Raises
     ------
@@ -206,8 +215,19 @@ def evaluate(
     folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in names)
     stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
+    deployed = (
+        [Deployment(s, backend, backend_options or {}, best, device) for s in stores] if backend else []
+    )
+    if backend_options and backend is None:
+        raise OptionError("--backend-set needs --backend, the circuit backend that has these options")
+    console = Console(stderr=True, quiet=not progress, highlight=False)
+    for each, store in zip(deployed, stores):
+        cost = each.cost(episodes, seed, steps_per_episode(store, best, episodes, seed, device))
+        if not each.simulator and not yes:
+            raise OptionError(f"{each.name} is no simulator: {cost}; add --yes to execute them")
+        console.print(f"{each.name}: {cost}", soft_wrap=True)
     measured = tuple(along_episodes(s, best, episodes, seed, device) for s in stores) if entanglement else ()
-    bar = Bar(Console(stderr=True, quiet=not progress, highlight=False), TimeRemainingColumn())
+    bar = Bar(console, TimeRemainingColumn())
 
     def report(name: str, done: int, total: int) -> None:
         bar.start(total, name)
@@ -217,6 +237,7 @@ def evaluate(
 
     try:
         played = [evaluation.trained(store, best, episodes, seed, device, report) for store in stores]
+        elsewhere = [each.play(episodes, seed, report) for each in deployed]
         entry = stores[0].entry()
         references = evaluation.references(entry, episodes, seed, report)
     finally:
@@ -226,7 +247,9 @@ def evaluate(
         each if labels.count(each.name) == 1 else replace(each, name=f"{each.name} {store.path.name[-8:]}")
         for each, store in zip(played, stores)
     ]
-    return Evaluation(entry.task.name, entry.task.hash, (*played, *references), episodes, seed, measured)
+    return Evaluation(
+        entry.task.name, entry.task.hash, (*played, *elsewhere, *references), episodes, seed, measured
+    )
 
 
 def _one_task(stores: Sequence[EntryStore]) -> None:

@@ -369,6 +369,9 @@ def evaluate(
     episodes: int = 1000,
     seed: int = 0,
     device: str = "cpu",
+    backend: str | None = None,
+    backend_options: Mapping[str, Any] | None = None,
+    yes: bool = False,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> Evaluation:
@@ -391,10 +394,17 @@ def evaluate(
         Another one gives other episodes.
     device:
         `cpu`, `cuda` or `cuda:1`.
+    backend:
+        Let the same agents act on this circuit backend, too: `native`, `pennylane`, `qiskit`, or a plugin's. Finished
+        episodes are kept in the entry's folder.
+    backend_options:
+        Options of that backend, such as `{"shots": 1000}`.
+    yes:
+        Execute circuits on a device that is no simulator.
     runs:
         The results folder.
     progress:
-        Whether to show a bar on a terminal or in a notebook.
+        Whether to show what is to be executed, and a bar, on a terminal or in a notebook.
 
     Returns
     -------
@@ -422,7 +432,19 @@ def evaluate(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
     names = [entries] if isinstance(entries, str) else list(entries)
-    return evaluation.evaluate(Path(runs), names, task, best, episodes, seed, device, progress)
+    return evaluation.evaluate(
+        Path(runs),
+        names,
+        task=task,
+        best=best,
+        episodes=episodes,
+        seed=seed,
+        device=device,
+        progress=progress,
+        backend=backend,
+        backend_options=backend_options,
+        yes=yes,
+    )
 
 
 def decide(

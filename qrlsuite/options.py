@@ -338,8 +338,10 @@ class Setting:
         return f"{self.prefix}{self.side}.{self.name}" if self.side else f"{self.prefix}{self.name}"
 
 
-def parse_setting(word: str) -> Setting:
+def parse_setting(word: str, prefix: str = "--set ") -> Setting:
     """Parse `[environment.|model.|ansatz.|algorithm.]name=value`; the value is read as TOML, else as text.
+
+    `prefix` is what stands before it where it was written, for messages.
 
     Raises
     ------
@@ -348,10 +350,11 @@ def parse_setting(word: str) -> Setting:
     """
     key, equals, text = word.partition("=")
     if not equals or not key.strip():
-        raise OptionError(f"--set {word}: write name=value, for example --set qubits=6")
+        example = "qubits=6" if prefix == "--set " else "shots=1000"
+        raise OptionError(f"{prefix}{word}: write name=value, for example {prefix}{example}")
     side, dot, name = key.strip().partition(".")
     value = parse_value(text.strip())
-    return Setting(side, name, value) if dot else Setting(None, side, value)
+    return Setting(side, name, value, prefix) if dot else Setting(None, side, value, prefix)
 
 
 def from_mapping(values: Mapping[str, Any] | None) -> list[Setting]:

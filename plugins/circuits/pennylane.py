@@ -41,6 +41,20 @@ LANE_MULTIPLE = 16
 """Every seed's lanes are padded to a multiple of this. torch multiplies complex numbers with fused operations in
 vectors and without them in what is left over at the end, so that a lane's bits would depend on its place."""
 
+SIMULATORS = (
+    "default.",
+    "lightning.",
+    "reference.",
+    "null.",
+    "simulator",
+    "aer",
+    "basicsim",
+    "local",
+    "qulacs",
+    "qsim",
+)
+"""Words in the names of devices that only simulate; any other device is taken for hardware."""
+
 PACKAGES = {
     "braket": "amazon-braket-pennylane-plugin",
     "cirq": "pennylane-cirq",
@@ -79,6 +93,7 @@ class PennyLaneBackend:
         self.circuit = circuit
         self.options = options
         self.shots: int | None = options.shots
+        self.simulator = any(word in options.device for word in SIMULATORS)
         self.table = AngleTable(circuit)
         self.diff_method = _diff_method(options)
         self._device = _device(options, circuit.qubits, None)

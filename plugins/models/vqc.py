@@ -251,6 +251,11 @@ class _Hybrid(nn.Module):
         """Circuit executions of each agent so far, shared with deep copies."""
         return self._runner.executions
 
+    @property
+    def simulator(self) -> bool:
+        """Whether the circuits are only simulated; else executions may cost money."""
+        return bool(getattr(self._runner.backend, "simulator", True))
+
     def circuit_states(self, x: Tensor) -> Tensor:
         """Return the circuit's final states (S, B, 2^n) for observations (S, B, in); qubit 0 is the highest bit."""
         from qrlsuite.plugins.circuits.native import dense  # the state is no backend's business but native's

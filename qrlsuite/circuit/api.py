@@ -41,13 +41,15 @@ class CircuitBackend(Protocol):
     shots:
         Circuit repetitions per expectation value; None means exact.
 
-    Two more attributes are read where a backend has them:
+    More attributes are read where a backend has them:
 
     draws (bool):
         Whether results are random, so that `seeds` are needed; by default where `shots` is finite.
     gradient_circuits (int):
         Circuits that it executes per input for a gradient; by default those of the parameter-shift rule. They are
         counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
+    simulator (bool):
+        False where circuits run on a device, whose executions may cost money; by default true.
     """
 
     shots: int | None

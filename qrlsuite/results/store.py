@@ -135,7 +135,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return records
 
 
-def _drop_torn_line(path: Path) -> None:
+def drop_torn_line(path: Path) -> None:
     """Remove what follows the last newline: the next line would be written behind it."""
     if path.exists():
         content = path.read_bytes()
@@ -277,7 +277,7 @@ class SeedStore:
         int
             The number of epochs that are left: fewer than `epoch` where some are gone.
         """
-        _drop_torn_line(self.timings)
+        drop_torn_line(self.timings)
         rows = [row for row in self.epochs() if row["epoch"] <= epoch]
         last = int(read_table(self.table, decimals=False)[-1]["epoch"]) if self.table.exists() else 0
         if last > epoch:

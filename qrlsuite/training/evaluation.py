@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -210,6 +210,22 @@ def _misfit(expected: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[A
     return None
 
 
+def trained_entry(store: EntryStore) -> Entry:
+    """Return a stored entry that was trained here.
+
+    Raises
+    ------
+    StoreError
+        If it was imported, and has no trained agents.
+    """
+    if store.record().get("imported"):
+        raise StoreError(
+            f"{store.path} was imported from other files, which hold learning curves and no trained parameters: "
+            "train the entry here with `qrlsuite run` to evaluate its policies"
+        )
+    return store.entry()
+
+
 def trained(
     store: EntryStore,
     best: int = 10,
@@ -237,16 +253,10 @@ def trained(
     EnvironmentFailure
         If the environment fails.
     """
-    record = store.record()
-    if record.get("imported"):
-        raise StoreError(
-            f"{store.path} was imported from other files, which hold learning curves and no trained parameters: "
-            "train the entry here with `qrlsuite run` to evaluate its policies"
-        )
-    entry = store.entry()
+    entry = trained_entry(store)
     seeds, validation, runs = best_runs(store, best)
     agents = trained_agents(entry, store, seeds, device)
-    returns, scores = play(
+    returns, scores, _ = play(
         entry, len(seeds), episodes, seed, lambda envs, block: agents.act, entry.label, report
     )
     return Played(entry.label, returns, scores, tuple(seeds), tuple(validation), runs)
@@ -274,7 +284,7 @@ def references(
         def build(envs: LaneEnv, block: int, factory: Any = factory, name: str = name) -> Policy:
             return _checked(name, factory(envs), envs)
 
-        returns, scores = play(entry, 1, episodes, seed, build, name, report)
+        returns, scores, _ = play(entry, 1, episodes, seed, build, name, report)
         played.append(Played(name, returns, scores))
     if "random" not in entry.task.environment.policies:
         streams = Streams(entry.task.hash, seed)
@@ -284,7 +294,7 @@ def references(
             choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
             return lambda observations: stream.integers(choices, size=envs.num_envs)
 
-        returns, scores = play(entry, 1, episodes, seed, uniform, "random", report)
+        returns, scores, _ = play(entry, 1, episodes, seed, uniform, "random", report)
         played.append(Played("random", returns, scores))
     return played
 
@@ -310,6 +320,24 @@ def _checked(name: str, policy: Policy, envs: LaneEnv) -> Policy:
     return act
 
 
+class Round(NamedTuple):
+    """Episodes that P agents played side by side: returns and scores (P, lanes), and the steps of all together."""
+
+    returns: FloatArray
+    scores: FloatArray
+    steps: int
+
+
+class KeptRounds(Protocol):
+    """Where finished rounds are kept, by number and lanes."""
+
+    def get(self, block: int, lanes: int) -> Round | None:
+        """Return a round that was finished before."""
+
+    def add(self, block: int, lanes: int, played: Round) -> None:
+        """Keep a finished round."""
+
+
 def play(
     entry: Entry,
     agents: int,
@@ -318,7 +346,9 @@ def play(
     build: Callable[[LaneEnv, int], Policy],
     name: str = "policy",
     report: Report = lambda name, done, total: None,
-) -> tuple[FloatArray, FloatArray | None]:
+    most_lanes: int = EVALUATION_LANES,
+    kept: KeptRounds | None = None,
+) -> tuple[FloatArray, FloatArray | None, int]:
     """Play the evaluation's episodes with P agents at once.
 
     Parameters
@@ -326,11 +356,15 @@ def play(
     build:
         Called at the beginning of each round of episodes with the lanes, seed-major in the agents, and the
         round's number.
+    most_lanes:
+        Episodes of an agent that are played side by side; which episodes are played does not depend on it.
+    kept:
+        Rounds found here are not played again, and others put there.
 
     Returns
     -------
     tuple
-        Returns (P, N), and scores (P, N) or None where the task knows no maximum.
+        Returns (P, N), scores (P, N) or None where the task knows no maximum, and the number of steps of all.
 
     Raises
     ------
@@ -342,20 +376,27 @@ def play(
     if episodes < 1:
         raise OptionError(f"--episodes {episodes}: at least one is needed")
     streams = Streams(entry.task.hash, seed)
-    lanes = min(EVALUATION_LANES, episodes)
+    lanes = min(most_lanes, episodes)
     envs = build_envs(entry, agents * lanes, lambda: None)
     envs.inner.autoreset = False
     rounds = -(-episodes // lanes)
     returns, scores = (np.empty((agents, rounds * lanes)) for _ in range(2))
+    steps = 0
     for block in range(rounds):
         columns = slice(block * lanes, (block + 1) * lanes)
         keys = range(columns.start, columns.stop)
         envs.seed_lanes([streams.numpy("evaluation", key) for _ in range(agents) for key in keys])
         report(name, block * lanes * agents, episodes * agents)
-        ended = play_episodes(envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
-        returns[:, columns] = ended.returns.reshape(agents, lanes)
-        scores[:, columns] = ended.scores.reshape(agents, lanes)
+        played = None if kept is None else kept.get(block, lanes)
+        if played is None:
+            ended = play_episodes(envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
+            both = (values.reshape(agents, lanes) for values in (ended.returns, ended.scores))
+            played = Round(*both, int(ended.lengths.sum()))
+            if kept is not None:
+                kept.add(block, lanes, played)
+        returns[:, columns], scores[:, columns] = played.returns, played.scores
+        steps += played.steps
     report(name, episodes * agents, episodes * agents)
     section = entry.task.file.score
     known = section.source == "info" or section.max_return is not None
-    return returns[:, :episodes].copy(), scores[:, :episodes].copy() if known else None
+    return returns[:, :episodes].copy(), scores[:, :episodes].copy() if known else None, steps

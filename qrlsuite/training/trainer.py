@@ -80,14 +80,21 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
 
 
-def count_parameters(entry: Entry) -> tuple[int, int]:
-    """Return the numbers of classical and quantum trainable scalars of an entry's first network."""
+def first_network(entry: Entry) -> nn.Module:
+    """Return one agent's freshly built first network; nothing is computed with it."""
     envs = build_envs(entry, 1, lambda: None)
     inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
     outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]
     with _building("models", entry.model.name):
-        agent = specs.resolve(entry.model.build)(inputs, outputs, entry.model_options, torch.Generator())
-    return population.count_parameters(agent)
+        agent: nn.Module = specs.resolve(entry.model.build)(
+            inputs, outputs, entry.model_options, torch.Generator()
+        )
+    return agent
+
+
+def count_parameters(entry: Entry) -> tuple[int, int]:
+    """Return the numbers of classical and quantum trainable scalars of an entry's first network."""
+    return population.count_parameters(first_network(entry))
 
 
 @dataclass(frozen=True)

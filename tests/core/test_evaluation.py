@@ -160,7 +160,7 @@ def test_short_episodes_are_not_counted_more_often(walk: Entry) -> None:
 
         return act
 
-    returns, scores = evaluation.play(walk, 1, 100, 0, build)
+    returns, scores, _ = evaluation.play(walk, 1, 100, 0, build)
     assert returns.shape == (1, 100)
     assert np.isfinite(returns).all()
     assert scores is None, "the task knows no maximum"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,6 +12,7 @@ from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import evaluation, pictures
+from qrlsuite.options import parse_setting
 from qrlsuite.results.store import write_atomically
 
 
@@ -42,6 +43,24 @@ def evaluate(
             "it.",
         ),
     ] = False,
+    backend: Annotated[
+        str | None,
+        typer.Option(
+            "--backend",
+            metavar="NAME",
+            help="Let the agents act on another circuit backend, too: native, pennylane, qiskit, or a plugin's.",
+        ),
+    ] = None,
+    backend_set: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--backend-set", metavar="NAME=VALUE", help="An option of that backend: shots=1000. Repeatable."
+        ),
+    ] = None,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Execute circuits on a device that is no simulator; it may cost money."),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Draw the histogram to a png, pdf or svg file."),
@@ -55,6 +74,11 @@ def evaluate(
     policy, so the choice does not raise the result. Agents act as in validation. Shown are sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
     others (beam6g: the optimal one and the nearest antenna).
+
+    With --backend the same agents act with shots, with noise or on a device, beside themselves as they were trained.
+    What this will take is said first. Finished episodes are kept, and not played again.
+
+    Example: qrlsuite evaluate vqc-native --backend qiskit --backend-set estimator=aer --backend-set shots=1000
 
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
@@ -70,6 +94,9 @@ def evaluate(
         seed=seed,
         progress=not json_output,
         entanglement=entanglement,
+        backend=backend,
+        backend_options=_options(backend_set or []),
+        yes=yes,
     )
     if out is not None:
         write_atomically(out, pictures.encode(evaluations.figure(), format_))
@@ -79,3 +106,12 @@ def evaluate(
     table_console().print(evaluations)
     if out is not None:
         typer.echo(f"wrote {out}")
+
+
+def _options(words: list[str]) -> dict[str, Any]:
+    """Read `name=value` words."""
+    settings = [parse_setting(word, "--backend-set ") for word in words]
+    for setting in settings:
+        if setting.side is not None:
+            raise OptionError(f"{setting.written}: write the name of the backend's option alone")
+    return {setting.name: setting.value for setting in settings}
