@@ -3,7 +3,8 @@
 Source: the paper's quantum models (section 'Experimental Setup'): Linear(obs -> n), a data re-uploading circuit
 whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3 inputs and 3 outputs these are
 6 L n + 7 n + 3 parameters on n qubits with L layers. Quantum parameters start uniform in [0, 2 pi), linear
-layers as `torch.nn.Linear` does.
+layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as in earlier work on CartPole (Jerbi
+et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
 
 One module serves all backends; the three models differ in which backend computes the circuit.
 """
@@ -79,6 +80,14 @@ class VQCOptions:
         Since("0.2.0"),
         Tuned(0.1, 10),
     ] = 1.0
+    linear: Annotated[
+        bool,
+        Field(
+            description="linear layers before and behind the circuit; false: observations are its inputs, and "
+            "output i is a trained factor times expectation value i"
+        ),
+        Since("0.2.0"),
+    ] = True
 
     @field_validator("ansatz_options")
     @classmethod
@@ -223,6 +232,14 @@ class _Affine(nn.Module):
         self.bias = nn.Parameter(bias)
 
 
+class _Factors(nn.Module):
+    """Holds `weight` (S, out), or without S in one agent's module: a factor for each output."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(weight)
+
+
 class _Hybrid(nn.Module):
     """What one agent's module and a population have in common; parameters `input.*, circuit.*, output.*`."""
 
@@ -233,7 +250,8 @@ class _Hybrid(nn.Module):
         super().__init__()
         self._runner = runner
         self._copies = 0
-        self.input = _Affine(state["input.weight"], state["input.bias"])
+        if runner.options.linear:
+            self.input = _Affine(state["input.weight"], state["input.bias"])
         self.circuit = nn.ParameterDict(
             {
                 name: nn.Parameter(
@@ -242,7 +260,11 @@ class _Hybrid(nn.Module):
                 for name in runner.circuit.parameters
             }
         )
-        self.output = _Affine(state["output.weight"], state["output.bias"])
+        self.output: nn.Module = (
+            _Affine(state["output.weight"], state["output.bias"])
+            if runner.options.linear
+            else _Factors(state["output.weight"])
+        )
         self.register_buffer("shot_key", state["shot_key"])
         self.register_buffer("shot_count", state["shot_count"])
 
@@ -266,7 +288,9 @@ class _Hybrid(nn.Module):
 
     def _circuit_inputs(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
         """Map (S, B, in) to what the circuit is given, (S, B, circuit.inputs)."""
-        inner = linear(x.to(state["input.weight"].dtype), state["input.weight"], state["input.bias"])
+        inner = x.to(state["output.weight"].dtype)
+        if self._runner.options.linear:
+            inner = linear(inner, state["input.weight"], state["input.bias"])
         return ACTIVATIONS[self._runner.options.activation_in](inner)
 
     def quantum_parameters(self) -> set[str]:
@@ -284,7 +308,10 @@ class _Hybrid(nn.Module):
         if values.requires_grad:
             values.register_hook(lambda grad: executions._backward(inputs))  # type: ignore[no-untyped-call]
         values = ACTIVATIONS[options.activation_out](values)
-        return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
+        if options.linear:
+            return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
+        factors = state["output.weight"][:, None]  # (S, 1, out)
+        return (values[..., : factors.shape[2]] * factors).to(x.dtype)
 
     def _shot_seeds(self) -> list[int] | None:
         """Return this pass's sampling seed of every agent, from its key and the number of its passes so far."""
@@ -369,24 +396,43 @@ def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Gene
     Raises
     ------
     OptionError
-        If the ansatz cannot be built with these options.
+        If the ansatz cannot be built with these options, or does not fit the task without linear layers.
     """
     runner = _Runner(options)
     circuit = runner.circuit
     state: dict[str, Tensor] = {}
-    state["input.weight"], state["input.bias"] = initial_layer(obs_dim, circuit.inputs, "torch", generator)
+    if options.linear:
+        state["input.weight"], state["input.bias"] = initial_layer(
+            obs_dim, circuit.inputs, "torch", generator
+        )
+    else:
+        _require_fit(circuit, obs_dim, out_dim)
     for name, parameter in circuit.parameters.items():
         uniform = torch.rand(parameter.shape, generator=generator)
         state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
         if name in _scales(circuit):
             state[f"circuit.{name}"] *= options.init_scale
-    state["output.weight"], state["output.bias"] = initial_layer(
-        len(circuit.observables), out_dim, "torch", generator
-    )
+    if options.linear:
+        state["output.weight"], state["output.bias"] = initial_layer(
+            len(circuit.observables), out_dim, "torch", generator
+        )
+    else:
+        state["output.weight"] = torch.ones(out_dim)
     state = {name: value.to(getattr(torch, options.dtype)) for name, value in state.items()}
     state["shot_key"] = torch.randint(2**63 - 1, (), generator=generator)
     state["shot_count"] = torch.zeros((), dtype=torch.int64)
     return VQC(runner, state)
+
+
+def _require_fit(circuit: Circuit, obs_dim: int, out_dim: int) -> None:
+    """Refuse a circuit that cannot stand without linear layers."""
+    outputs = len(circuit.observables)
+    if circuit.inputs != obs_dim or outputs < out_dim:
+        raise OptionError(
+            f"linear = false: the circuit has {circuit.inputs} inputs and {outputs} expectation values, the task "
+            f"{obs_dim} observations and {out_dim} outputs: choose the qubits so that the inputs are as many, and the "
+            "expectation values no fewer"
+        )
 
 
 def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:

@@ -246,7 +246,7 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     own = set(options.field_names(VQCOptions))
     assert own == {
         "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype", "train",
-        "init_scale",
+        "init_scale", "linear",
     }  # fmt: skip
     for name in BACKENDS:
         backend_options = registry.circuit_backend(name).options
@@ -294,3 +294,36 @@ def test_a_population_finds_out_at_once_that_its_backend_cannot_run():
     given = small(device="lightning.gpu")
     with pytest.raises(OptionError, match="pip install pennylane-lightning-gpu"):
         vqc.population(agents(1, given), given)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_without_linear_layers_the_circuit_stands_alone(backend):
+    options = small(backend, qubits=3, layers=1, dtype="float64", linear=False)
+    modules = agents(2, options, obs=3, out=2)
+    assert [name for name, _ in modules[0].named_parameters()] == [
+        "circuit.scaling",
+        "circuit.weights",
+        "output.weight",
+    ]
+    assert population.count_parameters(modules[0]) == (2, 18)
+    with torch.no_grad():
+        modules[1].output.weight.copy_(torch.tensor([2.0, -3.0]))
+    together = vqc.population(modules, options)
+    x = observations(2, 5, 3, dtype=torch.float64)
+    for s, module in enumerate(modules):
+        p = dict(module.named_parameters())
+        quantum = {name: p[f"circuit.{name}"][None] for name in ("scaling", "weights")}
+        values = create_backend("pennylane", ansatz("iqp", 3, 1))(x[s][None], quantum)[0]
+        expected = values[:, :2] * p["output.weight"]
+        torch.testing.assert_close(module(x[s]), expected, atol=1e-9, rtol=0)
+        torch.testing.assert_close(together(x)[s], expected, atol=1e-9, rtol=0)
+    together(x).square().sum().backward()
+    assert all(bool((parameter.grad != 0).any()) for parameter in together.parameters())
+
+
+@pytest.mark.parametrize(("obs", "out"), [(4, 2), (3, 4)])
+def test_without_linear_layers_sizes_must_fit(obs, out):
+    with pytest.raises(
+        OptionError, match=f"3 inputs and 3 expectation values, the task {obs} obs.*{out} out"
+    ):
+        agents(1, small(qubits=3, linear=False), obs=obs, out=out)
