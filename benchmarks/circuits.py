@@ -138,13 +138,15 @@ def operations(circuit: Circuit) -> tuple[float, float]:
     from qrlsuite.plugins.circuits.native.program import HADAMARD, NONE, ROTATE, compile_circuit
 
     forward = backward = 0.0
-    for kind, first, second, third, _ in compile_circuit(circuit).steps.tolist():
+    for kind, first, second, third, _, behind in compile_circuit(circuit).steps.tolist():
+        hadamards = behind.bit_count()
         if kind == ROTATE:
             pairs = (1 << circuit.qubits) / (2 if first == NONE else 4)
             forward, backward = forward + 28 * pairs, backward + 80 * pairs
         elif kind == HADAMARD:
-            amplitudes = sum(bit != NONE for bit in (first, second, third)) << circuit.qubits
-            forward, backward = forward + 2 * amplitudes, backward + 4 * amplitudes
+            hadamards = sum(bit != NONE for bit in (first, second, third))
+        amplitudes = hadamards << circuit.qubits
+        forward, backward = forward + 2 * amplitudes, backward + 4 * amplitudes
     return forward, backward
 
 

@@ -16,6 +16,10 @@ from qrlsuite.plugins.circuits.native.program import compile_circuit
 KEEP_BYTES = 256 << 20
 """Final states and gates up to this size are kept for the backward pass; larger ones are computed again."""
 
+APART = 17
+"""Rows between the two states of a backward pass. Without them equal rows lie a power of two apart, where a processor
+takes a load from one for dependent on a store to the other, and both for the same place in its first-level cache."""
+
 SPARE_BYTES = 64 << 20
 """Memory up to this size is kept from one pass to the next, one array per circuit and precision."""
 
@@ -81,7 +85,7 @@ class Simulator:
             self._workspaces[dtype] = _Workspace(
                 scratch=self.kernels.scratch(program, lanes, kind),
                 record=self.kernels.aligned((1, sum(rows), lanes), kind),
-                pair=self.kernels.aligned((2, rows[0], lanes), kind),
+                pair=self.kernels.aligned((2, rows[0] + APART, lanes), kind),
                 overlap=self.kernels.aligned((4, lanes), kind),
                 sums=self.kernels.aligned((program.parameters, lanes), kind),
                 slopes=self.kernels.aligned((program.inputs, lanes), kind),

@@ -17,6 +17,8 @@ from qrlsuite.plugins.circuits.native.program import (
     AXIS_Y,
     HADAMARD,
     NONE,
+    ON_CONTROL,
+    ON_TARGET,
     PERMUTE,
     PHASE,
     ROTATE,
@@ -153,7 +155,13 @@ def _components(program: Program) -> list[Component]:
 
 
 def _steps(program: Program, component: Component) -> list[list[int]]:
-    steps: list[list[int]] = program.steps[component.first : component.last].tolist()
+    """Return a component's steps, Hadamards behind a block as steps of their own, with their factor."""
+    steps: list[list[int]] = []
+    for step in program.steps[component.first : component.last].tolist():
+        steps.append(step)
+        for bit, here in ((step[2], ON_TARGET), (step[1], ON_CONTROL)):
+            if step[5] & here:
+                steps.append([HADAMARD, bit, NONE, NONE, 0, 0])
     return steps
 
 

@@ -16,7 +16,17 @@ from numba.np.numpy_support import from_dtype
 from numpy.typing import NDArray
 
 from qrlsuite.plugins.circuits.native.cache import inlined, kernel
-from qrlsuite.plugins.circuits.native.program import AXIS_X, AXIS_Y, HADAMARD, PERMUTE, PHASE, ROTATE, Program
+from qrlsuite.plugins.circuits.native.program import (
+    AXIS_X,
+    AXIS_Y,
+    HADAMARD,
+    ON_CONTROL,
+    ON_TARGET,
+    PERMUTE,
+    PHASE,
+    ROTATE,
+    Program,
+)
 from qrlsuite.plugins.circuits.native.sweeps import (
     HALF_ROOT,
     flip,
@@ -140,12 +150,14 @@ def _component(t: Any, c: int, states: Any) -> Any:
 
 @inlined
 def _begin(t: Any, c: int, state: Any) -> None:
-    """Put a component's state into |0...0> with the opening Hadamards applied."""
+    """Put a component's state into |0...0> with the opening Hadamards applied, and the factors of joined ones."""
     zero = splat(state, 0.0)
     opening, weight = t.components[c, 5], 1.0
     for q in range(t.components[c, 0]):
         if opening & (1 << q):
             weight *= HALF_ROOT
+    for _ in range(t.components[c, 6]):
+        weight *= HALF_ROOT
     amplitude = splat(state, weight)
     for i in range(1 << t.components[c, 0]):
         store(state, 2 * i, zero if i & ~opening else amplitude)
@@ -161,7 +173,7 @@ def _run(t: Any, states: Any, gates: Any) -> None:
         for m in range(t.components[component, 3], t.components[component, 4]):
             kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
             if kind == ROTATE:
-                rotate(state, n, a, b, gates, c, d)
+                rotate(state, n, a, b, gates, c, d, t.steps[m, 5])
             elif kind == HADAMARD:
                 hadamard(state, n, a, b, c)
             elif kind == PERMUTE:
@@ -305,10 +317,13 @@ def _unrun(
     for component in range(t.components.shape[0]):
         n, psi = _component(t, component, psis)
         n, lam = _component(t, component, lams)
+        weight = 1.0  # half for every Hadamard undone without its factor
         for m in range(t.components[component, 4] - 1, t.components[component, 3] - 1, -1):
             kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
             if kind == ROTATE:
-                unrotate(psi, lam, n, a, b, gates, c, d, overlap)
+                behind = t.steps[m, 5]
+                weight *= (0.5 if behind & ON_TARGET else 1.0) * (0.5 if behind & ON_CONTROL else 1.0)
+                unrotate(psi, lam, n, a, b, gates, c, d, behind, weight, overlap)
                 chain(t, c, overlap, flat, seed, inputs, trig, sums, slopes)
             elif kind == HADAMARD:
                 hadamard(psi, n, a, b, c)

@@ -9,12 +9,14 @@ Rotations of one target under one control are collected into a *block*, whose pr
 per lane. The phase of a controlled U3 is not global; its block carries it as a rotation "about" `PHASE`:
 e^{i angle} on the half of the state where the control is 1.
 
-H, CNOT, X, SWAP, CZ and Z are fixed: Hadamards are collected up to three at a time (a butterfly over 8
-amplitudes), neighboring CNOT, X and SWAP into one permutation of the basis, neighboring CZ and Z into one pattern
-of signs. S, T and Y equal rotations by constant angles up to a global phase.
+H, CNOT, X, SWAP, CZ and Z are fixed: neighboring CNOT, X and SWAP are collected into one permutation of the basis,
+neighboring CZ and Z into one pattern of signs. S, T and Y equal rotations by constant angles up to a global phase.
 
-A gate joins an earlier step where everything between acts on other qubits. Hadamards that open the circuit
-cost nothing: the state begins in their product.
+A gate joins an earlier step where everything between acts on other qubits. Hadamards that open the circuit cost
+nothing: the state begins in their product. Those behind a controlled block, on its control or target, join its sweep,
+as sums and differences without their factor 1 / sqrt 2: the multiplications, not the additions, fill the processor's
+units there. The initial state carries these factors. Other Hadamards are collected up to three at a time, a sweep with
+factor over 8 amplitudes.
 
 Qubits that no gate connects, directly or through others, never share a state. Each connected *component* has a
 state and steps of its own, so that 64 separate qubits take 64 times 2 amplitudes. The qubits of a component are
@@ -36,6 +38,10 @@ from qrlsuite.circuit.description import Angle, Circuit, Operation
 AXIS_X, AXIS_Y, AXIS_Z, PHASE = 0, 1, 2, 3
 ROTATE, HADAMARD, PERMUTE, SIGN = 0, 1, 2, 3
 NONE = -1
+ON_TARGET, ON_CONTROL = 1, 2
+"""Which bits of a controlled block have a Hadamard in the same sweep, as a mask."""
+JOINED = 64
+"""So many Hadamards of a component join blocks: without their factors its numbers grow by 2^32 in each state."""
 
 
 class Component(NamedTuple):
@@ -51,6 +57,8 @@ class Component(NamedTuple):
     last: int
     opening: int
     """The bits that begin with a Hadamard, as a mask."""
+    joined: int
+    """How many Hadamards blocks do without their factor: the initial state is 2^(-joined / 2) of its length."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +72,11 @@ class Program:
     amplitudes:
         Number of amplitudes of all components together.
     components:
-        (C, 6) int64: see `Component`.
+        (C, 7) int64: see `Component`.
     steps:
-        (M, 5) int64: kind and arguments. ROTATE: control bit or -1, target bit, block, whether the block has a
-        phase. HADAMARD: up to three bits, -1 where fewer. PERMUTE: first and last position in `cycles`. SIGN:
-        first and last position in `negative`.
+        (M, 6) int64: kind and arguments. ROTATE: control bit or -1, target bit, block, whether the block has a
+        phase, Hadamards behind it (`ON_TARGET`, `ON_CONTROL`). HADAMARD: up to three bits, -1 where fewer. PERMUTE:
+        first and last position in `cycles`. SIGN: first and last position in `negative`.
     angles:
         (A, 3) int64: input, flat index of scale, flat index of weight; -1 where absent.
     constants:
@@ -124,7 +132,7 @@ class _Step:
     control: int = NONE
     target: int = NONE
     rotations: list[tuple[int, int, float]] = field(default_factory=list)
-    bits: list[int] = field(default_factory=list)
+    hadamards: list[int] = field(default_factory=list)
     gates: list[tuple[str, tuple[int, ...]]] = field(default_factory=list)
 
 
@@ -133,6 +141,7 @@ class _Steps:
 
     def __init__(self) -> None:
         self.steps: list[_Step] = []
+        self.joined = 0
 
     def find(self, touched: set[int], fits: Callable[[_Step], bool]) -> _Step | None:
         """Return the latest step that fits, if nothing after it touches these bits."""
@@ -145,18 +154,27 @@ class _Steps:
 
     def rotate(self, control: int, target: int, rotations: list[tuple[int, int, float]]) -> None:
         touched = {target} | ({control} if control != NONE else set())
-        step = self.find(touched, lambda s: (s.kind, s.control, s.target) == (ROTATE, control, target))
+        step = self.find(
+            touched,
+            lambda s: (s.kind, s.control, s.target) == (ROTATE, control, target) and not s.hadamards,
+        )
         if step is None:
             step = _Step(ROTATE, touched, control, target)
             self.steps.append(step)
         step.rotations += rotations
 
     def hadamard(self, bit: int) -> None:
-        step = self.find({bit}, lambda s: s.kind == HADAMARD and bit not in s.bits and len(s.bits) < 3)
+        step = self.find({bit}, lambda s: s.control != NONE and bit in s.touched and bit not in s.hadamards)
+        if step is not None and self.joined < JOINED:
+            self.joined += 1
+        else:
+            step = self.find(
+                {bit}, lambda s: s.kind == HADAMARD and bit not in s.hadamards and len(s.hadamards) < 3
+            )
         if step is None:
             step = _Step(HADAMARD, set())
             self.steps.append(step)
-        step.bits.append(bit)
+        step.hadamards.append(bit)
         step.touched.add(bit)
 
     def fixed(self, kind: int, gate: str, bits: tuple[int, ...]) -> None:
@@ -175,7 +193,7 @@ class Compiler:
         offsets = np.cumsum([0, *(p.size for p in circuit.parameters.values())])
         self.offset = {name: int(start) for name, start in zip(circuit.parameters, offsets)}
         self.components: list[Component] = []
-        self.steps: list[tuple[int, int, int, int, int]] = []
+        self.steps: list[tuple[int, int, int, int, int, int]] = []
         self.angles: list[tuple[int, int, int]] = []
         self.constants: list[float] = []
         self.rotations: list[tuple[int, int, float]] = []
@@ -207,26 +225,27 @@ class Compiler:
             self.step(step, n)
         amplitude = sum(1 << c.qubits for c in self.components)
         place = sum(c.qubits for c in self.components)
-        self.components.append(Component(n, amplitude, place, first, len(self.steps), opening))
+        self.components.append(Component(n, amplitude, place, first, len(self.steps), opening, steps.joined))
 
     def step(self, step: _Step, qubits: int) -> None:
         """Lay a step out in the arrays."""
         if step.kind == ROTATE:
             phase = any(axis == PHASE for axis, _, _ in step.rotations)
-            self.steps.append((ROTATE, step.control, step.target, len(self.blocks) - 1, int(phase)))
+            behind = ON_TARGET * (step.target in step.hadamards) + ON_CONTROL * (step.control in step.hadamards)
+            self.steps.append((ROTATE, step.control, step.target, len(self.blocks) - 1, int(phase), behind))
             self.rotations += step.rotations
             self.blocks.append(len(self.rotations))
         elif step.kind == HADAMARD:
-            high, middle, low = [*sorted(step.bits, reverse=True), NONE, NONE][:3]
-            self.steps.append((HADAMARD, high, middle, low, 0))
+            high, middle, low = [*sorted(step.hadamards, reverse=True), NONE, NONE][:3]
+            self.steps.append((HADAMARD, high, middle, low, 0, 0))
         elif step.kind == PERMUTE:
             first = len(self.cycles)
             self.cycles += _cycles(_source(step.gates, qubits))
-            self.steps.append((PERMUTE, first, len(self.cycles), 0, 0))
+            self.steps.append((PERMUTE, first, len(self.cycles), 0, 0, 0))
         else:
             first = len(self.negative)
             self.negative += _negative(step.gates, qubits)
-            self.steps.append((SIGN, first, len(self.negative), 0, 0))
+            self.steps.append((SIGN, first, len(self.negative), 0, 0, 0))
 
     def angle(self, angle: Angle) -> int:
         """Add an angle to the table; returns its index."""
@@ -323,7 +342,7 @@ def compile_circuit(circuit: Circuit) -> Program:
         parameters=circuit.parameter_count,
         amplitudes=sum(1 << c.qubits for c in compiler.components),
         components=np.array(compiler.components, np.int64),
-        steps=np.array(compiler.steps, np.int64).reshape(-1, 5),
+        steps=np.array(compiler.steps, np.int64).reshape(-1, 6),
         angles=np.array(compiler.angles, np.int64).reshape(-1, 3),
         constants=np.array(compiler.constants, np.float64),
         rotations=np.array([r[:2] for r in compiler.rotations], np.int64).reshape(-1, 2),

@@ -6,7 +6,10 @@ the real part of amplitude i. A block's matrix in SU(2) is given by two numbers 
     U = [[a, -conj(b)], [b, conj(a)]],
 
 so that an amplitude pair (p0, p1), whose indices differ in the target bit, becomes
-(a p0 - conj(b) p1, b p0 + conj(a) p1). A controlled block touches only pairs whose control bit is 1.
+(a p0 - conj(b) p1, b p0 + conj(a) p1). A controlled block touches only pairs whose control bit is 1. Hadamards behind
+it, on its control or target, are done in the same sweep, which then visits the pairs whose control bit is 0 as well.
+They are sums and differences, without the factor 1 / sqrt 2, forward and backward: psi and lambda each grow by sqrt 2
+where one is undone, and the overlaps below by 2, exactly.
 
 Backward, psi is the state after a step, and lambda is O psi carried back to the same place. Where the last factor of
 that step is exp(-i t P / 2), the derivative of <psi|O|psi> by t is Im <lambda| P |psi>: so every block collects
@@ -22,6 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 from qrlsuite.plugins.circuits.native.cache import inlined
+from qrlsuite.plugins.circuits.native.program import ON_CONTROL, ON_TARGET
 from qrlsuite.plugins.circuits.native.vectors import load, splat, store
 
 HALF_ROOT = 0.7071067811865476
@@ -77,24 +81,68 @@ def multiplied(pr: Any, pi: Any, cr: Any, ci: Any) -> Any:
 
 
 @inlined
-def rotate(state: Any, qubits: int, control: int, target: int, gates: Any, block: int, phase: int) -> None:
-    """Apply a block."""
+def butterfly(p0r: Any, p0i: Any, p1r: Any, p1i: Any) -> Any:
+    """Return (p0 + p1, p0 - p1): sqrt 2 times a Hadamard."""
+    return p0r + p1r, p0i + p1i, p0r - p1r, p0i - p1i
+
+
+@inlined
+def read_pair(state: Any, i: int, j: int) -> Any:
+    """Return two amplitudes as four vectors, by their rows."""
+    return load(state, i), load(state, i + 1), load(state, j), load(state, j + 1)
+
+
+@inlined
+def write_pair(state: Any, i: int, j: int, p0r: Any, p0i: Any, p1r: Any, p1i: Any) -> None:
+    """Write two amplitudes to their rows."""
+    store(state, i, p0r)
+    store(state, i + 1, p0i)
+    store(state, j, p1r)
+    store(state, j + 1, p1i)
+
+
+@inlined
+def rotate(
+    state: Any, qubits: int, control: int, target: int, gates: Any, block: int, phase: int, behind: int
+) -> None:
+    """Apply a block, and the Hadamards behind it."""
+    # Constants in the place of variables: each case becomes a loop of its own, without branches.
+    if phase:
+        _rotate(state, qubits, control, target, gates, block, 1, behind)
+    elif behind == 0:
+        _rotate(state, qubits, control, target, gates, block, 0, 0)
+    elif behind == ON_CONTROL:
+        _rotate(state, qubits, control, target, gates, block, 0, ON_CONTROL)
+    else:
+        _rotate(state, qubits, control, target, gates, block, 0, behind)
+
+
+@inlined
+def _rotate(
+    state: Any, qubits: int, control: int, target: int, gates: Any, block: int, phase: int, behind: int
+) -> None:
     ar, ai, br, bi = read_block(gates, block)
     cr, ci = load(gates, 6 * block + 4), load(gates, 6 * block + 5)
     step = 2 << target
     for k in range(pairs(qubits, control)):
         i = 2 * pair(k, control, target)
         j = i + step
-        p0r, p0i, p1r, p1i = rotated(
-            load(state, i), load(state, i + 1), load(state, j), load(state, j + 1), ar, ai, br, bi
-        )
+        p0r, p0i, p1r, p1i = read_pair(state, i, j)
+        p0r, p0i, p1r, p1i = rotated(p0r, p0i, p1r, p1i, ar, ai, br, bi)
         if phase:
             p0r, p0i = multiplied(p0r, p0i, cr, ci)
             p1r, p1i = multiplied(p1r, p1i, cr, ci)
-        store(state, i, p0r)
-        store(state, i + 1, p0i)
-        store(state, j, p1r)
-        store(state, j + 1, p1i)
+        if behind:
+            away = 2 << control
+            q0r, q0i, q1r, q1i = read_pair(state, i - away, j - away)
+            if behind & ON_TARGET:
+                p0r, p0i, p1r, p1i = butterfly(p0r, p0i, p1r, p1i)
+                q0r, q0i, q1r, q1i = butterfly(q0r, q0i, q1r, q1i)
+            if behind & ON_CONTROL:
+                q0r, q0i, p0r, p0i = butterfly(q0r, q0i, p0r, p0i)
+                q1r, q1i, p1r, p1i = butterfly(q1r, q1i, p1r, p1i)
+            write_pair(state, i - away, j - away, q0r, q0i, q1r, q1i)
+        write_pair(state, i, j, p0r, p0i, p1r, p1i)
 
 
 @inlined
@@ -107,9 +155,35 @@ def unrotate(
     gates: Any,
     block: int,
     phase: int,
+    behind: int,
+    weight: float,
     overlap: Any,
 ) -> None:
-    """Collect T_X, T_Y, T_Z, T_1 (rows of `overlap`) and undo a block on both states."""
+    """Undo a block and the Hadamards behind it on both states; `overlap` receives weight * (T_X, T_Y, T_Z, T_1)."""
+    if phase:
+        _unrotate(psi, lam, qubits, control, target, gates, block, 1, behind, weight, overlap)
+    elif behind == 0:
+        _unrotate(psi, lam, qubits, control, target, gates, block, 0, 0, weight, overlap)
+    elif behind == ON_CONTROL:
+        _unrotate(psi, lam, qubits, control, target, gates, block, 0, ON_CONTROL, weight, overlap)
+    else:
+        _unrotate(psi, lam, qubits, control, target, gates, block, 0, behind, weight, overlap)
+
+
+@inlined
+def _unrotate(
+    psi: Any,
+    lam: Any,
+    qubits: int,
+    control: int,
+    target: int,
+    gates: Any,
+    block: int,
+    phase: int,
+    behind: int,
+    weight: float,
+    overlap: Any,
+) -> None:
     ar, ai, br, bi = read_block(gates, block)
     ai, br, bi = splat(gates, 0.0) - ai, splat(gates, 0.0) - br, splat(gates, 0.0) - bi  # U^-1: conj(a), -b
     cr, ci = load(gates, 6 * block + 4), splat(gates, 0.0) - load(gates, 6 * block + 5)
@@ -119,8 +193,24 @@ def unrotate(
     for k in range(pairs(qubits, control)):
         i = 2 * pair(k, control, target)
         j = i + step
-        p0r, p0i, p1r, p1i = load(psi, i), load(psi, i + 1), load(psi, j), load(psi, j + 1)
-        l0r, l0i, l1r, l1i = load(lam, i), load(lam, i + 1), load(lam, j), load(lam, j + 1)
+        p0r, p0i, p1r, p1i = read_pair(psi, i, j)
+        l0r, l0i, l1r, l1i = read_pair(lam, i, j)
+        if behind:
+            away = 2 << control
+            q0r, q0i, q1r, q1i = read_pair(psi, i - away, j - away)
+            m0r, m0i, m1r, m1i = read_pair(lam, i - away, j - away)
+            if behind & ON_CONTROL:
+                q0r, q0i, p0r, p0i = butterfly(q0r, q0i, p0r, p0i)
+                q1r, q1i, p1r, p1i = butterfly(q1r, q1i, p1r, p1i)
+                m0r, m0i, l0r, l0i = butterfly(m0r, m0i, l0r, l0i)
+                m1r, m1i, l1r, l1i = butterfly(m1r, m1i, l1r, l1i)
+            if behind & ON_TARGET:
+                q0r, q0i, q1r, q1i = butterfly(q0r, q0i, q1r, q1i)
+                p0r, p0i, p1r, p1i = butterfly(p0r, p0i, p1r, p1i)
+                m0r, m0i, m1r, m1i = butterfly(m0r, m0i, m1r, m1i)
+                l0r, l0i, l1r, l1i = butterfly(l0r, l0i, l1r, l1i)
+            write_pair(psi, i - away, j - away, q0r, q0i, q1r, q1i)
+            write_pair(lam, i - away, j - away, m0r, m0i, m1r, m1i)
         tx += l0r * p1i - l0i * p1r + l1r * p0i - l1i * p0r
         ty += l1r * p0r + l1i * p0i - l0r * p1r - l0i * p1i
         tz += l0r * p0i - l0i * p0r - l1r * p1i + l1i * p1r
@@ -132,18 +222,12 @@ def unrotate(
             l1r, l1i = multiplied(l1r, l1i, cr, ci)
         p0r, p0i, p1r, p1i = rotated(p0r, p0i, p1r, p1i, ar, ai, br, bi)
         l0r, l0i, l1r, l1i = rotated(l0r, l0i, l1r, l1i, ar, ai, br, bi)
-        store(psi, i, p0r)
-        store(psi, i + 1, p0i)
-        store(psi, j, p1r)
-        store(psi, j + 1, p1i)
-        store(lam, i, l0r)
-        store(lam, i + 1, l0i)
-        store(lam, j, l1r)
-        store(lam, j + 1, l1i)
-    store(overlap, 0, tx)
-    store(overlap, 1, ty)
-    store(overlap, 2, tz)
-    store(overlap, 3, t1)
+        write_pair(psi, i, j, p0r, p0i, p1r, p1i)
+        write_pair(lam, i, j, l0r, l0i, l1r, l1i)
+    store(overlap, 0, splat(gates, weight) * tx)
+    store(overlap, 1, splat(gates, weight) * ty)
+    store(overlap, 2, splat(gates, weight) * tz)
+    store(overlap, 3, splat(gates, weight) * t1)
 
 
 @inlined
