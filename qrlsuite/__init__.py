@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from qrlsuite.hookspecs import hookimpl as hookimpl
     from qrlsuite.registry import Registry
 
-__version__ = "0.1.0"
+__version__ = "0.1.1"
 
 __all__ = [
     "__version__", "api", "board", "compare", "decide", "evaluate", "hookimpl", "load", "plot",

@@ -22,7 +22,7 @@ from qrlsuite.circuit import Circuit, ansatz, expectations
 from qrlsuite.circuit.description import GATES
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import NativeBackend, dense
-from qrlsuite.plugins.circuits.native.program import HADAMARD, PERMUTE, ROTATE, SIGN, compile_circuit
+from qrlsuite.plugins.circuits.native.program import HADAMARD, JOINED, PERMUTE, ROTATE, SIGN, compile_circuit
 from tests.conftest import HANGS, golden
 
 GOLDEN = golden("vqc")
@@ -256,6 +256,21 @@ def test_programs_are_as_short_as_they_should_be(name: str) -> None:
     }[name]
     xyz = compile_circuit(ansatz(name, qubits=10, layers=4, gate="xyz")).steps[:, 0].tolist()
     assert xyz.count(ROTATE) == 40, "three rotations of one target under one control are one block"
+
+
+def test_hadamards_without_factor_stay_within_the_range_of_float32() -> None:
+    """198 Hadamards behind blocks: were all done without their factor, overlaps would grow by 2^198."""
+    circuit = ansatz("iqp", qubits=2, layers=100)
+    assert compile_circuit(circuit).components[0, 6] == JOINED
+    x, parameters = random_values(circuit, 1, 2, torch.float32)
+    results = []
+    for path in ("kernels", "torch"):
+        leaves = {name: p.clone().requires_grad_() for name, p in parameters.items()}
+        values = run(NativeBackend(circuit), path, x, leaves)
+        values.sum().backward()
+        results.append([values.detach(), *(leaf.grad for leaf in leaves.values())])
+    for compiled, plain in zip(*results):
+        torch.testing.assert_close(compiled, plain, rtol=0, atol=1e-4)
 
 
 def test_state_memory_at_14_qubits() -> None:

@@ -25,6 +25,9 @@ from tests.golden.make import EPOCHS, GOLDEN, SEEDS, machine
 
 VERSIONS = sorted(path.parent for path in GOLDEN.glob("v*/hashes.json"))
 RUNS = [path.parent for version in VERSIONS for path in sorted(version.glob("interrupted/*/*/entry.json"))]
+HADAMARDS = "v0.1.1"
+"""Since this version Hadamards join blocks, which rounds circuits differently: those that earlier versions began are
+compared number by number, everything else byte by byte."""
 TOLERANCE = 1e-4
 """With torch's kernels for other processors (ATEN_CPU_CAPABILITY=default) lines differ by 1e-7 at most. Parameters are
 not compared: angles without influence on the result follow rounding errors alone, and Adam makes steps of them."""
@@ -66,12 +69,13 @@ def test_runs_end_as_they_did(run: Path, begun: bool, tmp_path: Path) -> None:
         shutil.copy(run / "entry.json", folder)
     train_group(folder, SEEDS, EPOCHS)
     version = run.parents[2]
-    same_machine = stored(version, "machine") == machine()
+    other_circuits = version.name < HADAMARDS and "-vqc-" in run.name
+    same_bits = stored(version, "machine") == machine() and not other_circuits
     for seed in SEEDS:
         ended = EntryStore(folder).seed(seed)
         expected = version / "finished" / run.parent.name / run.name / ended.path.name
         lines = b"".join(map(json_line, ended.epochs()))
-        if same_machine:
+        if same_bits:
             assert lines == (expected / "epochs.jsonl").read_bytes()
             trained = (ended.path / "final.safetensors").read_bytes()
             assert trained == (expected / "final.safetensors").read_bytes()

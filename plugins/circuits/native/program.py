@@ -231,7 +231,9 @@ class Compiler:
         """Lay a step out in the arrays."""
         if step.kind == ROTATE:
             phase = any(axis == PHASE for axis, _, _ in step.rotations)
-            behind = ON_TARGET * (step.target in step.hadamards) + ON_CONTROL * (step.control in step.hadamards)
+            behind = ON_TARGET * (step.target in step.hadamards) + ON_CONTROL * (
+                step.control in step.hadamards
+            )
             self.steps.append((ROTATE, step.control, step.target, len(self.blocks) - 1, int(phase), behind))
             self.rotations += step.rotations
             self.blocks.append(len(self.rotations))
