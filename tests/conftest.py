@@ -213,9 +213,8 @@ def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "subprocess", stand_in)
 
 
-@pytest.fixture
-def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
-    """Train seeds as one group in this process; returns the entry's folder."""
+def trainer(task: str, root: Path) -> Callable[..., Path]:
+    """Return a function that trains seeds as one group in this process, and returns the entry's folder."""
 
     def run(
         folder: str,
@@ -229,8 +228,8 @@ def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
         from qrlsuite.options import parse_setting
         from qrlsuite.results.store import EntryStore
 
-        entry = resolve(tiny_task, model, settings=[parse_setting(word) for word in settings])
-        store = EntryStore.create(tmp_path / folder, entry)
+        entry = resolve(task, model, settings=[parse_setting(word) for word in settings])
+        store = EntryStore.create(root / folder, entry)
         train_group(store.path, seeds, epochs)
         return store.path
 
@@ -248,6 +247,12 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip(f"a small tmpfs cannot be mounted here: {done.stderr.strip()}")
     yield path
     subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+@pytest.fixture
+def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
+    """Train seeds as one group in this process; returns the entry's folder."""
+    return trainer(tiny_task, tmp_path)
 
 
 def results(entry: Path, seed: int) -> tuple[bytes, bytes]:

@@ -70,9 +70,9 @@ def test_bad_input() -> None:
 
 def test_the_circuit_fits_the_classes_and_matched_controls_do_not() -> None:
     """The best of several random starts of each; mean-field is also given the teacher's parameters to start from."""
-    circuit_size, circuit = fit("circuit", starts=4, steps=1500)
+    circuit_size, circuit = fit("circuit", starts=2, steps=500)
     for control in ("mean-field", "mean-field, teacher's own", "separable", "sin, gain 2", "mlp"):
-        size, right = fit(control, starts=4, steps=1500)
+        size, right = fit(control, starts=2, steps=500)
         gap = 0.1 if "mean-field" in control or control == "separable" else 0.01
         assert right[-1] < circuit[-1] - gap, control
         assert circuit_size <= size <= 1.2 * circuit_size, control

@@ -13,7 +13,9 @@ import pytest
 
 from qrlsuite import registry
 from qrlsuite.specs import EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
+from qrlsuite.testing import common
 from qrlsuite.testing.common import check_common, subject
+from qrlsuite.testing.fresh import fresh_process
 from tests.core.test_hooks import install
 from tests.testing.broken import Broken, ids
 
@@ -133,6 +135,21 @@ BROKEN = [
 ]  # fmt: skip
 
 KINDS = {ModelSpec: "models", EngineSpec: "engines", EnvironmentSpec: "environments"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_process(site: None) -> Iterator[None]:
+    """One process resolves the references of all specs that nothing registered, instead of one for each."""
+    subjects = [subject(KINDS[type(case.spec)], case.spec) for _, case in BROKEN]
+    references = {r for each in subjects if not each.modules for r in each.references().values()}
+    result = fresh_process((), tuple(sorted(references)))
+
+    def shared(modules: tuple[str, ...], needed: tuple[str, ...]) -> dict[str, Any]:
+        return result if not modules and references.issuperset(needed) else fresh_process(modules, needed)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(common, "fresh_process", shared)
+        yield
 
 
 def broken_rules(spec: Spec) -> dict[str, str]:
