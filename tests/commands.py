@@ -124,11 +124,22 @@ def _worker(
     return Fork(program)
 
 
+def _resolving_here(
+    fresh_process: Callable[..., dict[str, Any]], modules: tuple[str, ...], references: tuple[str, ...]
+) -> dict[str, Any]:
+    """Register plugins in a new interpreter, and resolve references in this one, which has imported torch already."""
+    from qrlsuite.testing import fresh
+
+    return {**fresh_process(modules, ()), "references": fresh.resolved(references)}
+
+
 def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -> int:
     """Be `python -W error -m qrlsuite WORDS`, a worker, `pytest WORDS` or `dask WORDS` in a forked process."""
     from qrlsuite import cli, registry
     from qrlsuite.engine import local, worker
+    from qrlsuite.testing import common, fresh
 
+    common.fresh_process = functools.partial(_resolving_here, fresh.fresh_process)  # type: ignore[assignment]
     registry.load.cache_clear()  # importing Gymnasium has loaded the plugins that were asked for then
     filters = list(warnings.filters)
     local.subprocess = SimpleNamespace(  # type: ignore[assignment]

@@ -69,14 +69,19 @@ def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
         except (Exception, SystemExit) as error:
             failed[name] = registry.words(error)
     heavy = [name for name in HEAVY if name in sys.modules]
-    resolved: dict[str, str | None] = {}
+    return {"modules": failed, "heavy": heavy, "references": resolved(references)}
+
+
+def resolved(references: Sequence[str]) -> dict[str, str | None]:
+    """Resolve references in this process; returns by reference its error, or None."""
+    errors: dict[str, str | None] = {}
     for reference in references:
         try:
             specs.resolve(reference)
-            resolved[reference] = None
+            errors[reference] = None
         except (Exception, SystemExit) as error:
-            resolved[reference] = registry.words(error)
-    return {"modules": failed, "heavy": heavy, "references": resolved}
+            errors[reference] = registry.words(error)
+    return errors
 
 
 if __name__ == "__main__":

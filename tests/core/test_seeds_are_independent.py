@@ -12,7 +12,7 @@ from tests.conftest import POLE, results
 
 MODELS = {
     "mlp": (3, ("width=16",)),
-    "vqc-pennylane": (2, ("qubits=2", "layers=1")),
+    "vqc-pennylane": (1, ("qubits=2", "layers=1")),
     "vqc-native": (3, ("qubits=3", "layers=2")),
 }
 """Epochs and options; PennyLane is slow."""

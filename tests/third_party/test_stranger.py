@@ -72,7 +72,7 @@ class Installation:
             *packages,
             cwd=folder,
         )
-        self.pip("install", *PIP, *wheels.glob("*.whl"))
+        self.pip("install", *PIP, "--no-compile", *wheels.glob("*.whl"))
         # after pip has run, which would otherwise take the borrowed packages for installed ones
         site = Path(
             run(
