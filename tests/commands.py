@@ -43,6 +43,9 @@ PRELOADED = (
 )
 if importlib.util.find_spec("distributed") is not None:
     PRELOADED += ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
+PENNYLANE, QISKIT = "qrlsuite.plugins.circuits.pennylane", "qrlsuite.plugins.circuits.qiskit"
+LOADED_FOR = {"vqc-pennylane": (PENNYLANE,), "check": (PENNYLANE, QISKIT), "pytest": (PENNYLANE, QISKIT)}
+"""What is imported before the first command with this word, for it and all that follow."""
 HANGS = 3600
 """Seconds after which a command is taken to hang: far more than any needs on a busy machine."""
 
@@ -166,7 +169,7 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
     return 0
 
 
-def _answer(request: int, out: int, err: int, reply: int) -> None:
+def _answer(request: Mapping[str, Any], out: int, err: int, reply: int) -> None:
     """Run one command to its end, in a process between it and the one that serves."""
 
     def program() -> int:
@@ -175,8 +178,7 @@ def _answer(request: int, out: int, err: int, reply: int) -> None:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.dup2(out, 1)
         os.dup2(err, 2)
-        with open(request) as file:
-            return _command(**json.load(file))
+        return _command(**request)
 
     command = Fork(program)
     os.write(reply, f"{command.pid}\n".encode())
@@ -194,7 +196,11 @@ def serve(control: int) -> None:
         running = [process for process in running if process.poll() is None]
         if not message:
             return
-        running.append(Fork(functools.partial(_answer, *files)))
+        request = json.loads(os.pread(files[0], os.fstat(files[0]).st_size, 0))
+        for word in (request["program"], *request["words"]):
+            for name in LOADED_FOR.get(word, ()):
+                importlib.import_module(name)
+        running.append(Fork(functools.partial(_answer, request, *files[1:])))
         for file in files:
             os.close(file)
 

@@ -141,7 +141,7 @@ SIZES = {"qubits = [": "qubits = [2, 3]", "layers = [": "layers = [1, 2]", "widt
 """Grids of sizes, and what they become."""
 QUOTED = r'"[^"]*"'
 LONG_LIST = re.compile(rf"\[\s*(?:{QUOTED},\s*){{9,}}(?:{QUOTED})?\s*\]")
-"""Ten names and more, of tasks; every fifth is kept."""
+"""Ten names and more, of tasks; every tenth is kept."""
 REDUCED = {"interactions": 80, "environments": 4, "validation_episodes": 4, "steps": 20}
 
 
@@ -151,7 +151,7 @@ def reduced(name: str, folder: Path) -> str:
     for beginning, grid in SIZES.items():
         text = re.sub(rf"{re.escape(beginning)}[^]]*\]", grid, text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
-    text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::5])}]", text)
+    text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::10])}]", text)
 
     def task(match: re.Match[str]) -> str:
         content = Path(registry.task(match[1]).path).read_text()

@@ -242,8 +242,9 @@ def test_alpha_and_seed_decide(rule: type) -> None:
     assert (rule()(*seeded[0]) == rule()(*seeded[1])).all()
 
 
-@pytest.mark.parametrize("rule", [TimesRule(), PermutationRule()], ids=["times", "permutation"])
-@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize(
+    ("rule", "index"), [(TimesRule(), 0), (PermutationRule(), 1)], ids=["times", "permutation"]
+)
 def test_equal_entries_rarely_differ_and_slow_ones_are_found(
     rule: TimesRule | PermutationRule, index: int
 ) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.commands import qrlsuite
+from tests.commands import Command, qrlsuite
 from tests.conftest import HANGS
 
 ROOT = Path(__file__).parents[2]
@@ -152,9 +152,9 @@ def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:
 def test_it_passes_its_own_test(installed: Installation) -> None:
     """As its author runs it; the slow kinds are left to `qrlsuite check acme-qrl`, with the same rules."""
     shutil.copytree(Path(__file__).parent / "acme-qrl" / "tests", installed.folder / "tests")
-    words = (installed.python, "-P", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests")
-    words += ("-k", "waves or half or log")
-    assert "3 passed" in run(*words, cwd=installed.folder).stdout
+    words = ["-q", "-W", "error", "-p", "no:cacheprovider", "tests", "-k", "waves or half or log"]
+    tests = Command(words, environment(), installed.folder, str(installed.python), program="pytest")
+    assert "3 passed" in tests.communicate()[0]
 
 
 @pytest.fixture(scope="module")
