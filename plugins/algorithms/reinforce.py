@@ -8,13 +8,15 @@ completed in an epoch:
     b    = 0 (`baseline = "none"`), the mean of the n G_t ("mean"), or V(s_t) of a value network of the model's
            architecture ("value"), which learns by 1/n sum_t (V(s_t) - G_t)^2 in the same step
 
-One Adam step per epoch. The paper names the algorithm only ('vanilla policy gradient', its appendix on CartPole)
-and gives no settings; the defaults are ours.
+One Adam step per epoch, or per `epochs_per_update` epochs. The paper names the algorithm only ('vanilla policy
+gradient', its appendix on CartPole) and gives no settings; the defaults are ours.
 
 How it meets a fixed number of steps per epoch:
 - An episode that is unfinished when the epoch ends carries over, and its steps are learned from in the epoch in which
   it ends. Its actions stay as they were chosen, log pi(a|s) is evaluated under the parameters of the update: with
   episodes longer than an epoch, the earliest steps are off-policy by as many updates. No importance weights.
+- With `epochs_per_update` > 1 all environments begin anew after each update, and no episode carries over to the next:
+  every step that is learned from was made by the policy that is updated. Episodes that are unfinished then are lost.
 - A seed without a completed episode makes no step: its parameters, moments and step count stay.
 - Of an unfinished episode the last `memory` steps are kept. Of a longer one the earliest are not learned from; the
   reward-to-go of the others is exact, as it does not look back.
@@ -41,7 +43,8 @@ from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
-from qrlsuite.options import Tuned
+from qrlsuite.errors import OptionError
+from qrlsuite.options import Since, Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
 
@@ -71,6 +74,15 @@ class REINFORCEOptions:
         int,
         Field(ge=1, description="steps kept of an unfinished episode, per environment, when an epoch ends"),
     ] = 500
+    epochs_per_update: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="epochs between updates; from 2 on environments begin anew after each, so that episodes are "
+            "whole and of one policy",
+        ),
+        Since("0.2.0"),
+    ] = 1
 
 
 def rewards_to_go(rewards: FloatArray, ended: BoolArray, gamma: float) -> tuple[FloatArray, BoolArray]:
@@ -112,6 +124,8 @@ class Reinforce:
         # the steps of unfinished episodes, the last step in the last slot; a row is observation, action, reward
         self.carried = torch.zeros((self.S, self.E, options.memory, self.obs_dim + 2), device=device)
         self.lengths = torch.zeros((self.S, self.E), dtype=torch.int64)  # slots of `carried` in use
+        # where an episode ended among them; none where episodes carry over
+        self.carried_ends = torch.zeros(self.carried.shape[:3], dtype=torch.bool)
 
     def start(self) -> None:
         """Reset the environments."""
@@ -122,19 +136,44 @@ class Reinforce:
         """Collect `rounds` steps of every environment and make one update.
 
         Returns, per seed (S,), the number of steps learned from `learned_steps` and the policy's loss `loss`, NaN
-        where no episode ended; with a value network also its mean squared error `value_loss`.
+        where no episode ended or there was no update; with a value network also its mean squared error `value_loss`.
+
+        Raises
+        ------
+        OptionError
+            If `memory` is too short for `epochs_per_update`.
         """
+        memory, each = self.options.memory, self.options.epochs_per_update
+        place = self.epoch % each  # among the epochs of one update
+        if memory < (each - 1) * rounds:
+            raise OptionError(
+                f"memory = {memory}: epochs_per_update = {each} keeps {(each - 1) * rounds} steps of each environment; "
+                f"set memory={(each - 1) * rounds}"
+            )
+        if self.epoch and each > 1 and place == 0:
+            self.start()
         rows, ended, cut, final = self._collect(rounds)
-        memory = self.options.memory
         rewards = rows[..., -1].to(torch.float64).cpu().numpy()
         if self.value is not None:
             beyond = self._beyond(final)  # (S, E, rounds)
             rewards[:, :, memory:] += self.options.gamma * np.where(cut[:, :, memory:], beyond, 0.0)
         returns, known = rewards_to_go(rewards, ended, self.options.gamma)
         lengths = self.lengths.numpy()
+        if place < each - 1:
+            rows[..., -1] = torch.from_numpy(rewards).to(rows)
+            self.carried, self.carried_ends = rows[:, :, -memory:], torch.from_numpy(ended[:, :, -memory:])
+            self.lengths += rounds
+            self.epoch += 1
+            names = ("loss",) if self.value is None else ("loss", "value_loss")
+            return {"learned_steps": np.zeros(self.S), **{name: np.full(self.S, np.nan) for name in names}}
         filled = np.arange(memory + rounds) >= memory - lengths[..., None]
         metrics = self._learn(rows[..., :-1], returns, known & filled)
-        self._carry(rows, lengths + rounds, known)
+        if each == 1:
+            self._carry(rows, lengths + rounds, known)
+        else:
+            self.lengths, self.carried_ends = (
+                torch.zeros_like(kept) for kept in (self.lengths, self.carried_ends)
+            )
         self.epoch += 1
         return metrics
 
@@ -157,6 +196,7 @@ class Reinforce:
         rows = torch.zeros((*shape, self.obs_dim + 2), device=self.device)
         rows[:, :, :memory] = self.carried
         ended, cut = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
+        ended[:, :, :memory] = self.carried_ends.numpy()
         final = torch.zeros((self.S, self.E, rounds, self.obs_dim), device=self.device)
         for k in range(rounds):
             with torch.no_grad():
@@ -282,6 +322,7 @@ class Reinforce:
             "lengths": self.lengths,
             "observations": self.observations,
             "epoch": torch.full((self.S,), self.epoch, dtype=torch.int64),
+            **({} if self.options.epochs_per_update == 1 else {"carried_ends": self.carried_ends}),
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -293,5 +334,7 @@ class Reinforce:
             self.value_adam.load_state_dict(part(state, "value_adam"))
         self.carried.copy_(state["carried"])
         self.lengths.copy_(state["lengths"])
+        if self.options.epochs_per_update > 1:
+            self.carried_ends.copy_(state["carried_ends"])
         self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from qrlsuite.errors import OptionError
 from qrlsuite.plugins.algorithms import reinforce
 from qrlsuite.plugins.algorithms.reinforce import Reinforce, rewards_to_go
 from tests.algorithms.worlds import Clock, Contexts, Group, Perceptron, log_softmax
@@ -122,6 +123,48 @@ def test_memory_keeps_the_last_steps_of_a_long_episode() -> None:
     assert made.train_epoch(3)["learned_steps"].tolist() == [1 + 2]
     assert made.lengths.tolist() == [[1]]
     assert made.carried[0, 0, 0, 0] == 0  # the first step of the second episode
+
+
+def test_whole_episodes_are_of_one_policy() -> None:
+    """Three epochs of 4 rounds: from 12 steps each, episodes of 5, 2 and 8 steps keep 10, 12 and 8."""
+    made = clock([5, 2, 8], memory=8, epochs_per_update=3)
+    for update in (1, 2):
+        before = {name: value.clone() for name, value in made.policy.state_dict().items()}
+        for _ in range(2):
+            metrics = made.train_epoch(4)
+            assert metrics["learned_steps"].tolist() == [0]
+            assert np.isnan(metrics["loss"]).all()
+        assert all(torch.equal(value, before[name]) for name, value in made.policy.state_dict().items())
+        assert made.train_epoch(4)["learned_steps"].tolist() == [30], "unfinished episodes are lost"
+        assert made.adam.steps.tolist() == [update]
+
+
+@pytest.mark.parametrize("baseline", ["mean", "value"])
+def test_what_whole_episodes_teach_is_what_one_long_epoch_teaches(
+    baseline: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rewards-to-go of four epochs of 3 rounds, time limits included, and interrupted after the second."""
+    taught = []
+    for rounds, each in ((12, 1), (3, 4)):
+        made = clock([5, 3], cut=True, memory=9, epochs_per_update=each, baseline=baseline)
+        for epoch in range(each):
+            if epoch == 2:
+                state, envs = made.state_dict(), made.envs
+                made = clock([5, 3], cut=True, memory=9, epochs_per_update=each, baseline=baseline)
+                made.load_state_dict(state)
+                made.envs = envs
+            if epoch == each - 1:
+                monkeypatch.setattr(
+                    made, "_learn", lambda rows, returns, learned: taught.append(returns[learned]) or {}
+                )
+            made.train_epoch(rounds)
+    assert len(taught[0]) == 10 + 12
+    np.testing.assert_allclose(taught[1], taught[0], rtol=1e-5)
+
+
+def test_a_memory_too_short_for_whole_episodes_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"memory = 8: epochs_per_update = 4 keeps 9 steps.*set memory=9"):
+        clock([5, 3], memory=8, epochs_per_update=4).train_epoch(3)
 
 
 def test_a_seed_without_a_completed_episode_stays_as_it_is() -> None:
