@@ -63,12 +63,19 @@ class Tuned:
     Values are drawn log-uniformly. Where the best one lies at an end of the range, the search goes on beyond it, as far
     as the option admits.
 
+    With `per_agent=True`, agents of one population may have different values of the option, and a search trains many
+    of its settings side by side in one population. `build` of a model gets each agent's own options. An algorithm's
+    factory, and `population` of a model, get a float64 tensor (S,) of the agents' values where these differ, and the
+    number where they do not: each agent must become, bit for bit, what it becomes alone. `qrlsuite check` verifies it.
+
     Attributes
     ----------
     low, high:
         0 < low < high.
     family:
         Tuned only for models of this family; None for all.
+    per_agent:
+        Whether agents of one population may have different values.
 
     Raises
     ------
@@ -79,6 +86,7 @@ class Tuned:
     low: float
     high: float
     family: Literal["classical", "quantum"] | None = None
+    per_agent: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.low < self.high < math.inf:
@@ -308,6 +316,11 @@ def tuned(cls: type[Any]) -> dict[str, Tuned]:
     """Return the marks of every option marked `Tuned`, by name."""
     fields_of = _pydantic_fields(cls)
     return {n: mark for n, info in fields_of.items() for mark in info.metadata if isinstance(mark, Tuned)}
+
+
+def per_agent(cls: type[Any]) -> set[str]:
+    """Return the names of the options in which agents of one population may differ."""
+    return {name for name, mark in tuned(cls).items() if mark.per_agent}
 
 
 def _pydantic_fields(cls: type[Any]) -> Mapping[str, pydantic.fields.FieldInfo]:

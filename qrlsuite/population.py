@@ -8,6 +8,7 @@ agents' mean losses: gradients do not mix, and one elementwise optimizer serves 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,6 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from qrlsuite.options import per_agent
 
 NARROW = 16
 """Layers below this width on both sides multiply in a fixed order, see `linear`."""
@@ -174,6 +177,36 @@ def stack(modules: Sequence[nn.Module]) -> nn.Module:
     return StackedPopulation(modules)
 
 
+def joined(options: Sequence[Any]) -> Any:
+    """Return the options of S agents as one object, as an algorithm or a population gets them.
+
+    Parameters
+    ----------
+    options:
+        S objects of one options class.
+
+    Returns
+    -------
+    Any
+        Such an object, in which an option that differs between the agents is a float64 tensor (S,).
+
+    Raises
+    ------
+    ValueError
+        If an option differs that is not marked `per_agent` (`qrlsuite.options.Tuned`).
+    """
+    first = options[0]
+    values = {f.name: [getattr(each, f.name) for each in options] for f in dataclasses.fields(first)}
+    different = [name for name, own in values.items() if any(value != own[0] for value in own)]
+    shared = sorted(set(different) - per_agent(type(first)))
+    if shared:
+        raise ValueError(f"agents of one population cannot differ in {', '.join(shared)}")
+    together = copy.copy(first)
+    for name in different:  # past the validation of a frozen class, which admits single numbers only
+        object.__setattr__(together, name, torch.tensor(values[name], dtype=torch.float64))
+    return together
+
+
 class Adam:
     """Adam for a population: elementwise, with a step count per agent and two learning rates.
 
@@ -187,7 +220,8 @@ class Adam:
     population:
         Module with parameters (S, ...).
     classical_lr, quantum_lr:
-        Learning rates of the parameters outside and inside `quantum_parameters(population)`.
+        Learning rates of the parameters outside and inside `quantum_parameters(population)`: of all agents, or float64
+        tensors (S,).
     betas, eps:
         Adam's constants.
     """
@@ -195,8 +229,8 @@ class Adam:
     def __init__(
         self,
         population: nn.Module,
-        classical_lr: float,
-        quantum_lr: float,
+        classical_lr: float | Tensor,
+        quantum_lr: float | Tensor,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:

@@ -58,10 +58,14 @@ class PPOOptions:
         float, Field(ge=0, le=1, description="0: one-step advantages, 1: Monte-Carlo advantages")
     ] = 0.95
     lr: Annotated[
-        float, Field(gt=0, description="learning rate of classical parameters"), Tuned(2e-4, 1e-2)
+        float,
+        Field(gt=0, description="learning rate of classical parameters"),
+        Tuned(2e-4, 1e-2, per_agent=True),
     ] = 1e-3
     quantum_lr: Annotated[
-        float, Field(gt=0, description="learning rate of quantum parameters"), Tuned(2e-4, 1e-2, "quantum")
+        float,
+        Field(gt=0, description="learning rate of quantum parameters"),
+        Tuned(2e-4, 1e-2, "quantum", per_agent=True),
     ] = 1e-3
     clip: Annotated[float, Field(gt=0, description="ratios beyond 1 - clip and 1 + clip earn nothing")] = 0.1
     repeats: Annotated[int, Field(ge=1, description="passes over an epoch's samples")] = 10

@@ -61,10 +61,14 @@ class REINFORCEOptions:
 
     gamma: Annotated[float, Field(ge=0, le=1, description="discount factor")] = 0.99
     lr: Annotated[
-        float, Field(gt=0, description="learning rate of classical parameters"), Tuned(2e-4, 1e-2)
+        float,
+        Field(gt=0, description="learning rate of classical parameters"),
+        Tuned(2e-4, 1e-2, per_agent=True),
     ] = 1e-2
     quantum_lr: Annotated[
-        float, Field(gt=0, description="learning rate of quantum parameters"), Tuned(2e-4, 1e-2, "quantum")
+        float,
+        Field(gt=0, description="learning rate of quantum parameters"),
+        Tuned(2e-4, 1e-2, "quantum", per_agent=True),
     ] = 1e-3
     baseline: Annotated[
         Literal["none", "mean", "value"],

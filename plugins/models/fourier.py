@@ -39,7 +39,7 @@ class FourierOptions:
             allow_inf_nan=False,
             description="standard deviation of the initial frequencies, radians per unit",
         ),
-        Tuned(0.3, 30),
+        Tuned(0.3, 30, per_agent=True),
     ] = 1.0
     train: Annotated[
         Literal["all", "linear"],

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 from pydantic import ConfigDict, Field
@@ -48,7 +48,7 @@ class MLPOptions:
         float,
         Field(gt=0, allow_inf_nan=False, description="factor on the observation"),
         Since("0.2.0"),
-        Tuned(0.3, 30),
+        Tuned(0.3, 30, per_agent=True),
     ] = 1.0
 
 
@@ -71,23 +71,34 @@ class MLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, in) to (B, out)."""
         state = {name: p[None] for name, p in self.named_parameters()}
-        return _forward(x[None], state, self.layers, self.options)[0]
+        return _forward(x[None], state, self.layers, self.options, self.options.input_scale)[0]
 
 
 class MLPPopulation(nn.Module):
-    """S perceptrons; (S, B, in) -> (S, B, out); parameters as in `MLP` with a leading axis S."""
+    """S perceptrons; (S, B, in) -> (S, B, out); parameters as in `MLP` with a leading axis S.
 
-    def __init__(self, modules: Sequence[MLP]) -> None:
+    `input_scale` is the same for all, or (S, 1, 1) where it differs: a buffer that moves to the device with the
+    parameters, and is no state, for the options hold it.
+    """
+
+    input_scale: float | Tensor
+
+    def __init__(self, modules: Sequence[MLP], options: MLPOptions) -> None:
         super().__init__()
         self.layers = modules[0].layers
-        self.options = modules[0].options
+        self.options = options
+        scale = cast("float | Tensor", options.input_scale)
+        if isinstance(scale, Tensor):
+            self.register_buffer("input_scale", scale.to(torch.float32)[:, None, None], persistent=False)
+        else:
+            self.input_scale = scale
         for name, _ in modules[0].named_parameters():
             stacked = torch.stack([m.get_parameter(name).detach() for m in modules])
             self.register_parameter(name, nn.Parameter(stacked))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        return _forward(x, dict(self.named_parameters()), self.layers, self.options)
+        return _forward(x, dict(self.named_parameters()), self.layers, self.options, self.input_scale)
 
 
 def initial_layer(
@@ -108,10 +119,12 @@ def initial_layer(
     return weight, bias
 
 
-def _forward(x: Tensor, state: dict[str, Tensor], layers: int, options: MLPOptions) -> Tensor:
+def _forward(
+    x: Tensor, state: dict[str, Tensor], layers: int, options: MLPOptions, input_scale: float | Tensor
+) -> Tensor:
     function = ACTIVATIONS[options.activation]
-    if options.input_scale != 1.0:
-        x = x * options.input_scale
+    if isinstance(input_scale, Tensor) or input_scale != 1.0:
+        x = x * input_scale
     for i in range(layers):
         x = linear(x, state[f"w{i}"], state[f"b{i}"])
         if i < layers - 1:
@@ -126,4 +139,4 @@ def build(obs_dim: int, out_dim: int, options: MLPOptions, generator: torch.Gene
 
 def population(modules: Sequence[MLP], options: MLPOptions) -> MLPPopulation:
     """Stack built perceptrons."""
-    return MLPPopulation(modules)
+    return MLPPopulation(modules, options)

@@ -78,7 +78,7 @@ class VQCOptions:
             "scalings from [0, init_scale 2 pi)",
         ),
         Since("0.2.0"),
-        Tuned(0.1, 10),
+        Tuned(0.1, 10, per_agent=True),
     ] = 1.0
     linear: Annotated[
         bool,

@@ -30,13 +30,21 @@ Show = Callable[[Snapshot], None]
 
 @dataclass(frozen=True)
 class Work:
-    """Input of an engine: groups of one entry's seeds, to be trained to `epochs`, `workers` at a time."""
+    """Input of an engine: groups of one entry's seeds, to be trained to `epochs`, `workers` at a time.
+
+    Attributes
+    ----------
+    others:
+        Folders of further entries, of which the same seeds are trained in the same populations; only the local engine
+        is given any.
+    """
 
     store: EntryStore
     groups: Sequence[SeedGroup]
     epochs: int
     workers: int
     device: str = "cpu"
+    others: Sequence[EntryStore] = ()
 
 
 @dataclass(frozen=True)
@@ -147,9 +155,10 @@ class RemoteEngine(Protocol):
 def worker_command(work: Work, group: SeedGroup) -> list[str]:
     """Return the command line that trains a group."""
     # -P: never import from the folder one stands in, which may be a source tree without its plugins
-    command = [sys.executable, "-P", "-m", "qrlsuite.engine.worker", str(work.store.path.absolute())]
+    command = [sys.executable, "-P", "-m", "qrlsuite.engine.worker"]
     return [
         *command,
+        *(str(store.path.absolute()) for store in (work.store, *work.others)),
         "--seeds",
         format_seeds(group.seeds),
         "--epochs",

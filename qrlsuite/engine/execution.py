@@ -6,6 +6,7 @@ Everything that trains goes through here: `run`, `tune` and `study` on the comma
 from __future__ import annotations
 
 import contextlib
+import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -18,13 +19,14 @@ import numpy as np
 from qrlsuite import registry, specs
 from qrlsuite.engine import api, remote
 from qrlsuite.engine.api import Engine, EngineOutcome, RemoteEngine
+from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.claims import living
 from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import SeedGroup, plan_groups
+from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import duration_range
 from qrlsuite.training import device as devices
@@ -61,6 +63,54 @@ class Execution:
         if _carries_bytes(self.engine):
             return remote.train(self.engine, handed, show)
         return self.engine.run(handed, show)
+
+    @property
+    def room(self) -> int:
+        """How many runs can be trained side by side; 1 where the engine trains one entry after the other."""
+        return LARGEST_GROUP * self.workers if isinstance(self.engine, LocalEngine) else 1
+
+    def divide(self, plans: Sequence[Plan]) -> list[list[Plan]]:
+        """Divide the plans that have groups into those that `run_together` can train: as few lists as can be."""
+        alike: dict[str, list[Plan]] = {}
+        for each in plans:
+            if each.groups:
+                # of an entry that another process trains too, other seeds are free than of the rest
+                side_by_side = isinstance(self.engine, LocalEngine) and not each.busy
+                key = each.entry.population_key if side_by_side else each.entry.hash
+                alike.setdefault(key, []).append(each)
+        return list(alike.values())
+
+    def run_together(self, plans: Sequence[Plan], show: api.Show) -> EngineOutcome:
+        """Let the engine train plans to the same epoch, one of the lists of `divide`: several in common populations."""
+        if len(plans) > 1 and isinstance(self.engine, LocalEngine):
+            return self.engine.run_all(self._populations(plans), show)
+        return self.run(plans[0], show)
+
+    def _populations(self, plans: Sequence[Plan]) -> list[api.Work]:
+        """Divide plans whose entries can be trained in one population among the workers.
+
+        Seeds are divided first, and entries where there are more workers than seeds, or groups would be too large.
+        """
+        seeds = sorted({seed for each in plans for seed in each.missing})
+        pieces = min(self.workers, len(seeds))
+        groups = [
+            SeedGroup(tuple(seeds[i * len(seeds) // pieces : (i + 1) * len(seeds) // pieces]), 0)
+            for i in range(pieces)
+        ]
+        free = memory.available() if self.device == "cpu" else None
+        parts = min(len(plans), math.ceil(self.workers / pieces))
+        while parts < len(plans):
+            size = math.ceil(len(plans) / parts) * math.ceil(len(seeds) / pieces)
+            needed = min(self.workers, parts * pieces) * memory.group_bytes(plans[0].entry, size)
+            if size <= LARGEST_GROUP and (free is None or needed <= free):
+                break
+            parts += 1
+        work = []
+        for i in range(parts):
+            first, *others = plans[i * len(plans) // parts : (i + 1) * len(plans) // parts]
+            stores = [each.store for each in others]
+            work.append(api.Work(first.store, groups, first.epochs, self.workers, self.device, stores))
+        return work
 
 
 def _carries_bytes(engine: Engine | RemoteEngine) -> TypeGuard[RemoteEngine]:

@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import IO
 
 from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
@@ -30,10 +31,10 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_
 
 
 class WorkerJob:
-    """A group, the process that was started for it, and how often that died."""
+    """A group, the process that was started for it, and how often that died; `name` is the group's id if not given."""
 
-    def __init__(self, group: SeedGroup, progress: ProgressFile) -> None:
-        self.group, self.progress = group, progress
+    def __init__(self, group: SeedGroup, progress: ProgressFile, name: str | None = None) -> None:
+        self.group, self.progress, self.name = group, progress, name or group.id
         self.deaths, self.epoch_at_death = 0, -1
         self.process: subprocess.Popen[bytes] | None = None
         self.output: IO[bytes] | None = None
@@ -94,17 +95,32 @@ class LocalEngine:
         KeyboardInterrupt
             After Ctrl-C, when every worker has saved and ended.
         """
-        jobs = [WorkerJob(group, ProgressFile(work.store, group.id)) for group in work.groups]
+        return self.run_all([work], show)
+
+    def run_all(self, several: Sequence[Work], show: Show) -> EngineOutcome:
+        """Do several pieces of work as `run` does one: as many groups at a time as `workers` of the first says.
+
+        Where there is more than one, an entry's name stands before the ids of its groups.
+        """
+        jobs = {
+            WorkerJob(
+                group,
+                ProgressFile(work.store, group.id),
+                f"{work.store.path.name} {group.id}" if len(several) > 1 else None,
+            ): work
+            for work in several
+            for group in work.groups
+        }
         waiting = deque(jobs)
         outcome = EngineOutcome()
         for job in jobs:
             job.progress.clear()
         try:
             while waiting or self._running:
-                while waiting and len(self._running) < work.workers:
+                while waiting and len(self._running) < several[0].workers:
                     job = waiting.popleft()
                     self._running.append(job)
-                    _start(job, work)
+                    _start(job, jobs[job])
                 time.sleep(0.2)
                 for job in list(self._running):
                     code = job.process.poll() if job.process else None
@@ -113,7 +129,7 @@ class LocalEngine:
                     self._running.remove(job)
                     if _ended(job, code, outcome):
                         waiting.append(job)
-                show({job.group.id: job.progress.read() for job in jobs})
+                show({job.name: job.progress.read() for job in jobs})
         except BaseException:
             self.stop()
             raise
@@ -163,11 +179,11 @@ def _ended(job: WorkerJob, code: int, outcome: EngineOutcome) -> bool:
         return False
     if code in (2, 3):
         message = str(job.progress.read().get("error") or text or "failed").removeprefix("qrlsuite: ")
-        (outcome.failed if code == 2 else outcome.taken)[job.group.id] = message
+        (outcome.failed if code == 2 else outcome.taken)[job.name] = message
         return False
     reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
     given_up = job.died(reason, text)
     if given_up is None:
         return True
-    outcome.failed[job.group.id] = given_up
+    outcome.failed[job.name] = given_up
     return False

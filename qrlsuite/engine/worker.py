@@ -30,11 +30,11 @@ _PR_SET_PDEATHSIG = 1
 
 
 class ClaimHeartbeat(threading.Thread):
-    """Refreshes the claim; interrupts this process when the claim or its parent is lost, or it is asked to stop."""
+    """Refreshes the claims; interrupts this process when one or its parent is lost, or it is asked to stop."""
 
-    def __init__(self, claim: Claim, parent: int | None) -> None:
+    def __init__(self, claims: Sequence[Claim], parent: int | None) -> None:
         super().__init__(daemon=True)
-        self.claim = claim
+        self.claims = claims
         self.parent = parent
         self.stopped = threading.Event()
 
@@ -42,14 +42,19 @@ class ClaimHeartbeat(threading.Thread):
         """Beat until stopped."""
         while not self.stopped.wait(HEARTBEAT):
             orphaned = self.parent is not None and os.getppid() != self.parent
-            ends = orphaned or self.claim.stop_requested or not self.claim.refresh()
+            ends = orphaned or any(claim.stop_requested or not claim.refresh() for claim in self.claims)
             if ends and not self.stopped.is_set():  # it may have been released while it was being refreshed
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
 
 
 def train_group(
-    folder: Path, seeds: Sequence[int], epochs: int, device: str = "cpu", parent: int | None = None
+    folder: Path,
+    seeds: Sequence[int],
+    epochs: int,
+    device: str = "cpu",
+    parent: int | None = None,
+    others: Sequence[Path] = (),
 ) -> None:
     """Claim seeds and train those of them that have not finished, in this process.
 
@@ -60,11 +65,13 @@ def train_group(
     ----------
     parent:
         The process without which this one shall not go on.
+    others:
+        Folders of further entries, of which the same seeds are trained in the same population.
 
     Raises
     ------
     SeedsClaimedError
-        If another worker holds one of the seeds.
+        If another worker holds one of the seeds; entries of which nobody holds any are trained before.
     QrlSuiteError
         If the entry cannot be built, its environment fails, or results cannot be written.
     KeyboardInterrupt
@@ -72,27 +79,47 @@ def train_group(
     """
     from qrlsuite.training.group import GroupRun  # torch, which a supervisor does without
 
-    store = EntryStore(folder)
-    progress = ProgressFile(store, group_id(seeds))
-    claim = acquire(store, seeds)
-    heartbeat = ClaimHeartbeat(claim, parent)
+    claims: list[Claim] = []
+    heartbeat = ClaimHeartbeat(claims, parent)
     heartbeat.start()
+    files: dict[Path, ProgressFile] = {}
+    places: dict[Path, slice] = {}
+    """Of each entry's seeds in the population."""
+
+    def report(progress: Progress, error: str | None = None, force: bool = False) -> None:
+        for path, file in files.items():
+            file.write(progress, error, force, places.get(path, slice(0)))
+
     state = Progress(epochs=epochs)
+    taken: SeedsClaimedError | None = None
     try:
-        entry = store.entry()
-        for group in plan_groups(store, seeds, epochs, workers=1):
-            run = GroupRun(entry, store, group.seeds, epochs, device, progress.write)
+        parts: dict[int, list[tuple[EntryStore, Sequence[int]]]] = {}
+        for store in map(EntryStore, (folder, *others)):
+            try:
+                claims.append(acquire(store, seeds))
+            except SeedsClaimedError as error:
+                taken = error
+                continue
+            files[store.path] = ProgressFile(store, group_id(seeds))
+            for group in plan_groups(store, seeds, epochs, workers=1):
+                parts.setdefault(group.epoch, []).append((store, group.seeds))
+        for _, [(store, own), *further] in sorted(parts.items()):
+            run = GroupRun(store.entry(), store, own, epochs, device, report, further)
+            places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()
         state.phase, state.epoch = "finished", epochs
-        progress.write(state, force=True)
+        report(state, force=True)
     except QrlSuiteError as error:
         with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
-            progress.write(state, error=str(error), force=True)
+            report(state, str(error), force=True)
         raise
     finally:
         heartbeat.stopped.set()
-        claim.release()
+        for claim in claims:
+            claim.release()
+    if taken is not None:
+        raise taken
 
 
 def _end_with(parent: int) -> bool:
@@ -134,7 +161,13 @@ def _set_checkpoint_seconds() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the worker's command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m qrlsuite.engine.worker", description=__doc__)
-    parser.add_argument("folder", type=Path, help="the entry's folder, runs/<task>/<entry>")
+    parser.add_argument(
+        "folders",
+        type=Path,
+        nargs="+",
+        metavar="FOLDER",
+        help="the entry's folder, runs/<task>/<entry>; several are trained in one population",
+    )
     parser.add_argument("--seeds", required=True, help="0:50, or a list such as 0,3,10:12")
     parser.add_argument("--epochs", type=int, required=True)
     parser.add_argument("--device", default="cpu")
@@ -146,9 +179,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     try:
         _set_checkpoint_seconds()
-        train_group(
-            options.folder, parse_seeds(options.seeds), options.epochs, options.device, options.follow_parent
-        )
+        folder, *others = options.folders
+        seeds, parent = parse_seeds(options.seeds), options.follow_parent
+        train_group(folder, seeds, options.epochs, options.device, parent, others)
     except SeedsClaimedError as error:
         print(f"qrlsuite: {error}", file=sys.stderr)
         return 3

@@ -61,6 +61,21 @@ class Entry:
         return digest(self.identity)
 
     @property
+    def population_key(self) -> str:
+        """Equal for entries whose agents can be trained in one population: those that differ in options per agent only.
+
+        See `per_agent` of `qrlsuite.options.Tuned`.
+        """
+        common = self.identity
+        for side, own in (
+            ("algorithm_options", self.algorithm_options),
+            ("model_options", self.model_options),
+        ):
+            free = options.per_agent(type(own))
+            common[side] = {name: value for name, value in common[side].items() if name not in free}
+        return digest(common)
+
+    @property
     def name(self) -> str:
         """The folder's name: algorithm, model, and the first eight digits of the hash."""
         return f"{self.algorithm.name}-{self.model.name}-{self.hash[:8]}"

@@ -44,13 +44,28 @@ class ProgressFile:
         self.path = store.groups / group / "progress.json"
         self._written = 0.0
 
-    def write(self, progress: Progress, error: str | None = None, force: bool = False) -> None:
-        """Write the progress, unless it was just written."""
+    def write(
+        self,
+        progress: Progress,
+        error: str | None = None,
+        force: bool = False,
+        places: slice = slice(None),
+    ) -> None:
+        """Write the progress, unless it was just written.
+
+        Parameters
+        ----------
+        places:
+            Of the seeds in the group whose scores count here.
+        """
         now = time.monotonic()
         if not force and now - self._written < 0.5:
             return
         self._written = now
-        content = json.dumps({**asdict(progress), "error": error}).encode()
+        scores = progress.seed_scores[places]
+        median = statistics.median(scores) if scores else None
+        shown = {**asdict(progress), "seed_scores": scores, "median_score": median, "error": error}
+        content = json.dumps(shown).encode()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             temporary = self.path.with_suffix(".tmp")

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from qrlsuite import population as populations
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, array, differs
@@ -46,6 +47,16 @@ def check(subject: Subject) -> list[Finding]:
             return rules.findings
         rules.run(
             "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(subject)
+        )
+        cause = (
+            "an option marked per_agent is a float64 tensor (S,) where agents differ in it: Adam of "
+            "qrlsuite.population takes one as a learning rate; reshape it to (S, 1, 1) before it multiplies (S, B, n)"
+        )
+        rules.run(
+            "options per agent",
+            "two values in one population: the bits of each alone",
+            lambda: _per_agent(subject),
+            cause,
         )
         cause = "load_state_dict() takes what state_dict() returned, or slices of it, in place of start()"
         rules.run("state", "saved, sliced and restored exactly", lambda: _state(subject), cause)
@@ -149,14 +160,16 @@ def _learns(subject: Subject) -> None:
     )
 
 
-def _trained(subject: Subject, seeds: Sequence[int], noise: int = 0) -> dict[str, NDArray[Any]]:
+def _trained(
+    subject: Subject, seeds: Sequence[int], noise: int = 0, options: Any = None
+) -> dict[str, NDArray[Any]]:
     """Return everything after two epochs, with another global random state for every `noise`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(noise)
         state = np.random.get_state()  # noqa: NPY002
         np.random.seed(noise)  # noqa: NPY002
         try:
-            group = ToyGroup(subject, seeds).start()
+            group = ToyGroup(subject, seeds, options=options).start()
             metrics = group.train(2)
             return {
                 **group.save(),
@@ -202,7 +215,7 @@ def _seed_first(subject: Subject) -> None:
 
 def _independence(subject: Subject) -> None:
     whole = _trained(subject, range(S))
-    for members in SIZES:
+    for members in (*SIZES, (2, 2)):  # a search trains one seed with several settings in one population
         part = _trained(subject, members)
         name = differs(part, {key: value[list(members)] for key, value in whole.items()})
         require(
@@ -210,6 +223,20 @@ def _independence(subject: Subject) -> None:
             f"seeds {list(members)} trained among themselves differ from those trained among all {S} in '{name}': sum "
             "the agents' own mean losses, clip norms per agent, normalize per agent, draw per seed",
         )
+
+
+def _per_agent(subject: Subject) -> None:
+    """Train one seed with two values of each marked option: as two agents, and alone."""
+    for option, both in subject.per_agent().items():
+        together = _trained(subject, [0, 0], options=populations.joined(both))
+        for place, own in enumerate(both):
+            name = differs(_trained(subject, [0], options=own), {k: v[[place]] for k, v in together.items()})
+            require(
+                name is None,
+                f"an agent with {option} = {getattr(own, option):g} differs in '{name}' beside one with another value "
+                "from itself alone: such an option is then a float64 tensor (S,), and each agent's value belongs to "
+                "its slice only; or leave per_agent out",
+            )
 
 
 def _state(subject: Subject) -> None:

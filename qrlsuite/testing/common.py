@@ -59,6 +59,19 @@ class Subject:
             else option_values.build(specs.resolve(reference), self.settings, self.title)
         )
 
+    def per_agent(self) -> dict[str, tuple[Any, Any]]:
+        """Return, for every option in which agents of one population may differ, options with two values of it."""
+        cls = type(self.options())
+        pairs = {}
+        for name in sorted(option_values.per_agent(cls)):
+            mark = option_values.tuned(cls)[name]
+            low, high = (
+                option_values.build(cls, {**self.settings, name: value}, self.title)
+                for value in (mark.low, mark.high)
+            )
+            pairs[name] = low, high
+        return pairs
+
     def missing(self) -> str:
         """Return what to type for packages that it needs and that are not installed; `""` where all are there."""
         extras: dict[str, str] = getattr(self.spec, "extras", {})

@@ -106,7 +106,7 @@ class _Linear(nn.Module):
 class ToyGroup:
     """An algorithm with a group of seeds, as the core runs it."""
 
-    def __init__(self, subject: Subject, seeds: Sequence[int], lanes: int = E) -> None:
+    def __init__(self, subject: Subject, seeds: Sequence[int], lanes: int = E, options: Any = None) -> None:
         spec = subject.spec
         assert isinstance(spec, specs.AlgorithmSpec)
         self.seeds = list(seeds)
@@ -115,7 +115,8 @@ class ToyGroup:
         self.envs.seed_lanes([s.numpy("environment", e) for s in self.streams for e in range(lanes)])
         self.outputs: list[int] = []
         factory = specs.resolve(spec.factory)
-        self.algorithm = factory(self.envs, self._model, subject.options(), self.streams, torch.device("cpu"))
+        own = subject.options() if options is None else options
+        self.algorithm = factory(self.envs, self._model, own, self.streams, torch.device("cpu"))
 
     def _model(self, out_dim: int) -> nn.Module:
         call = len(self.outputs)

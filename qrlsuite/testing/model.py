@@ -26,21 +26,23 @@ class Subjects:
     def __init__(self, subject: Subject) -> None:
         spec = subject.spec
         assert isinstance(spec, specs.ModelSpec)
-        self.spec, self.options = spec, subject.options()
+        self.spec, self.options, self.per_agent = spec, subject.options(), subject.per_agent()
         self.build = specs.resolve(spec.build)
         self.sampled = getattr(self.options, "shots", None) is not None
 
-    def agent(self, seed: int) -> nn.Module:
+    def agent(self, seed: int, options: Any = None) -> nn.Module:
         """Return one agent, from a generator of that seed."""
-        agent: nn.Module = self.build(OBS, OUT, self.options, torch.Generator().manual_seed(seed))
+        own = self.options if options is None else options
+        agent: nn.Module = self.build(OBS, OUT, own, torch.Generator().manual_seed(seed))
         return agent
 
-    def population(self, seeds: Sequence[int]) -> nn.Module:
-        """Return a population of freshly built agents."""
-        agents = [self.agent(seed) for seed in seeds]
+    def population(self, seeds: Sequence[int], options: Sequence[Any] | None = None) -> nn.Module:
+        """Return a population of freshly built agents, each with options of its own where these are given."""
+        own = [self.options] * len(seeds) if options is None else options
+        agents = [self.agent(*each) for each in zip(seeds, own)]
         if self.spec.population is None:
             return populations.stack(agents)
-        population: nn.Module = specs.resolve(self.spec.population)(agents, self.options)
+        population: nn.Module = specs.resolve(self.spec.population)(agents, populations.joined(own))
         return population
 
 
@@ -81,6 +83,15 @@ def check(subject: Subject) -> list[Finding]:
             return rules.findings
         rules.run(
             "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(subjects)
+        )
+        cause = (
+            "an option marked per_agent is a float64 tensor (S,) for `population` where agents differ in it"
+        )
+        rules.run(
+            "options per agent",
+            "two values in one population: the bits of each alone",
+            lambda: _per_agent(subjects),
+            cause,
         )
         rules.run("state", "saved, sliced and restored exactly", lambda: _state(subjects))
     return rules.findings
@@ -376,6 +387,27 @@ def _independence(subjects: Subjects) -> None:
                 gradient is not None and expected is not None and torch.equal(gradient, expected[chosen]),
                 f"seeds {chosen} among themselves get another gradient of '{name}' than among all {S}: slices must "
                 "not mix, and sums must not depend on the size of the stack",
+            )
+
+
+def _per_agent(subjects: Subjects) -> None:
+    """Build one seed with two values of each marked option: as two agents, and alone."""
+    x = _x()
+    for option, both in subjects.per_agent.items():
+        together = subjects.population([0, 0], both)
+        values, gradients = together(x.expand(2, -1, -1)).detach(), _gradients(together, x.expand(2, -1, -1))
+        for place, own in enumerate(both):
+            alone = subjects.population([0], [own])
+            same = torch.equal(alone(x[None]).detach(), values[[place]])
+            for name, gradient in _gradients(alone, x[None]).items():
+                beside = gradients[name]
+                same &= gradient is not None and beside is not None and torch.equal(gradient, beside[[place]])
+            require(
+                same,
+                f"an agent with {option} = {getattr(own, option):g} computes something else beside one with another "
+                "value than alone: an option that is used after `build` is not the same for all agents of a "
+                "population, so keep it per agent, as a buffer, or give the model a `population` that takes it as a "
+                "float64 tensor (S,); or leave per_agent out",
             )
 
 

@@ -1,4 +1,4 @@
-"""Trains one group of seeds epoch by epoch, and writes records and checkpoints to the entry's folder.
+"""Trains one group of seeds epoch by epoch, and writes records and checkpoints to the folder of each one's entry.
 
 Killed at any moment and resumed, a group ends with the same curves and parameters, byte for byte, as one never
 stopped: lines newer than the checkpoint are cut. `qrlsuite.training.trainer` trains; here is what is on disk of it.
@@ -10,7 +10,7 @@ import datetime
 import math
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -191,7 +191,7 @@ def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[A
 
 
 class GroupRun:
-    """The training of one group of seeds of an entry in this process, with its files.
+    """The training of one group of seeds in this process, with its files.
 
     Parameters
     ----------
@@ -205,11 +205,21 @@ class GroupRun:
         Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:
         Called after every round with the group's progress.
+    others:
+        Folders of further entries, each with the seeds of it that are at this epoch too: they are trained in the same
+        population, and left as if each had been trained alone.
+
+    Attributes
+    ----------
+    files:
+        The files of each entry, in the order of their agents in the population.
 
     Raises
     ------
     QrlSuiteError
         If the entry cannot be built, or there is no such device.
+    ValueError
+        If the entries cannot be trained in one population, see `Entry.population_key`.
     """
 
     def __init__(
@@ -220,12 +230,19 @@ class GroupRun:
         epochs: int,
         device: str = "cpu",
         report: Report = lambda progress: None,
+        others: Sequence[tuple[store.EntryStore, Sequence[int]]] = (),
     ) -> None:
-        self.entry, self.epochs = entry, epochs
-        self.trainer = Trainer(entry, seeds, device, report)
+        self.epochs = epochs
+        parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
+        self.trainer = Trainer(
+            [own for own, _, part in parts for _ in part],
+            [seed for *_, part in parts for seed in part],
+            device,
+            report,
+        )
         self.progress, self.report = self.trainer.progress, report
         events = EventSink(registry.load(), asked())
-        self.files = GroupFiles(entry, entry_store, seeds, events)
+        self.files = [GroupFiles(*part, events) for part in parts]
         self.progress.epochs, self.progress.warnings = epochs, events.problems
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
 
@@ -259,32 +276,54 @@ class GroupRun:
                     self._save()
                 raise
 
+    def parts(self) -> Iterator[tuple[GroupFiles, slice]]:
+        """Yield the files of each entry, and the places of its seeds in the population."""
+        end = 0
+        for files in self.files:
+            begin, end = end, end + len(files.seeds)
+            yield files, slice(begin, end)
+
     def _begin(self) -> None:
-        """Start fresh, or resume from the newest checkpoint."""
-        epoch, arrays = self.files.resume()
+        """Start fresh, or resume from the newest checkpoints."""
+        states = [files.resume() for files in self.files]
+        epoch, first = states[0]
+        where = ", ".join(str(files.store.path) for files in self.files)
+        if any((own, arrays.keys()) != (epoch, first.keys()) for own, arrays in states):
+            raise StoreError(f"{where}: these entries are at different epochs, or of different versions")
         if epoch:
             try:
-                self.trainer.restore(epoch, arrays)
-            except StoreError as error:
-                raise StoreError(f"{self.files.store.path}: {error}") from error
+                joined = {name: np.concatenate([arrays[name] for _, arrays in states]) for name in first}
+                self.trainer.restore(epoch, joined)
+            except (StoreError, ValueError) as error:
+                raise StoreError(f"{where}: {error}") from error
         else:
             self.trainer.start()
         self.progress.epoch = self.trainer.epoch
-        origin = provenance.collect(self.entry.distributions(), self.trainer.device)
-        self.files.begin(self.trainer.epoch, self.trainer.models.trained(), origin)
+        parameters = self.trainer.models.trained()
+        origin = provenance.collect(self.trainer.entry.distributions(), self.trainer.device)
+        for files in self.files:
+            files.begin(self.trainer.epoch, parameters, origin)
 
     def _record(self, epoch: Epoch) -> None:
         """Append one line per seed, and show the progress."""
-        self.files.record(lines_of(epoch), timing_of(epoch, len(self.files.seeds)))
+        lines, timing = lines_of(epoch), timing_of(epoch, len(self.trainer.seeds))
+        for files, places in self.parts():
+            files.record(lines[places], timing)
         self.progress.finished_epoch(epoch.number, epoch.scores.mean(axis=1).tolist())
         self.report(self.progress)
 
     def _save(self) -> None:
         """Write the checkpoint of the last finished epoch, if it is newer than the one on disk."""
-        if self._snapshot is not None:
-            self.files.save(*self._snapshot)
+        if self._snapshot is None:
+            return
+        epoch, arrays = self._snapshot
+        for files, places in self.parts():
+            files.save(epoch, {name: array[places] for name, array in arrays.items()})
 
     def _finish(self) -> None:
-        self.files.finish(self.trainer.epoch, self.trainer.policy())
+        """Publish the trained agents, and mark every seed as finished."""
+        policy = self.trainer.policy()
+        for files, places in self.parts():
+            files.finish(self.trainer.epoch, {name: array[places] for name, array in policy.items()})
         self.progress.phase = "finished"
         self.report(self.progress)

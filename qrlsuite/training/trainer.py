@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -158,18 +159,21 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
 class ModelBuilder:
     """Builds populations for an algorithm: every agent from its own seed's stream, every call from a new one.
 
+    `entry` is that of all agents, or one for each.
+
     With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
     refused (PluginError), see `qrlsuite.training.hidden`.
     """
 
     def __init__(
         self,
-        entry: Entry,
+        entry: Entry | Sequence[Entry],
         observation_size: int,
         streams: Sequence[Streams],
         statistics: RunningStatistics | None = None,
     ) -> None:
-        self.entry = entry
+        self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
+        self.entry = self.entries[0]
         self.observation_size = observation_size
         self.streams = streams
         self.statistics = statistics
@@ -179,25 +183,25 @@ class ModelBuilder:
 
     def __call__(self, out_dim: int) -> nn.Module:
         """Return a population of freshly initialized agents."""
-        spec, options = self.entry.model, self.entry.model_options
+        spec, options = self.entry.model, [entry.model_options for entry in self.entries]
         call = len(self.built)
         with _building("models", spec.name):
             build = specs.resolve(spec.build)
 
-            def agent(streams: Streams) -> nn.Module:
-                model: nn.Module = build(self.observation_size, out_dim, options, streams.torch("init", call))
+            def agent(streams: Streams, own: Any) -> nn.Module:
+                model: nn.Module = build(self.observation_size, out_dim, own, streams.torch("init", call))
                 return model
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
-            hidden.require_none(lambda which: agent(two[which]), self.observation_size, spec.name)
-            agents = [agent(streams) for streams in self.streams]
+            hidden.require_none(lambda which: agent(two[which], options[0]), self.observation_size, spec.name)
+            agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))
             if spec.population is None:
                 together = population.stack(agents)
             else:
-                together = specs.resolve(spec.population)(agents, options)
+                together = specs.resolve(spec.population)(agents, population.joined(options))
         if self.statistics is not None:
             self.statistics.attach(together)
         self.built.append(together)
@@ -261,16 +265,17 @@ class Epoch:
 
 
 class Trainer:
-    """S seeds of an entry, trained together and validated after every epoch.
+    """S agents, trained together and validated after every epoch: seeds of an entry, or of several.
 
     Begin with `start()` or `restore(...)`; then each `train_epoch()` adds one.
 
     Parameters
     ----------
     entry:
-        What is trained.
+        What is trained; or S entries, one for each seed, that differ in options per agent only: their `population_key`
+        is the same.
     seeds:
-        S seeds, all at the same epoch.
+        S seeds, all at the same epoch. Each stands once for every entry that it is of.
     device:
         Where the populations live: `cpu`, `cuda` or `cuda:1`.
     report:
@@ -287,17 +292,26 @@ class Trainer:
     ------
     QrlSuiteError
         If the entry cannot be built, or there is no such device.
+    ValueError
+        If the entries differ in more.
     """
 
     def __init__(
         self,
-        entry: Entry,
+        entry: Entry | Sequence[Entry],
         seeds: Sequence[int],
         device: str = "cpu",
         report: Report = lambda progress: None,
     ) -> None:
         torch.set_num_threads(1)
-        self.entry, self.seeds, self.report = entry, list(seeds), report
+        self.seeds, self.report = list(seeds), report
+        entries = [entry] * len(self.seeds) if isinstance(entry, Entry) else list(entry)
+        distinct = {id(each): each for each in entries}.values()
+        if len(entries) != len(self.seeds) or len({each.population_key for each in distinct}) > 1:
+            raise ValueError(
+                "agents of one population have one entry each, and these differ in options marked per_agent only"
+            )
+        self.entry = entry = entries[0]
         self.device = find_device(device)
         self.progress = Progress()
         self.epoch = 0
@@ -310,12 +324,11 @@ class Trainer:
         if self.envs.inner.running_statistics:
             self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
-        self.models = ModelBuilder(entry, size, self.streams, self.statistics)
+        self.models = ModelBuilder(entries, size, self.streams, self.statistics)
         with _building("algorithms", entry.algorithm.name):
             factory = specs.resolve(entry.algorithm.factory)
-            self.algorithm = factory(
-                self.envs, self.models, entry.algorithm_options, self.streams, self.device
-            )
+            own_options = population.joined([each.algorithm_options for each in entries])
+            self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:

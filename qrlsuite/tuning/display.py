@@ -11,7 +11,6 @@ from rich.console import Console
 
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.execution import Plan
-from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
@@ -41,8 +40,9 @@ class TuneDisplay:
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
         self._began = time.monotonic()
-        self._trained = 0
-        self._work: Plan | None = None
+        self._plans: Sequence[Plan] = ()
+        self._done = self._trained = 0
+        """Trials before those that are trained now; those among them that were trained here."""
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
@@ -77,40 +77,50 @@ class TuneDisplay:
         estimate = speed.known(search.runs, search.results).estimate(search.base, together)
         return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
 
-    def trial(self, entry: Entry, work: Plan) -> None:
-        """Show that a trial begins."""
-        self._work = work
-        self._trained += bool(work.groups)
-        if work.busy:
-            self.console.print(
-                f"{entry.label}: {len(work.busy)} runs are left to another process or a queue", markup=False
-            )
+    def begin_trials(self, plans: Sequence[Plan]) -> None:
+        """Show that trials begin, of which some may have finished before."""
+        self._plans = ()
+        self._done = sum(search.asked for search in self.searches) - sum(bool(work.groups) for work in plans)
+        for work in plans:
+            if work.busy:
+                self.console.print(
+                    f"{work.entry.label}: {len(work.busy)} runs are left to another process or a queue",
+                    markup=False,
+                )
         self.bar.start(sum(search.planned for search in self.searches), "tuning")
+
+    def training(self, plans: Sequence[Plan]) -> None:
+        """Show that some of these trials are trained now, side by side."""
+        self._done += len(self._plans)
+        self._trained += len(self._plans)
+        self._plans = plans
         self.update({})
 
     def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
-        """Show where the trial at work stands."""
-        if not self.bar.shown or self._work is None:
+        """Show where the trials at work stand."""
+        if not self.bar.shown or not self._plans:
             return
-        proposed = sum(search.asked for search in self.searches)
-        work = self._work
-        epochs = [int(snapshot.get(group.id, {}).get("epoch") or group.epoch) for group in work.groups]
-        part = sum(epochs) / (len(epochs) * work.epochs) if epochs else 0.0
-        parts = [f"trial {proposed}/{sum(search.planned for search in self.searches)}"]
-        parts += [f"epoch {min(epochs)}/{work.epochs}"] if epochs else []
+        count, last = len(self._plans), self._plans[0].epochs
+        begun = min(group.epoch for work in self._plans for group in work.groups)
+        epochs = [int(state.get("epoch") or begun) for state in snapshot.values()] or [begun]
+        numbers = f"trial {self._done + 1}" if count == 1 else f"trials {self._done + 1}-{self._done + count}"
+        parts = [
+            f"{numbers}/{sum(search.planned for search in self.searches)}",
+            f"epoch {min(epochs)}/{last}",
+        ]
         parts += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
         left = self._left()
         if left is not None:
             parts.append(f"{duration(left)} left")
-        self.bar.update(proposed - 1 + part, "tuning", "  ".join(parts))
+        part = sum(epochs) / (len(epochs) * last)
+        self.bar.update(self._done + count * part, "tuning", "  ".join(parts))
 
     def _left(self) -> float | None:
         """Return the seconds left by the pace of the trials that were trained now; None before one was."""
-        done = self._trained - 1
-        if done < 1:
+        if not self._trained:
             return None
-        left = sum(search.planned - search.asked + 1 for search in self.searches)
-        return (time.monotonic() - self._began) / done * left
+        left = sum(search.planned for search in self.searches) - self._done
+        return (time.monotonic() - self._began) / self._trained * left
 
     def told(self, search: Search, trial: Trial | None) -> None:
         """Show a trial's result."""
@@ -120,7 +130,7 @@ class TuneDisplay:
         several = f"{search.base.label}  " if len(self.searches) > 1 else ""
         rung = f"rung {trial.rung + 1} " if search.request.sampler == "halving" else ""
         self.console.print(
-            f"{several}{rung}trial {len(search.trials)}/{search.planned}  {text(trial.point)}: "
+            f"{several}{rung}trial {search.trials.index(trial) + 1}/{search.planned}  {text(trial.point)}: "
             f"{merit_text(trial)}{best}",
             markup=False,
             soft_wrap=True,

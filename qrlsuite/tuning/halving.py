@@ -13,16 +13,17 @@ has no more trials than another. The number of settings is proportional to the n
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from qrlsuite.errors import OptionError
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
 from qrlsuite.tuning import samplers, space
-from qrlsuite.tuning.search import Search, Train, Trial
+from qrlsuite.tuning.search import Proposal, Search, Train, Trial
 from qrlsuite.tuning.space import Dimension, Point, Range
 
 PER_OPTION = 8
@@ -42,16 +43,6 @@ PARTS = (0.5, 0.75, 1.0)
 
 _DRAWS = 1000
 """Points without a new combination after which there is none left."""
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """Settings to be tried: their number, and the seeds of a rung."""
-
-    number: int
-    point: Point
-    seeds: tuple[int, ...]
-    rung: int
 
 
 def ladder(settings: int, seeds: int) -> tuple[tuple[int, int], ...]:
@@ -117,7 +108,8 @@ class Halving(Search):
             self.settings = self._at_most((request.trials or PER_OPTION) * len(self.space))
         self._tried: list[Point] = [space.base(self.space, self.base)]
         self._climb = self._proposals()
-        self._next: Proposal | None = next(self._climb)
+        self._next = next(self._climb)
+        self._tried_now: list[Trial | None] = []
 
     def _at_most(self, settings: int) -> int:
         """Return a number of settings, or of all combinations where there are fewer."""
@@ -166,15 +158,25 @@ class Halving(Search):
     @property
     def over(self) -> bool:
         """Whether no further trial can be begun: all are, or the next ones need to know some that wait."""
-        return self._next is None
+        return not self._next
+
+    @property
+    def next_seeds(self) -> int:
+        """How many seeds the next trial has."""
+        return len(self._next[0].seeds) if self._next else 0
 
     @property
     def presentable(self) -> bool:
         """Whether the last rung is complete."""
         return self.over and not self.pending
 
-    def step(self, train: Train) -> Trial | None:
-        """Run the next trial; returns None where some of its runs are left to another process or a queue.
+    def step(self, train: Train, most: int = 1) -> list[Trial | None]:
+        """Run the next trials, `most` at a time where they do not depend on each other, else fewer.
+
+        Returns
+        -------
+        list
+            A trial is None where some of its runs are left to another process or a queue.
 
         Raises
         ------
@@ -185,35 +187,45 @@ class Halving(Search):
         QrlSuiteError
             If a trial cannot be run.
         """
-        proposal = self._next
-        if proposal is None:
+        if not self._next:
             raise RuntimeError("the search is over")
-        trial = self._try(proposal.number, proposal.point, proposal.seeds, train, proposal.rung)
-        try:
-            self._next = self._climb.send(trial)
-        except StopIteration:
-            self._next = None
-        return trial
+        trials = self._try(self._next[:most], train)
+        self._next = self._next[most:]
+        self._tried_now += trials
+        if not self._next:
+            tried, self._tried_now = self._tried_now, []
+            with contextlib.suppress(StopIteration):
+                self._next = self._climb.send(tried)
+        return trials
 
-    def _proposals(self) -> Generator[Proposal, Trial | None, None]:
-        """Propose trials rung by rung; ends early where a choice needs one that is left to others."""
+    def _proposals(self) -> Generator[list[Proposal], list[Trial | None], None]:
+        """Propose trials that do not depend on each other; ends early where a choice needs one that is left to others.
+
+        What is sent back are the trials of all that were proposed at once.
+        """
         block, fresh_seeds = self.request.seeds[0], len(self.request.seeds)
         few = self.rungs[0][1]
         seeds = tuple(range(block, block + few))
-        trials = [(yield Proposal(1, self._tried[0], seeds, 0))]
+        proposals = [Proposal(1, self._tried[0], seeds)]
+        trials: list[Trial | None] = []
         if self.settings is None:
+            trials = yield proposals
             if trials[0] is None:
                 return
             self.settings = self._afforded(trials[0])
+            proposals = []
         points = self._points()
         dimensions = self.space
         for share in PARTS:
-            while len(trials) < math.ceil(share * self.settings):
+            while len(trials) + len(proposals) < math.ceil(share * self.settings):
                 point = _new_point(points, dimensions, self._tried)
                 if point is None:
                     break
                 self._tried.append(point)
-                trials.append((yield Proposal(len(trials) + 1, point, seeds, 0)))
+                proposals.append(Proposal(len(self._tried), point, seeds))
+            if proposals:
+                trials += yield proposals
+            proposals = []
             known = [trial for trial in trials if trial is not None]
             if len(known) < len(trials):
                 return
@@ -223,10 +235,9 @@ class Halving(Search):
             last = rung == len(self.rungs) - 1
             start = block + max(n for _, n in self.rungs[:-1]) if last else block
             seeds = tuple(range(start, start + (fresh_seeds if last else each)))
-            known, rising = [], _best(known, count)
-            for risen in rising:
-                if (trial := (yield Proposal(risen.number, risen.point, seeds, rung))) is not None:
-                    known.append(trial)
+            rising = [Proposal(risen.number, risen.point, seeds, rung) for risen in _best(known, count)]
+            risen_trials = yield rising
+            known = [trial for trial in risen_trials if trial is not None]
             if len(known) < len(rising):
                 return
 

@@ -64,7 +64,8 @@ def run(
     Parameters
     ----------
     budget:
-        Seconds: no trial is begun that would not end within them, by the longest so far. None for no limit.
+        Seconds: no trials are begun that would not end within them, one after the other and at the pace of those
+        before. None for no limit.
     out:
         The preset file of the one search; None takes `Search.path`.
 
@@ -96,26 +97,39 @@ def run(
 def _run(
     searches: Sequence[Search], runs: Path, execution: Execution, display: TuneDisplay, budget: float | None
 ) -> bool:
-    def train(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
-        work = plan(runs / FOLDER, entry, execution, seeds, epochs)
-        check_memory(work, execution)
-        EntryStore.create(work.runs, entry)
-        display.trial(entry, work)
-        if work.groups:
-            outcome = execution.run(work, display.update)
+    trained = 0
+
+    def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        nonlocal trained
+        plans = [plan(runs / FOLDER, entry, execution, seeds, epochs) for entry in entries]
+        for work in plans:
+            check_memory(work, execution)
+            EntryStore.create(work.runs, work.entry)
+            trained += len(work.missing)
+        display.begin_trials(plans)
+        for together in execution.divide(plans):
+            display.training(together)
+            outcome = execution.run_together(together, display.update)
             api.raise_failures(outcome)
             if outcome.submitted is not None:
                 display.console.print(outcome.submitted, markup=False)
-        return work.store
+        return [work.store for work in plans]
 
     began = time.monotonic()
-    longest = 0.0
-    while not all(search.over for search in searches):
-        if budget is not None and time.monotonic() - began + longest > budget:
-            return False
-        started = time.monotonic()
-        for search in searches:
-            if not search.over:
-                display.told(search, search.step(train))
-        longest = max(longest, time.monotonic() - started)
+    pace: dict[int, float] = {}  # seconds per run of each search
+    while turn := [(i, search) for i, search in enumerate(searches) if not search.over]:
+        most = None
+        if budget is not None:
+            left = budget - (time.monotonic() - began)
+            one_each = sum(pace.get(i, 0.0) * search.next_seeds for i, search in turn)
+            if left < one_each:
+                return False
+            most = int(left / one_each) if one_each else 1
+        for i, search in turn:
+            started, before = time.monotonic(), trained
+            room = max(1, execution.room // search.next_seeds)
+            for trial in search.step(train, room if most is None else min(room, most)):
+                display.told(search, trial)
+            if trained > before:
+                pace[i] = (time.monotonic() - started) / (trained - before)
     return not any(search.pending for search in searches)

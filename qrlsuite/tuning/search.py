@@ -38,8 +38,8 @@ SHOWN = 10
 FOLDER = "tuning"
 """Trials lie in a results folder of their own, so that leaderboards do not rank them."""
 
-Train = Callable[[Entry, Sequence[int], int], EntryStore]
-"""Trains the missing ones of some seeds to an epoch and returns the entry's folder, finished or not."""
+Train = Callable[[Sequence[Entry], Sequence[int], int], Sequence[EntryStore]]
+"""Trains the missing ones of some seeds of each entry to an epoch; returns the entries' folders, finished or not."""
 
 
 def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
@@ -114,6 +114,16 @@ def split_model(text: str) -> tuple[str, tuple[Setting, ...]]:
     if not name or "=" in name:
         raise OptionError(f"--model '{text}': write a model and its settings, for example 'mlp width=16'")
     return name, tuple(options.parse_setting(word) for word in settings)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Settings to be tried: their number, and the seeds of a rung."""
+
+    number: int
+    point: space.Point
+    seeds: tuple[int, ...]
+    rung: int = 0
 
 
 @dataclass(frozen=True)
@@ -238,8 +248,18 @@ class Search(Shown):
         """Whether no further trial can be begun: all are, or the next one needs to know one that waits."""
         return self.asked == self.planned or (self.sampler.adaptive and bool(self.pending))
 
-    def step(self, train: Train) -> Trial | None:
-        """Run the next trial; returns None where some of its runs are left to another process or a queue.
+    @property
+    def next_seeds(self) -> int:
+        """How many seeds the next trial has."""
+        return len(self.request.seeds)
+
+    def step(self, train: Train, most: int = 1) -> list[Trial | None]:
+        """Run the next trials, `most` at a time where they do not depend on each other, else fewer.
+
+        Returns
+        -------
+        list
+            A trial is None where some of its runs are left to another process or a queue.
 
         Raises
         ------
@@ -248,22 +268,35 @@ class Search(Shown):
         QrlSuiteError
             If a trial cannot be run.
         """
-        point = self.sampler.ask()
-        trial = self._try(self.asked + 1, point, self.request.seeds, train)
-        if trial is not None:
-            self.sampler.tell(trial.merit.signal)
-        return trial
+        count = 1 if self.sampler.adaptive else min(most, self.planned - self.asked)
+        proposals = [
+            Proposal(self.asked + i, self.sampler.ask(), self.request.seeds) for i in range(1, count + 1)
+        ]
+        trials = self._try(proposals, train)
+        for trial in trials:
+            if trial is not None:
+                self.sampler.tell(trial.merit.signal)
+        return trials
 
-    def _try(
-        self, number: int, point: space.Point, seeds: tuple[int, ...], train: Train, rung: int = 0
-    ) -> Trial | None:
-        """Train settings on seeds and look at their curves; None where some are left to others."""
-        self.asked += 1
+    def _try(self, proposals: Sequence[Proposal], train: Train) -> list[Trial | None]:
+        """Train settings on the same seeds and look at their curves; None where some are left to others."""
+        self.asked += len(proposals)
         request = self.request
-        entry = resolve(
-            request.task, request.model, request.algorithm, [*request.settings, *space.settings(point)]
-        )
-        store = train(entry, seeds, self.epochs)
+        entries = [
+            resolve(
+                request.task,
+                request.model,
+                request.algorithm,
+                [*request.settings, *space.settings(each.point)],
+            )
+            for each in proposals
+        ]
+        stores = train(entries, proposals[0].seeds, self.epochs)
+        return [self._judge(*each) for each in zip(proposals, entries, stores)]
+
+    def _judge(self, proposal: Proposal, entry: Entry, store: EntryStore) -> Trial | None:
+        """Look at the curves of settings; None where some are left to others."""
+        request, seeds = self.request, proposal.seeds
         if store.finished(seeds, self.epochs) != set(seeds):
             self.pending.append(entry)
             return None
@@ -273,7 +306,8 @@ class Search(Shown):
         )
         own = {(entry.hash, seed): store.seed(seed).seconds() for seed in seeds}
         self._seconds |= own
-        trial = Trial(number, point, entry, worth, sum(own.values()), seeds, rung)
+        spent = sum(own.values())
+        trial = Trial(proposal.number, proposal.point, entry, worth, spent, seeds, proposal.rung)
         self.trials.append(trial)
         return trial
 

@@ -43,7 +43,10 @@ class Recorder:
         self.folder, self.speed, self.stop_before = folder, speed, stop_before
         self.runs: list[tuple[str, int]] = []
 
-    def __call__(self, entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
+    def __call__(self, entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        return [self.train(entry, seeds, epochs) for entry in entries]
+
+    def train(self, entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
         store = EntryStore.create(self.folder, entry)
         for seed in sorted(set(seeds) - store.finished(seeds, epochs)):
             if len(self.runs) == self.stop_before:
@@ -62,9 +65,9 @@ class Recorder:
         return store
 
 
-def finish(found: Halving, train: Recorder | Trainer) -> Halving:
+def finish(found: Halving, train: Recorder | Trainer, most: int = 1) -> Halving:
     while not found.over:
-        found.step(train)
+        found.step(train, most)
     return found
 
 
@@ -146,7 +149,9 @@ def test_stopped_at_any_run_it_ends_the_same(stop: int, tiny_task: str, tmp_path
     with pytest.raises(KeyboardInterrupt):
         finish(Halving(wanted, tmp_path / "b"), Recorder(tmp_path / "b" / "tuning", near(8e-3), stop))
     rest = Recorder(tmp_path / "b" / "tuning", near(8e-3))
-    resumed = finish(Halving(wanted, tmp_path / "b"), rest)
+    resumed = finish(
+        Halving(wanted, tmp_path / "b"), rest, most=4
+    )  # and goes on with several trials at a time
     assert len(rest.runs) == straight.runs_done - stop, "no run is trained twice"
     assert [(t.number, t.point, t.seeds, t.merit) for t in resumed.trials] == [
         (t.number, t.point, t.seeds, t.merit) for t in straight.trials
@@ -207,12 +212,12 @@ def test_equal_core_hours(tiny_task: str, tmp_path: Path) -> None:
 def test_what_a_queue_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> None:
     """A part is handed over together; nothing is chosen before its trials are there."""
 
-    def queue(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
-        return EntryStore.create(tmp_path / "tuning", entry)
+    def queue(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        return [EntryStore.create(tmp_path / "tuning", entry) for entry in entries]
 
     found = Halving(request(tiny_task, trials=8), tmp_path)
     while not found.over:
-        assert found.step(queue) is None
+        assert found.step(queue) == [None]
     assert len(found.pending) == 4
     assert not found.presentable
 

@@ -53,7 +53,10 @@ class Trainer:
     def __init__(self, folder: Path, stop_before: int | None = None) -> None:
         self.folder, self.stop_before, self.trained = folder, stop_before, 0
 
-    def __call__(self, entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
+    def __call__(self, entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        return [self.train(entry, seeds, epochs) for entry in entries]
+
+    def train(self, entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
         from qrlsuite.engine.worker import train_group
 
         store = EntryStore.create(self.folder, entry)
@@ -296,15 +299,15 @@ def test_small_ranges_are_drawn_until_nothing_new_comes(tiny_task: str) -> None:
 
 
 def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> None:
-    def elsewhere(entry: Entry, seeds: Sequence[int], epochs: int) -> EntryStore:
-        return EntryStore.create(tmp_path, entry)
+    def elsewhere(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        return [EntryStore.create(tmp_path, entry) for entry in entries]
 
     for sampler, begun in (("grid", 4), ("tpe", 1)):
         what = search.Search(
             request(tiny_task, sampler=sampler, trials=None if sampler == "grid" else 4), tmp_path
         )
         while not what.over:
-            assert what.step(elsewhere) is None
+            assert what.step(elsewhere) == [None]
         assert (what.asked, len(what.pending)) == (begun, begun)
         with pytest.raises(OptionError, match="no trial has finished"):
             what.preset()

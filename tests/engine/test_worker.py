@@ -27,7 +27,7 @@ def test_a_claim_that_was_given_back_is_not_lost(
     released: bool, killed: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     claim = claims.acquire(EntryStore(tmp_path), [0])
-    heartbeat = worker.ClaimHeartbeat(claim, None)
+    heartbeat = worker.ClaimHeartbeat([claim], None)
 
     def refresh(self: claims.Claim) -> bool:
         """The training ends between two lines of a refresh; or another worker takes over."""

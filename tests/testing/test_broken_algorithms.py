@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel
 from qrlsuite.environment import LaneEnv
+from qrlsuite.options import Tuned
 from qrlsuite.seeding import Streams
 from qrlsuite.specs import AlgorithmSpec
 from tests.testing.broken import Broken, assert_breaks, ids, own_rules
@@ -25,6 +26,11 @@ HERE = __name__
 class Options:
     epsilon: float = 0.2
     lr: float = 0.1
+
+
+@dataclass(frozen=True)
+class PerAgentOptions(Options):
+    lr: Annotated[float, Tuned(0.1, 0.2, per_agent=True)] = 0.1
 
 
 class Good:
@@ -301,9 +307,20 @@ class InPlace(Good):
         self.room.copy_(state["observations"])
 
 
-def algorithm(factory: type) -> AlgorithmSpec:
+class OneRate(Good):
+    """All agents learn at the mean of their rates."""
+
+    def learn(self, loss: Tensor) -> None:
+        parameters = list(self.values.parameters())
+        rate = float(torch.as_tensor(self.options.lr).mean())
+        for parameter, gradient in zip(parameters, torch.autograd.grad(self.total(loss), parameters)):
+            with torch.no_grad():
+                parameter.sub_(rate * gradient)
+
+
+def algorithm(factory: type, options: type = Options) -> AlgorithmSpec:
     reference = f"{HERE}:{factory.__name__}"
-    return AlgorithmSpec(factory.__name__.lower(), "Breaks a rule", f"{HERE}:Options", reference)
+    return AlgorithmSpec(factory.__name__.lower(), "Breaks a rule", f"{HERE}:{options.__name__}", reference)
 
 
 BROKEN = [
@@ -340,6 +357,8 @@ BROKEN = [
             frozenset({"state"}),
         ),
     ),
+    ("options per agent", Broken(algorithm(OneRate, PerAgentOptions), r"lr = 0.1 differs in '.*' beside one with")),
+    ("options per agent", Broken(algorithm(Good, PerAgentOptions), r"RuntimeError: .*; an option marked per_agent")),
     ("state", Broken(algorithm(Restarting), r"resumed .* differ in 'algorithm.weight' .* the epoch's number belong")),
     ("state", Broken(algorithm(Blind), r"current observations and the epoch's number belong into state_dict\(\)")),
     ("state", Broken(algorithm(InPlace), r"no attribute 'room'; load_state_dict\(\) takes .* in place of start\(\)")),

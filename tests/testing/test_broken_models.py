@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite import population
+from qrlsuite.options import Tuned
 from qrlsuite.specs import ModelSpec
 from tests.testing.broken import Broken, Cases, assert_breaks, ids, own_rules
 
@@ -21,6 +22,11 @@ HERE = __name__
 @dataclass(frozen=True)
 class Options:
     pass
+
+
+@dataclass(frozen=True)
+class GainOptions:
+    gain: Annotated[float, Tuned(0.1, 10, per_agent=True)] = 1.0
 
 
 class Good(nn.Module):
@@ -39,6 +45,17 @@ class Good(nn.Module):
 
 def good(obs: int, out: int, options: Options, generator: torch.Generator) -> nn.Module:
     return Good(obs, out, generator)
+
+
+class Amplified(Good):
+    """Multiplies its inputs by an option, which a stack of agents has from the first."""
+
+    def __init__(self, obs: int, out: int, options: GainOptions, generator: torch.Generator) -> None:
+        super().__init__(obs, out, generator)
+        self.options = options
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x * self.options.gain)
 
 
 def nothing(obs: int, out: int, options: Options, generator: torch.Generator) -> None:
@@ -307,6 +324,10 @@ BROKEN: Cases = [
     )),
     ("seed independence", Broken(
         spec(population=f"{HERE}:coupled"), r"among themselves compute other values", frozenset({"state"})
+    )),
+    ("options per agent", Broken(
+        spec(f"{HERE}:Amplified", options=f"{HERE}:GainOptions"),
+        r"gain = 10 computes something else beside one with another value than alone",
     )),
     ("state", Broken(spec(population=f"{HERE}:forgetful"), r"is not in state_dict\(\); register it")),
     ("shapes", Broken(spec(build_of(Pair)), r"forward returned tuple, not a tensor")),

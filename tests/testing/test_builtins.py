@@ -23,7 +23,7 @@ RULES = {
     "models": [
         "builds", "shapes", "parameters registered", "nothing hidden", "quantum parameters", "same seed",
         "different seed", "global randomness", "pure", "gradients", "finite differences", "copies", "population",
-        "seed independence", "state",
+        "seed independence", "options per agent", "state",
     ],
     "environments": [
         "gymnasium", "spaces", "shapes", "episodes end", "score", "same seed", "different seed",
@@ -31,7 +31,7 @@ RULES = {
     ],
     "algorithms": [
         "builds", "trains", "interactions", "acts", "learns", "same seed", "different seed",
-        "state is seed-first", "seed independence", "state",
+        "state is seed-first", "seed independence", "options per agent", "state",
     ],
     "tasks": ["file", "format", "says what is registered", "identity", "algorithms", "ranking", "scores"],
     "significance_tests": ["builds", "signs", "repeatable", "antisymmetric", "equal entries", "direction"],
