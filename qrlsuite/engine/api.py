@@ -15,7 +15,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError
@@ -125,6 +125,7 @@ class Link(Protocol):
         """Forget the tasks that have no answer yet, and disconnect."""
 
 
+@runtime_checkable
 class RemoteEngine(Protocol):
     """Workers without a shared folder; built as `factory(options)`, `options` None for a spec without options."""
 

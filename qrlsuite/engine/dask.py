@@ -10,8 +10,10 @@ own settings (`distributed.comm.tls` in its configuration, addresses that begin 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import time
+import warnings
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -91,9 +93,6 @@ class DaskLink:
     """A connection to a Dask scheduler."""
 
     def __init__(self, options: DaskOptions, workers: int, versions: Mapping[str, str | None]) -> None:
-        import dask
-        import distributed
-
         self._versions = versions
         self._futures: dict[str, Any] = {}
         self._allowed: dict[str, frozenset[str]] = {}
@@ -104,10 +103,10 @@ class DaskLink:
         self._exit = contextlib.ExitStack()
         with self._exit as exit_stack:
             quiet = {"distributed.admin.large-graph-warning-threshold": 2 * MOST_BYTES}
-            exit_stack.enter_context(dask.config.set(quiet))
+            exit_stack.enter_context(_module("dask.config").set(quiet))
             address = options.scheduler
             if address is None:
-                cluster = distributed.LocalCluster(
+                cluster = _module("distributed").LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     host="127.0.0.1",
@@ -181,8 +180,6 @@ class DaskLink:
 
     def _fetch(self, key: str) -> Answer | None:
         """Return the answer to an ended task, None where its bytes are on a worker that has just died."""
-        from distributed import TimeoutError
-
         future = self._futures[key]
         try:
             answer = Answer(key, _bytes(future.result(timeout=FETCH_SECONDS)))
@@ -268,10 +265,7 @@ def _connected(address: str, timeout: float) -> Any:
     QrlSuiteError
         If none answers there.
     """
-    import warnings
-
-    import distributed
-
+    distributed = _module("distributed")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in our words
     try:
         with warnings.catch_warnings():
@@ -288,6 +282,11 @@ def _connected(address: str, timeout: float) -> Any:
             f"no Dask scheduler answers at {address} within {timeout:g} s ({words(error)}): is it running there, and "
             "can this machine reach it?"
         ) from None
+
+
+def _module(name: str) -> Any:
+    """Import a module of Dask, which is not there in every installation; its types are its own matter."""
+    return importlib.import_module(name)
 
 
 def _minor(python: Any) -> str:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Execution:
     def run(self, work: Plan, show: api.Show) -> EngineOutcome:
         """Let the engine train the groups of a plan."""
         handed = api.Work(work.store, work.groups, work.epochs, self.workers, self.device)
-        if _carries_bytes(self.engine):
+        if isinstance(self.engine, RemoteEngine):
             return remote.train(self.engine, handed, show)
         return self.engine.run(handed, show)
 
@@ -111,10 +111,6 @@ class Execution:
             stores = [each.store for each in others]
             work.append(api.Work(first.store, groups, first.epochs, self.workers, self.device, stores))
         return work
-
-
-def _carries_bytes(engine: Engine | RemoteEngine) -> TypeGuard[RemoteEngine]:
-    return hasattr(engine, "connect")
 
 
 @dataclass(frozen=True)
@@ -214,7 +210,7 @@ def plan(
     busy &= set(requested)
     left = sorted(set(requested) - busy)
     missing = plan_groups(store, left, last, execution.workers)
-    if missing and _carries_bytes(execution.engine):
+    if missing and isinstance(execution.engine, RemoteEngine):
         missing = plan_groups(store, left, last, execution.workers, remote.seeds_per_task(entry))
     return Plan(runs, entry, store, requested, last, frozenset(busy), missing)
 

@@ -142,9 +142,8 @@ class _Run:
             while waiting and len(self.sent) < self.work.workers and self._room():
                 self._guarded(waiting.popleft(), self._resume)
             for answer in self.link.receive(WAIT_SECONDS) if self.sent else ():
-                member = self.sent.pop(answer.key, None)
-                if member is not None:  # else it is answered twice, or was given up
-                    self._guarded(member, functools.partial(self._take, answer=answer))
+                if answer.key in self.sent:  # else it is answered twice
+                    self._guarded(self.sent.pop(answer.key), functools.partial(self._take, answer=answer))
             self.claims.require()
             show({member.group.id: member.progress_file.read() for member in self.members})
         return self.outcome
