@@ -109,8 +109,16 @@ class Answer:
 class Link(Protocol):
     """A connection to workers that call `qrlsuite.training.advance.advance`."""
 
-    def send(self, key: str, task: bytes) -> None:
-        """Have a task worked on by any worker, now or when one is free; `key` is new for every task."""
+    def send(self, key: str, task: bytes, priority: int) -> None:
+        """Have a task worked on by any worker, now or when one is free.
+
+        Parameters
+        ----------
+        key:
+            New for every task.
+        priority:
+            Tasks with a higher one go first where they can; those of groups that have begun have a higher one.
+        """
 
     def receive(self, seconds: float) -> list[Answer]:
         """Return the answers that have come, each once; waits for the first of them, that long at most.

@@ -139,7 +139,7 @@ class DaskLink:
                 f"the Dask scheduler at {self.address} has {different}: Dask needs the same on both sides"
             )
 
-    def send(self, key: str, task: bytes) -> None:
+    def send(self, key: str, task: bytes, priority: int) -> None:
         """Have a task worked on by any worker of our versions."""
         if time.monotonic() - self._looked >= SEND_SECONDS:
             self._look()
@@ -149,7 +149,7 @@ class DaskLink:
         restricted = {"workers": sorted(self._usable)} if self._refused else {}
         self._allowed[key] = self._usable if self._refused else frozenset()
         self._futures[key] = self._client.submit(
-            eval, CALL, {"task": task}, key=f"advance-{key}", pure=False, **restricted
+            eval, CALL, {"task": task}, key=f"advance-{key}", priority=priority, pure=False, **restricted
         )
 
     def receive(self, seconds: float) -> list[Answer]:

@@ -204,7 +204,7 @@ class _Run:
         member.size, member.progress.phase = len(task), "sent"
         member.write()
         self.sent[token] = member
-        self.link.send(token, task)
+        self.link.send(token, task, member.epoch)
 
     def _take(self, member: _Member, answer: Answer) -> None:
         """Accept an answer, or send the task again."""

@@ -103,7 +103,7 @@ def _answers(engine: Any, answers: list[tuple[str, Any]]) -> None:
     try:
         for token in TASKS:
             task = {"token": token, "seeds": [0], "versions": {"qrlsuite": "0"}}
-            link.send(token, pack(task, {}))
+            link.send(token, pack(task, {}), 0)
         answers += _received(link)
     finally:
         link.close()

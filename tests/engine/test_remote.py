@@ -62,7 +62,7 @@ class Here:
     def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
         return self
 
-    def send(self, key: str, task: bytes) -> None:
+    def send(self, key: str, task: bytes, priority: int) -> None:
         self.sent += 1
         self.tasks[key] = task
 

@@ -138,7 +138,7 @@ class GoodLink:
     def __init__(self) -> None:
         self.tasks: list[tuple[str, bytes]] = []
 
-    def send(self, key: str, task: bytes) -> None:
+    def send(self, key: str, task: bytes, priority: int) -> None:
         self.tasks.append((key, task))
 
     def receive(self, seconds: float) -> list[Answer]:
