@@ -8,6 +8,7 @@ lost costs that minute. An answer is accepted once, for the group, epoch and tok
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import json
 import secrets
@@ -23,7 +24,7 @@ from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.results.checkpoint import Arrays
-from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
+from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire_each
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.provenance import PACKAGES
 from qrlsuite.results.seeds import SeedGroup
@@ -130,8 +131,12 @@ class _Run:
         self.members = [_Member(work, group) for group in work.groups]
         self.files: dict[str, GroupFiles] = {}
         self.sent: dict[str, _Member] = {}
-        self.claims = _Claims(work.store)
         self.link: Link = engine.connect(work.workers, self.versions)
+        try:
+            self.claims = _Claims(work.store, [member.group.seeds for member in self.members])
+        except BaseException:
+            self.link.close()
+            raise
 
     def train(self, show: Show) -> EngineOutcome:
         """Send and accept until every group has finished or failed."""
@@ -145,7 +150,7 @@ class _Run:
                 if answer.key in self.sent:  # else it is answered twice
                     self._guarded(self.sent.pop(answer.key), functools.partial(self._take, answer=answer))
             self.claims.require()
-            show({member.group.id: member.progress_file.read() for member in self.members})
+            show({member.group.id: dataclasses.asdict(member.progress) for member in self.members})
         return self.outcome
 
     def close(self) -> None:
@@ -174,9 +179,9 @@ class _Run:
             member.write(message)
 
     def _resume(self, member: _Member) -> None:
-        """Claim a group's seeds and send its first task, from the newest checkpoint."""
+        """Send a group's first task, from the newest checkpoint."""
         seeds = member.group.seeds
-        self.claims.acquire(seeds)
+        self.claims.require_held(seeds)
         if self.store.finished(seeds, self.work.epochs) == set(
             seeds
         ):  # by somebody else, since it was planned
@@ -301,12 +306,14 @@ def _require_fit(header: Mapping[str, Any], arrays: Arrays, token: str, member: 
 
 
 class _Claims(threading.Thread):
-    """The claims of this process, refreshed by a thread of their own."""
+    """The claims of groups of seeds by this process, refreshed by a thread of their own."""
 
-    def __init__(self, store: EntryStore) -> None:
+    def __init__(self, store: EntryStore, groups: Sequence[tuple[int, ...]]) -> None:
         super().__init__(daemon=True)
         self._store = store
-        self._held: dict[Sequence[int], Claim] = {}
+        answers = dict(zip(groups, acquire_each(store, groups)))
+        self._held = {seeds: claim for seeds, claim in answers.items() if isinstance(claim, Claim)}
+        self._refused = {s: error for s, error in answers.items() if isinstance(error, SeedsClaimedError)}
         self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._lost = False
@@ -318,13 +325,18 @@ class _Claims(threading.Thread):
             with self._lock:
                 self._lost |= any(not claim.refresh() for claim in self._held.values())
 
-    def acquire(self, seeds: Sequence[int]) -> None:
-        """Claim seeds; the errors are those of `claims.acquire`."""
-        claim = acquire(self._store, seeds)
-        with self._lock:
-            self._held[seeds] = claim
+    def require_held(self, seeds: tuple[int, ...]) -> None:
+        """Refuse a group that is somebody else's.
 
-    def release(self, seeds: Sequence[int]) -> None:
+        Raises
+        ------
+        SeedsClaimedError
+            Saying whose.
+        """
+        if seeds in self._refused:
+            raise self._refused[seeds]
+
+    def release(self, seeds: tuple[int, ...]) -> None:
         """Give seeds back, if they are held."""
         with self._lock:
             claim = self._held.pop(seeds, None)

@@ -18,7 +18,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -213,38 +213,63 @@ def acquire(store: EntryStore, seeds: Sequence[int]) -> Claim:
     StoreError
         If the folder cannot be written.
     """
+    (claim,) = acquire_each(store, [seeds])
+    if isinstance(claim, SeedsClaimedError):
+        raise claim
+    return claim
+
+
+def acquire_each(store: EntryStore, groups: Sequence[Sequence[int]]) -> list[Claim | SeedsClaimedError]:
+    """Claim groups of seeds for this process, each on its own; a thousand take one look at what is claimed already.
+
+    Returns
+    -------
+    list
+        For each group its claim, or the error that `acquire` raises where a living worker holds one of its seeds.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be written.
+    """
+    wanted = {seed for seeds in groups for seed in seeds}
     try:
         store.claims.mkdir(parents=True, exist_ok=True)
         with _locked(store.claims):
             now = _file_system_time(store.claims)
             states = {claim: _state(claim, now) for claim in claims(store)}
-            claimed = set(seeds)
-            suspects = [c for c, state in states.items() if state == "suspect" and claimed & set(c.seeds)]
+            suspects = [c for c, state in states.items() if state == "suspect" and wanted & set(c.seeds)]
             states |= dict.fromkeys(_abandoned(suspects), "dead")
             holders = [claim for claim, state in states.items() if state != "dead"]
-            for holder in holders:
-                shared = sorted(claimed & set(holder.seeds))
-                if shared:
-                    raise SeedsClaimedError(_refusal(holder, shared))
             for path in set(store.claims.glob("*.json")) - {holder.path for holder in holders}:
                 path.unlink(missing_ok=True)
                 path.with_suffix(".stop").unlink(missing_ok=True)
-            token = secrets.token_hex(8)
-            claim = Claim(
-                path=store.claims / f"{token}.json",
-                host=socket.gethostname(),
-                pid=os.getpid(),
-                namespace=_namespace(),
-                started=_process_start(os.getpid()) or "unknown",
-                token=token,
-                seeds=tuple(int(seed) for seed in seeds),
-            )
-            content = {
-                name: getattr(claim, name) for name in ("host", "pid", "namespace", "started", "token")
-            }
-            claim.path.write_text(json.dumps({**content, "seeds": list(claim.seeds)}))
+            held = {seed: holder for holder in holders for seed in holder.seeds}
+            return [_acquire_free(store, seeds, held) for seeds in groups]
     except OSError as error:
         raise StoreError(f"cannot write {store.claims}: {error.strerror or error}") from None
+
+
+def _acquire_free(
+    store: EntryStore, seeds: Sequence[int], held: Mapping[int, Claim]
+) -> Claim | SeedsClaimedError:
+    """Write a claim of seeds, unless one of them is held."""
+    for seed in seeds:
+        if seed in held:
+            holder = held[seed]
+            return SeedsClaimedError(_refusal(holder, sorted(set(seeds) & set(holder.seeds))))
+    token = secrets.token_hex(8)
+    claim = Claim(
+        path=store.claims / f"{token}.json",
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        namespace=_namespace(),
+        started=_process_start(os.getpid()) or "unknown",
+        token=token,
+        seeds=tuple(int(seed) for seed in seeds),
+    )
+    content = {name: getattr(claim, name) for name in ("host", "pid", "namespace", "started", "token")}
+    claim.path.write_text(json.dumps({**content, "seeds": list(claim.seeds)}))
     return claim
 
 
