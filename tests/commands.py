@@ -155,6 +155,8 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
     os.environ.update(env)
     sys.path[:0] = [path for path in env.get("PYTHONPATH", "").split(os.pathsep) if path]
     sys.argv = ["qrlsuite", *words]
+    if "dask" in sys.modules:
+        importlib.import_module("dask.config").refresh()  # from this command's environment
     if program == "dask":
         importlib.import_module(f"distributed.cli.dask_{words[0]}").main(words[1:], standalone_mode=False)
         return 0

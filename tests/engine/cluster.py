@@ -22,19 +22,26 @@ LOCAL = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
 class Cluster:
     """A scheduler and its workers; all are killed at the end."""
 
-    def __init__(self, folder: Path, workers: int = 0, env: Mapping[str, str] | None = None) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, env: Mapping[str, str] | None = None, protocol: str = "tcp") -> None:
+        self.folder, self.protocol = folder, protocol
         self.workers: list[Command] = []
         self._numbers = itertools.count()
         self.start_scheduler(env)
-        for _ in range(workers):
-            self.add()
 
     def start_scheduler(self, env: Mapping[str, str] | None = None) -> None:
         """Start a scheduler, at a new address."""
         folder = self._folder("scheduler")
         file = folder / "scheduler.json"
-        words = ["scheduler", *LOCAL, "--port", "0", "--scheduler-file", str(file)]
+        words = [
+            "scheduler",
+            *LOCAL,
+            "--port",
+            "0",
+            "--protocol",
+            self.protocol,
+            "--scheduler-file",
+            str(file),
+        ]
         self.scheduler = start_dask(*words, env=_environment(env), cwd=folder)
         while not file.exists() or not file.read_bytes().endswith(b"}"):
             assert self.scheduler.poll() is None, self.scheduler.communicate()[1]

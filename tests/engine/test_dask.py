@@ -15,12 +15,20 @@ from pathlib import Path
 
 import pytest
 
+from qrlsuite import api
+from qrlsuite.engine import execution
+from qrlsuite.engine.dask import DaskEngine, DaskOptions
+from qrlsuite.engine.status import survey
+from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
 from tests.commands import Command, qrlsuite, start
 from tests.conftest import TINY, most_epochs, results
 from tests.engine.stress import compare, undisturbed
 
 pytest.importorskip("distributed", reason="pip install 'qrlsuite[dask]'")
+
+import dask
+import psutil
 
 from tests.engine.cluster import Cluster
 
@@ -80,6 +88,12 @@ def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_pa
     run = start(*words(task, runs, cluster.address, ENDLESS), env=environment())
     for kill in range(1, kills + 1):
         further(entry, run)
+        if kill == 1:
+            (status,) = survey(runs)
+            assert {(group.state, group.progress["epochs"]) for group in status.groups} == {
+                ("running", ENDLESS)
+            }
+            assert sorted(seed for group in status.groups for seed in group.seeds) == list(range(SEEDS))
         time.sleep(dice.uniform(0, 0.3))
         cluster.kill(dice.choice(cluster.workers))
         if dice.random() < 0.2 and len(cluster.workers) < 4:
@@ -111,6 +125,62 @@ def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_pa
     done = qrlsuite(*words(task, runs, cluster.address, epochs), env=environment())
     assert done.returncode == 0, done.stderr
     compare(undisturbed(task, tmp_path / "straight", SEEDS, epochs, SEEDS), entry, SEEDS, epochs)
+
+
+def test_over_tls_from_python(
+    task: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By Dask's own settings."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        "/CN=localhost",
+    ]
+    subprocess.run([*make, "-keyout", str(key), "-out", str(certificate)], check=True, capture_output=True)
+    settings = {"ca-file": str(certificate)}
+    for role in ("scheduler", "worker", "client"):
+        settings |= {f"{role}.cert": str(certificate), f"{role}.key": str(key)}
+    tls = {f"distributed.comm.tls.{name}": value for name, value in settings.items()}
+    variables = {
+        f"DASK_{name.replace('.', '__').replace('-', '_').upper()}": value for name, value in tls.items()
+    }
+    with Cluster(tmp_path / "cluster", variables, "tls") as cluster, dask.config.set(tls):
+        assert cluster.address.startswith("tls://127.0.0.1:")
+        cluster.add(variables)
+        engine = execution.create("dask", 2, {"scheduler": cluster.address})
+        done = api.train(
+            str(task), "mlp", options={"width": 16}, seeds=2, epochs=2, engine=engine, runs=tmp_path / "runs"
+        )
+        refused = pytest.raises(QrlSuiteError, match=f"no Dask scheduler answers at {cluster.address} .*TLS")
+        with dask.config.set({"distributed.comm.tls.ca-file": None}), refused:
+            DaskEngine(DaskOptions(cluster.address)).connect(1, {})
+    straight = train("straight", [0, 1], 2)
+    assert [results(Path(done.folder), seed) for seed in (0, 1)] == [
+        results(straight, seed) for seed in (0, 1)
+    ]
+
+
+def test_what_the_engine_starts_itself_listens_here_only() -> None:
+    link = DaskEngine(DaskOptions()).connect(1, {})
+    try:
+        own = psutil.Process()
+        listening = {
+            connection.laddr.ip
+            for process in (own, *own.children(recursive=True))
+            for connection in process.net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        }
+    finally:
+        link.close()
+    assert listening == {"127.0.0.1"}
 
 
 def shadow(folder: Path, distribution: str, version: str) -> dict[str, str]:
