@@ -618,7 +618,7 @@ def tune(
     if not requests or (preset is not None and len(requests) > 1):
         raise OptionError("model: give at least one model, and with `out` only one")
     searches = tuning_runner.build(requests, Path(runs))
-    display = TuneDisplay(searches, chosen_execution.workers, not progress, "call")
+    display = TuneDisplay(searches, chosen_execution, not progress, "call")
     display.begin()
     budget = None if minutes is None else 60 * minutes
     tuning_runner.run(searches, Path(runs), chosen_execution, display, budget, preset)

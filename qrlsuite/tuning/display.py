@@ -10,7 +10,7 @@ from typing import Any, Literal
 from rich.console import Console
 
 from qrlsuite.engine.display import Bar
-from qrlsuite.engine.execution import Plan
+from qrlsuite.engine.execution import Execution, Plan
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
@@ -32,11 +32,11 @@ class TuneDisplay:
     def __init__(
         self,
         searches: Sequence[Search],
-        workers: int,
+        execution: Execution,
         quiet: bool = False,
         again: Literal["command", "call"] = "command",
     ) -> None:
-        self.searches, self.workers, self.again = searches, workers, again
+        self.searches, self.execution, self.again = searches, execution, again
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
         self._began = time.monotonic()
@@ -60,7 +60,7 @@ class TuneDisplay:
             cost, basis = self._cost(search)
             bases.setdefault(basis)
             total = None if total is None or cost is None else (total[0] + cost[0], total[1] + cost[1])
-        cores = self.workers
+        cores = self.execution.workers
         if total is None:
             self.console.print("what it costs will be known after the first trial")
         else:
@@ -72,8 +72,8 @@ class TuneDisplay:
 
     def _cost(self, search: Search) -> tuple[tuple[float, float] | None, str]:
         """Return the least and the most core-seconds of a whole search, None where unknown, and what that rests on."""
-        seeds = len(search.request.seeds)
-        together = min(LARGEST_GROUP, math.ceil(seeds / self.workers))
+        runs = len(search.request.seeds) * (search.beside if self.execution.room > 1 else 1)
+        together = min(LARGEST_GROUP, math.ceil(runs / self.execution.workers))
         estimate = speed.known(search.runs, search.results).estimate(search.base, together)
         return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
 

@@ -161,6 +161,11 @@ class Halving(Search):
         return not self._next
 
     @property
+    def beside(self) -> int:
+        """How many settings can be trained side by side in one population: those of the last rung, the most runs."""
+        return FINALISTS if self._per_agent else 1
+
+    @property
     def next_seeds(self) -> int:
         """How many seeds the next trial has."""
         return len(self._next[0].seeds) if self._next else 0

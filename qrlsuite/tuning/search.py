@@ -249,6 +249,18 @@ class Search(Shown):
         return self.asked == self.planned or (self.sampler.adaptive and bool(self.pending))
 
     @property
+    def beside(self) -> int:
+        """How many settings can be trained side by side in one population, at most: what a run costs depends on it."""
+        return self.planned if self._per_agent and not self.sampler.adaptive else 1
+
+    @property
+    def _per_agent(self) -> bool:
+        """Whether agents of one population may differ in all that is varied."""
+        sides = {"algorithm": self.base.algorithm_options, "model": self.base.model_options}
+        free = {f"{side}.{name}" for side, own in sides.items() for name in options.per_agent(type(own))}
+        return all(free.issuperset(dimension.name.split("+")) for dimension in self.space)
+
+    @property
     def next_seeds(self) -> int:
         """How many seeds the next trial has."""
         return len(self.request.seeds)

@@ -26,7 +26,7 @@ from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.halving import Halving
 from qrlsuite.tuning.runner import run as run_searches
 from tests.conftest import results
-from tests.core.test_tuning import finish, without_hours
+from tests.core.test_tuning import finish, varied, without_hours
 
 NETWORK = ("width=4", "depth=1")
 CASES = {
@@ -198,6 +198,32 @@ def halving(task: str, folder: Path) -> Halving:
     return Halving(wanted, folder)
 
 
+def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -> None:
+    """What a search is expected to cost depends on it."""
+    settings = tuple(parse_setting(word) for word in NETWORK)
+    for words, sampler, beside in (
+        (("lr=1e-3,1e-2",), "grid", 2),
+        (("lr=1e-3,1e-2", "gamma=.9,.99"), "grid", 1),
+        (("lr+quantum_lr=1e-3,1e-2",), "halving", 3),
+        (("gamma=.9,.99",), "halving", 1),
+    ):
+        fixed = (
+            *settings,
+            parse_setting("input_scale=1"),
+            *([parse_setting("lr=1e-3")] * (words == ("gamma=.9,.99",))),
+        )
+        wanted = search.Request(
+            tiny_task,
+            "mlp",
+            settings=fixed,
+            varied=varied(*words),
+            sampler=sampler,
+            seeds=search.tuning_seeds("2"),
+        )
+        found = Halving(wanted, tmp_path) if sampler == "halving" else search.Search(wanted, tmp_path)
+        assert found.beside == beside, words
+
+
 def preset(found: Halving) -> str:
     found.write(found.path)
     return without_hours(found.path.read_text())
@@ -208,6 +234,7 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
     """Begun the one way it continues the other way."""
     folder = tmp_path / "in turn"
     in_turn = halving(tiny_task, folder)
+    assert in_turn.beside == 3
     finish(in_turn)
     expected = preset(in_turn)
 
@@ -217,7 +244,7 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
             with pytest.raises(KeyboardInterrupt):
                 finish(halving(tiny_task, tmp_path / name), stop_before=begun)
         found = halving(tiny_task, tmp_path / name)
-        assert run_searches([found], tmp_path / name, by, TuneDisplay([found], 1, quiet=True))
+        assert run_searches([found], tmp_path / name, by, TuneDisplay([found], by, quiet=True))
         assert preset(found) == expected
         assert [trial.merit for trial in found.trials] == [trial.merit for trial in in_turn.trials]
         sizes = {
@@ -234,7 +261,7 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_searches([stopped], tmp_path / "stopped", by, Stopping([stopped], 1, quiet=True))
+        run_searches([stopped], tmp_path / "stopped", by, Stopping([stopped], by, quiet=True))
     again = halving(tiny_task, tmp_path / "stopped")
     finish(again)
     assert preset(again) == expected

@@ -188,7 +188,7 @@ def tune(
         )
     searches = runner.build(requests, runs)
     execution = execution_of(engine, workers, partition, time, engine_options, device)
-    display = TuneDisplay(searches, execution.workers, quiet=json_output)
+    display = TuneDisplay(searches, execution, quiet=json_output)
     display.begin()
     if dry_run:
         if json_output:
