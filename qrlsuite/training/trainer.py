@@ -194,7 +194,12 @@ class ModelBuilder:
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
-            hidden.require_none(lambda which: agent(two[which], options[0]), self.observation_size, spec.name)
+            both = options[0], options[0]
+            if spec.population is None:  # a stack keeps one agent's plain attributes for all
+                both = options[0], next((own for own in options if own != options[0]), options[0])
+            hidden.require_none(
+                lambda which: agent(two[which], both[which]), self.observation_size, spec.name
+            )
             agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))

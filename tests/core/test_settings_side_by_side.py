@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,15 +11,19 @@ import pytest
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
+from torch import Tensor, nn
 
 from qrlsuite import population
 from qrlsuite.engine import execution, local, worker
+from qrlsuite.errors import PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Tuned, parse_setting
+from qrlsuite.plugins.models.mlp import MLPOptions
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.store import EntryStore, read_lines
+from qrlsuite.specs import ModelSpec
 from qrlsuite.training import group
 from qrlsuite.training.trainer import Trainer
 from qrlsuite.tuning import search
@@ -139,6 +144,32 @@ class Gained:
 
     gain: Annotated[float, Field(gt=0), Tuned(0.1, 10, per_agent=True)] = 1.0
     decay: Annotated[float, Field(gt=0), Tuned(0.1, 10)] = 1.0
+
+
+class Amplified(nn.Module):
+    """A network that keeps its options where a stack of agents has one for all."""
+
+    def __init__(self, inputs: int, outputs: int, own: MLPOptions, generator: torch.Generator) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.rand(inputs, outputs, generator=generator))
+        self.gain = own.input_scale
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.gain * x @ self.weight
+
+
+def test_a_stack_of_agents_with_a_plain_number_each_is_refused(tiny_task: str) -> None:
+    model = ModelSpec(
+        "amplified",
+        "Plain number",
+        "classical",
+        f"{MLPOptions.__module__}:MLPOptions",
+        f"{__name__}:Amplified",
+    )
+    chosen = [dataclasses.replace(entry, model=model) for entry in entries(tiny_task)]
+    Trainer(chosen[0], [0, 1])
+    with pytest.raises(PluginError, match=r"model 'amplified': self\.gain differs"):
+        Trainer(chosen, [0, 0, 0])
 
 
 def test_options_per_agent_become_tensors() -> None:
