@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard, Row, Section
 from qrlsuite.leaderboard.tables import tier_text
-from qrlsuite.leaderboard.times import TimeRow, thousands
+from qrlsuite.leaderboard.times import TimeRow
 from qrlsuite.results.text import steps_text
 
 _SPECIAL = {
@@ -89,7 +89,8 @@ def _section(section: Section) -> str:
 def _cells(row: TimeRow, of: Row) -> tuple[str, ...]:
     classical, quantum = row.entry.parameters
     complexity = of.reference
-    low, high = row.mean.interval
+    steps, low, high = (steps_text(each) for each in (complexity.steps, complexity.low, complexity.high))
+    mean, mean_low, mean_high = (steps_text(each, digits=3) for each in (row.mean.mean, *row.mean.interval))
     bound = r"$\geq$ " if complexity.unsettled else ""
     cap = ", at cap" if complexity.at_cap else ""
     return (
@@ -99,8 +100,8 @@ def _cells(row: TimeRow, of: Row) -> tuple[str, ...]:
         (f"{classical} + {quantum} q" if quantum else str(classical)) + row.entry.fixed_text,
         f"{len(row.entry.seeds)}" + r"$^\dagger$" * row.few,
         tier_text(of),
-        f"{bound}{thousands(complexity.steps)} ({thousands(complexity.low)}--{thousands(complexity.high)}{cap})",
-        f"{thousands(row.mean.mean)} ({thousands(low)}--{thousands(high)})",
+        f"{bound}{steps} ({low}--{high}{cap})",
+        f"{mean} ({mean_low}--{mean_high})",
         _signed(row.difference_text),
     )
 

@@ -34,7 +34,7 @@ class Drawn:
         Entries that have begun but end before the others do, (task, label, epochs): they would cut the picture
         to their length, and are left out.
     figure:
-        None where the picture cannot be drawn of what is there.
+        None where the finished seeds do not suffice for the picture.
     problem:
         Then the reason.
     path:
@@ -109,7 +109,7 @@ def draw(
     runs: Path,
     report: Report | None = None,
 ) -> list[Drawn]:
-    """Draw every picture of a study from what is there.
+    """Draw every picture of a study from the seeds finished so far.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def _steps(entry: EntryCurves) -> int:
 def _attempt(
     picture: PictureSection, entries: Sequence[EntryCurves], head: Drawn, report: Report | None
 ) -> Drawn:
-    """Draw one picture; what is there may not suffice for it."""
+    """Draw one picture; the finished seeds may not suffice for it."""
     try:
         if pictures.KINDS[picture.kind].data == "episodes":
             figure = _episodes(picture, entries, report)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
 
 ALPHA = 0.05
@@ -119,13 +120,13 @@ class TimeRanking:
 
     def cells(self, row: TimeRow) -> tuple[str, ...]:
         """Return a row as text."""
-        low, high = row.mean.interval
+        mean, low, high = (steps_text(steps, digits=3) for steps in (row.mean.mean, *row.mean.interval))
         return (
             row.rank_text,
             row.joined,
             row.entry.label,
             f"{len(row.entry.seeds)}{'!' * row.few}",
-            f"{thousands(row.mean.mean)} ({thousands(low)} to {thousands(high)})",
+            f"{mean} ({low} to {high})",
             f"{row.at_cap:.0%}",
             "-" if row.place_at_half is None else str(row.place_at_half),
             row.difference_text,
@@ -330,11 +331,6 @@ def percent(share: float) -> str:
     """Write a difference: `+12%`, `-3.4%`."""
     value = 100 * share
     return f"{value:+.0f}%" if abs(value) >= 9.95 else f"{value:+.1f}%"
-
-
-def thousands(steps: float) -> str:
-    """Write a mean number of steps: `58.2k`, `812`."""
-    return f"{steps / 1000:.1f}k" if steps >= 1000 else f"{steps:.0f}"
 
 
 def p_text(p: float) -> str:

@@ -50,7 +50,7 @@ from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning import space
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.search import Request, Search, default_sampler, split_model, tuning_seeds
+from qrlsuite.tuning.search import Request, Search, default_sampler, for_each_model, tuning_seeds
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
@@ -591,36 +591,30 @@ def tune(
     _check_positive("epochs", epochs)
     _check_positive("trials", trials)
     chosen_execution = _execution(engine, workers, device)
-    if minutes is not None and not 0 < minutes < float("inf"):
-        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
+    budget = _seconds(minutes)
     varied = {
         name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
     }
-    requests = []
-    for text in [model] if isinstance(model, str) else model:
-        name, own = split_model(text)
-        request = Request(
-            task=task,
-            model=name,
-            algorithm=algorithm,
-            settings=(*from_mapping(options), *own),
-            grid=None if grid is None else space.load(grid),
-            varied=tuple(from_mapping(varied)),
-            sampler=sampler or default_sampler(grid or vary),
-            trials=trials,
-            core_hours=core_hours,
-            sampler_seed=sampler_seed,
-            seeds=tuning_seeds(seeds),
-            epochs=epochs,
-            objective=objective,
-        )
-        requests.append(request)
+    shared = Request(
+        task=task,
+        algorithm=algorithm,
+        settings=tuple(from_mapping(options)),
+        grid=None if grid is None else space.load(grid),
+        varied=tuple(from_mapping(varied)),
+        sampler=sampler or default_sampler(grid or vary),
+        trials=trials,
+        core_hours=core_hours,
+        sampler_seed=sampler_seed,
+        seeds=tuning_seeds(seeds),
+        epochs=epochs,
+        objective=objective,
+    )
+    requests = for_each_model(shared, _several(model))
     if not requests or (preset is not None and len(requests) > 1):
         raise OptionError("model: give at least one model, and with `out` only one")
     searches = tuning_runner.build(requests, Path(runs))
     display = TuneDisplay(searches, chosen_execution, not progress, "call")
     display.begin()
-    budget = None if minutes is None else 60 * minutes
     tuning_runner.run(searches, Path(runs), chosen_execution, display, budget, preset)
     return searches
 
@@ -724,8 +718,7 @@ def run_study(
     if format not in ("png", "pdf", "svg"):
         raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
     _check_positive("epochs", epochs)
-    if minutes is not None and not 0 < minutes < float("inf"):
-        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
+    budget = _seconds(minutes)
     chosen_execution = _execution(engine, workers, device)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     study = study_files.load(name)
@@ -735,7 +728,6 @@ def run_study(
     folder = Path(runs)
     speeds = speed.known(folder)
     items = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
-    budget = None if minutes is None else 60 * minutes
     if budget is not None:
         study_runner.check_budget(items, budget, chosen_execution.workers)
     session = study_runner.Session(folder, chosen_execution, speeds, budget, not progress, "call")
@@ -759,6 +751,12 @@ def _execution(engine: str | Execution, workers: int | None, device: str) -> Exe
 def _check_positive(name: str, value: int | None) -> None:
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise OptionError(f"{name} = {value!r}: give a whole number, 1 or more")
+
+
+def _seconds(minutes: float | None) -> float | None:
+    if minutes is not None and not 0 < minutes < float("inf"):
+        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
+    return None if minutes is None else 60 * minutes
 
 
 def _several(names: str | Sequence[str] | None) -> Sequence[str]:

@@ -66,7 +66,6 @@ class SectionView:
     threshold_symbol: str
     framed: bool
     deltas: tuple[str, ...]
-    unit: str
     data: dict[str, Any]
     times: timed.TimesView
 
@@ -94,14 +93,13 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     rows = tuple(
         _row(place, row, entries[id(row.entry)], judgement) for place, row in enumerate(section.rows)
     )
-    unit = 1000 if section.horizon >= 20_000 else 1
     grid = judgement.grid
     bars = bar_grid(ranking)
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
     names = [f"{float(value):g}" for value in grid.levels]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
     missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
-    surfaces = tuple(surface(judgement.own(place), ranking, unit) for place in range(len(rows)))
+    surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
     return SectionView(
         id=f"board-{number}",
         number=number,
@@ -121,8 +119,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         ),
         surfaces=surfaces,
         bars=tuple(
-            tuple(cell for line in surface(evidence, ranking, unit) for cell in line)
-            for evidence in bar_evidence
+            tuple(cell for line in surface(evidence, ranking) for cell in line) for evidence in bar_evidence
         ),
         bar_names=tuple(
             f"{symbol(bars)} {float(value):g}, δ {float(delta):g}"
@@ -134,7 +131,6 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         threshold_symbol=symbol(grid),
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
-        unit="thousands of environment steps" if unit == 1000 else "environment steps",
         data=_data(section, judgement, rows, bars, bar_evidence, ranking),
         times=timed.view(section.times, entries),
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.report.words import in_unit
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 
@@ -27,7 +26,7 @@ class CellView:
     title: str
 
 
-def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tuple[CellView, ...], ...]:
+def surface(evidence: Evidence, ranking: RankingSection) -> tuple[tuple[CellView, ...], ...]:
     """Return E lines of D cells: S_hat of an entry at all its runs."""
     grid, horizon = evidence.grid, evidence.entry.horizon
     point, interval = evidence.point, evidence.interval()
@@ -44,7 +43,7 @@ def surface(evidence: Evidence, ranking: RankingSection, unit: int) -> tuple[tup
             share = float(point[i, j]) / horizon
             cells.append(
                 CellView(
-                    text=in_unit(float(point[i, j]), unit),
+                    text=steps_text(float(point[i, j]), digits=3),
                     level=min(LEVELS - 1, int(LEVELS * share)),
                     capped=bool(capped[i, j]),
                     unsettled=bool(open_end[i, j]),

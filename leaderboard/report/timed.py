@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from qrlsuite.leaderboard.report.entries import EntryView
-from qrlsuite.leaderboard.times import TimeRanking, TimeRow, p_text, thousands
+from qrlsuite.leaderboard.times import TimeRanking, TimeRow, p_text
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Direction
 
@@ -56,13 +56,14 @@ def view(ranking: TimeRanking, entries: Mapping[int, EntryView]) -> TimesView:
 def _row(row: TimeRow, entry: EntryView, ranking: TimeRanking) -> TimeRowView:
     horizon = ranking.board.horizon
     low, high = row.mean.interval
+    mean, least, most = (steps_text(steps, digits=3) for steps in (row.mean.mean, low, high))
     shares = (f"{ranking.kind} {level}: {share:.0%}" for level, share in zip(ranking.levels, row.mean.at_cap))
     return TimeRowView(
         entry=entry,
         row=row,
         link=LINKS[row.joined],
-        mean=thousands(row.mean.mean),
-        interval=f"{thousands(low)} to {thousands(high)}",
+        mean=mean,
+        interval=f"{least} to {most}",
         low=100 * low / horizon,
         point=100 * row.mean.mean / horizon,
         high=100 * high / horizon,

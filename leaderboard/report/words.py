@@ -5,12 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 
-def in_unit(steps: float, unit: int) -> str:
-    """Write steps in multiples of a unit, with at most three digits."""
-    value = steps / unit
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
 def listed(items: Sequence[str]) -> str:
     """Join words: `a, b and c`."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

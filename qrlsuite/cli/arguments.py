@@ -31,7 +31,7 @@ EntryOption = Annotated[
     typer.Option(
         "--entry",
         metavar="ENTRY",
-        help="Only this entry (name or label, [TASK/] before it, or the beginning); for several, repeat --entry.",
+        help="Only this entry: its name or label, or the beginning of one, after [TASK/]. Repeatable.",
     ),
 ]
 HorizonOption = Annotated[
@@ -73,6 +73,6 @@ AcrossOption = Annotated[
     typer.Option(
         "--across",
         metavar="TASK TASK ...",
-        help="Entries that were trained on all of these tasks, over all of them.",
+        help="Compare entries that were trained on all of these tasks, by means over the tasks.",
     ),
 ]

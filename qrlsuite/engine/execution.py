@@ -178,7 +178,7 @@ def create(
         If there is no such engine, it has no such option or value, a package is not installed, or there can be
         no such device.
     """
-    devices.check(device)  # whether it is there is seen where the work is done
+    devices.check(device)  # the machine that trains checks whether it has this device
     built = api.create(engine, options or {})
     spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
     return Execution(built, built.workers(workers), device, spec.submits, engine, spec.remote or spec.submits)

@@ -23,7 +23,7 @@ ATTEMPTS = 3
 """Deaths of a group's worker, without a finished epoch between them, after which it is given up."""
 
 IGNORED = (signal.SIGUSR1, signal.SIGUSR2)
-"""Signals with which a cluster warns its jobs: they reach every process, and a worker is told by its supervisor."""
+"""Signals with which a cluster warns its jobs. They reach every process; a worker saves when its supervisor says so."""
 
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 
-def steps_text(steps: float, position: object = None) -> str:
-    """Write environment steps with at most four digits: 500, 44k, 107.9k, 1.25M, 8.6 billion.
+def steps_text(steps: float, position: object = None, digits: int = 4) -> str:
+    """Write environment steps in the unit that fits: 500, 44k, 107.9k, 1.25M, 8.6 billion.
 
     Parameters
     ----------
@@ -12,14 +12,16 @@ def steps_text(steps: float, position: object = None) -> str:
         A number of environment steps.
     position:
         Ignored: with it, the function is a matplotlib formatter of tick labels.
+    digits:
+        Written at most. Means have three: their intervals are wider than a fourth could say.
 
     >>> steps_text(107_900)
     '107.9k'
     """
     for size, unit in ((1e9, " billion"), (1e6, "M"), (1e3, "k")):
         if abs(steps) >= size:
-            return f"{steps / size:.4g}{unit}"
-    return f"{steps:.4g}"
+            return f"{steps / size:.{digits}g}{unit}"
+    return f"{steps:.{digits}g}"
 
 
 def hours_text(hours: float) -> str:

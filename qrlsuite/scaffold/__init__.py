@@ -213,11 +213,11 @@ def write(package: Package, out: Path) -> Path:
     Raises
     ------
     ScaffoldError
-        If the package's folder is there already, or cannot be written. Nothing is changed then.
+        If the package's folder exists already, or cannot be written. Nothing is changed then.
     """
     folder = out / package.name
     if folder.exists() or folder.is_symlink():
-        raise ScaffoldError(f"{folder} is there already and is left as it is: choose another name or --out")
+        raise ScaffoldError(f"{folder} exists already and is left unchanged: choose another name or --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{package.name}-", dir=out) as temporary:

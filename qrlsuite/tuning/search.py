@@ -7,7 +7,7 @@ finished on the disk, and ends with the same preset (but for the measured hours)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,7 @@ class Request:
     """
 
     task: str
-    model: str
+    model: str = ""
     algorithm: str | None = None
     settings: tuple[Setting, ...] = ()
     grid: space.GridFile | None = None
@@ -114,6 +114,15 @@ def split_model(text: str) -> tuple[str, tuple[Setting, ...]]:
     if not name or "=" in name:
         raise OptionError(f"--model '{text}': write a model and its settings, for example 'mlp width=16'")
     return name, tuple(options.parse_setting(word) for word in settings)
+
+
+def for_each_model(shared: Request, models: Iterable[str]) -> list[Request]:
+    """Return a request for each model and its settings (`mlp width=16`); all else is as in `shared`."""
+    requests = []
+    for text in models:
+        model, own = split_model(text)
+        requests.append(replace(shared, model=model, settings=(*shared.settings, *own)))
+    return requests
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from typer.testing import CliRunner
@@ -50,6 +51,21 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
     assert shown is not None
     assert shown[1] == f"{expected:.3f}"
     assert len({state["median_score"] for state in snapshot.values()}) == 2, "the groups must differ"
+
+
+@pytest.mark.parametrize(("again", "limit"), [("command", "--minutes"), ("call", "`minutes`")])
+def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
+    again: Literal["command", "call"],
+    limit: str,
+    entry: Entry,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plan = Plan(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
+    RunDisplay(plan, 1, again=again).out_of_time(1.5)
+    message = capsys.readouterr().err
+    assert "stopped after 1.5 min, at epoch 0 of 3" in message
+    assert f"The same {again} continues from there, and without {limit} to the end." in message
 
 
 def test_the_first_epoch_s_estimate_follows_its_slow_rounds() -> None:

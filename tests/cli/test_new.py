@@ -156,7 +156,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "acme-ring" / "notes.txt").write_text("mine")
     code, _, err = qrlsuite(capsys, "new", "plugin", "acme-ring", "--kind", "model", "--out", str(tmp_path))
     assert code == 2
-    assert "is there already and is left as it is" in err
+    assert "exists already and is left unchanged" in err
     assert [path.name for path in (tmp_path / "acme-ring").iterdir()] == ["notes.txt"]
 
 

@@ -55,6 +55,17 @@ def test_the_table_is_what_the_lines_were(train: Callable[..., Path]) -> None:
     assert folder.epochs() == rows[:2]
 
 
+def test_scores_are_read_and_those_that_cannot_be_are_refused(train: Callable[..., Path]) -> None:
+    folder = store.EntryStore(train("runs", [0], 1)).seed(0)
+    assert folder.read().scores.shape == (1, 5)
+    (row,) = folder.epochs()
+    folder.table.unlink()
+    for scores in ([], [None, 0.5]):
+        folder.lines.write_bytes(store.json_line({**row, "scores": scores}))
+        with pytest.raises(StoreError, match="must be finite and equally many in every epoch"):
+            folder.read()
+
+
 def test_another_format_version_is_refused(train: Callable[..., Path]) -> None:
     entry = train("runs", [0])
     content = json.loads((entry / "entry.json").read_text())

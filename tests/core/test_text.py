@@ -9,6 +9,7 @@ def test_steps_have_four_digits_at_most() -> None:
     steps = (0, 60, 999, 62_000, 58_150, 107_900, 1_000_000, 1_254_000, 8_600_000_000)
     written = ["0", "60", "999", "62k", "58.15k", "107.9k", "1M", "1.254M", "8.6 billion"]
     assert [text.steps_text(count) for count in steps] == written
+    assert text.steps_text(58_234.5, digits=3) == "58.2k"
 
 
 def test_times_are_in_the_unit_that_fits() -> None:

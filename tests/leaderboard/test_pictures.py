@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -126,6 +127,18 @@ def test_bars_have_the_height_of_s_hat_and_fade_at_the_cap() -> None:
     assert [patch.get_alpha() for patch in (first, second, third)] == [1, 1, 0.3]
     assert "≥" in texts(figure)
     assert "faded" in texts(figure)
+
+
+def test_bars_of_a_cell_stand_side_by_side_around_its_label() -> None:
+    entries = [*ENTRIES, learner("ddqn mlp width=8", 20)]
+    axes = pictures.draw("bars", entries, epsilons=[0.2, 0.3], deltas=[0.5]).axes[0]
+    for cell, tick in enumerate(axes.get_xticks()):
+        of_cell = bars(axes)[cell::2]  # they are drawn entry by entry
+        sides = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in of_cell]
+        assert np.mean(sides) == pytest.approx(tick)
+        assert all(right < left for (_, right), (left, _) in itertools.pairwise(sides)), "none covers another"
+        assert tick - 0.5 < sides[0][0]
+        assert sides[-1][1] < tick + 0.5
 
 
 def test_surface_writes_s_hat_in_thousands() -> None:

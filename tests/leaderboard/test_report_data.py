@@ -79,6 +79,19 @@ def test_arcs_that_a_chain_stands_for_are_left_out() -> None:
     assert (drawn.implied, drawn.chains_without_win) == (3, 0)
 
 
+def test_an_arc_reaches_the_further_the_more_rows_it_spans_and_stays_inside() -> None:
+    beats = np.zeros((7, 7), dtype=bool)
+    for start, end in ((0, 1), (1, 4), (0, 6)):
+        beats[start, end] = True
+    arcs = ladder.draw(beats, [1, 2, 2, 2, 3, 3, 3]).arcs
+    rows = {arc.end - arc.start: float(re.match(r"M6 [\d.]+C([\d.]+) ", arc.line)[1]) for arc in arcs}  # type: ignore[index]
+    reached = {
+        span: bend * 3 / 4 for span, bend in rows.items()
+    }  # of a cubic curve with these control points
+    assert reached[1] < 0.5 * reached[6]
+    assert reached[1] < reached[3] < reached[6] < ladder.WIDTH
+
+
 def test_a_chain_without_a_direct_win_is_counted() -> None:
     beats = np.triu(np.ones((3, 3), dtype=bool), 1)
     beats[0, 2] = False

@@ -59,7 +59,7 @@ def test_mean_times_places_and_differences_by_hand() -> None:
     low, high = found.rows[1].difference[1:]
     assert low < 121 / 21 - 1 < high
     assert (found.n_pairs, found.n_decided) == (3, 3)
-    assert found.cells(found.rows[1])[4].startswith("121.0k (")
+    assert found.cells(found.rows[1])[4].startswith("121k (")
 
 
 def test_neighbors_that_are_not_told_apart_are_joined() -> None:

@@ -34,13 +34,13 @@ class PartName(StrEnum):
 def calibrate(
     entries: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ENTRY]...", help="Entries of one task; by default all of it."),
+        typer.Argument(metavar="[ENTRY]...", help="Entries of one task; default: all entries of the task."),
     ] = None,
     rule: Annotated[
         list[str] | None,
         typer.Option("--rule", metavar="NAME", help="The rules; by default the four built-in ones."),
     ] = None,
-    task: Annotated[str | None, typer.Option("--task", help="Which task, where there are several.")] = None,
+    task: Annotated[str | None, typer.Option("--task", help="The task, if the folder holds several.")] = None,
     draws: Annotated[
         int,
         typer.Option(

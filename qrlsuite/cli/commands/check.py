@@ -29,7 +29,9 @@ def check(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="An option with which a single thing is checked."),
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Check a single plugin with this value of an option."
+        ),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:

@@ -17,7 +17,9 @@ from qrlsuite.leaderboard import tables
 def compare(
     first: Annotated[
         str,
-        typer.Argument(metavar="ENTRY", help="An entry: name or label, [TASK/] before it, or the beginning."),
+        typer.Argument(
+            metavar="ENTRY", help="An entry: its name or label, or the beginning of one, after [TASK/]."
+        ),
     ],
     second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
     task: AmongOption = None,

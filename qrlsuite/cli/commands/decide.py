@@ -56,7 +56,8 @@ def new(
         str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
     ],
     algorithm: Annotated[
-        str | None, typer.Option("--algorithm", help="Of entries that name none; default: the task's.")
+        str | None,
+        typer.Option("--algorithm", help="The algorithm of entries that name none; default: the task's."),
     ] = None,
     preset: Annotated[
         str | None, typer.Option("--preset", help="One of the task's presets of settings.")
@@ -74,7 +75,7 @@ def new(
         Spending.POCOCK
     ),
     margin: Annotated[
-        float, typer.Option("--margin", help="A smaller difference counts as none: 0.1 is 10 percent.")
+        float, typer.Option("--margin", help="Entries that differ by less count as equal: 0.1 is 10 percent.")
     ] = 0.1,
     first_seed: Annotated[
         int | None,
@@ -92,7 +93,7 @@ def new(
 ) -> None:
     """Write a plan: what is compared, at which numbers of seeds, and at which error. Trains nothing.
 
-    Every pair is compared. To ask less of more entries, add [[questions]] to the file, each with its pairs.
+    Every pair is compared. To compare only some pairs, add [[questions]] with these pairs to the file.
 
     Example: qrlsuite decide new width.toml "mlp width=64" "mlp width=32" --task beam6g
     """
@@ -201,7 +202,7 @@ def status(
 @app.command()
 def export(
     path: PlanArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/NAME/.")] = Path(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Write to DIR/NAME/.")] = Path(
         "leaderboard/plans"
     ),
     runs: RunsOption = Path("runs"),

@@ -48,7 +48,7 @@ def evaluate(
         typer.Option(
             "--backend",
             metavar="NAME",
-            help="Let the agents act on another circuit backend, too: native, pennylane, qiskit, or a plugin's.",
+            help="Also let the agents act on another circuit backend: native, pennylane, qiskit, or a plugin's.",
         ),
     ] = None,
     backend_set: Annotated[
@@ -70,13 +70,13 @@ def evaluate(
 ) -> None:
     """Play fresh episodes with an entry's best trained agents, and with reference policies.
 
-    The best agents are chosen by their last validation score; the episodes here are others, the same for every
-    policy, so the choice does not raise the result. Agents act as in validation. Shown are sums of rewards and,
+    The best agents are chosen by their last validation score; these episodes are new, and the same for every
+    policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
     others (beam6g: the optimal one and the nearest antenna).
 
-    With --backend the same agents act with shots, with noise or on a device, beside themselves as they were trained.
-    What this will take is said first. Finished episodes are kept, and not played again.
+    With --backend the same agents act with shots, with noise or on a device, beside themselves as they were
+    trained. The cost is printed first. Finished episodes are kept, and not played again.
 
     Example: qrlsuite evaluate vqc-native --backend qiskit --backend-set estimator=aer --backend-set shots=1000
 

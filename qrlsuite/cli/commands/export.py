@@ -24,11 +24,13 @@ from qrlsuite.results.text import counted
 def export(
     entries: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ENTRY]...", help="Names or labels, [TASK/] before them, or the beginnings."),
+        typer.Argument(
+            metavar="[ENTRY]...", help="Its name or label, or the beginning of one, after [TASK/]."
+        ),
     ] = None,
     task: TaskOption = None,
     everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to: DIR/TASK/ENTRY/.")] = Path(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Write to DIR/TASK/ENTRY/.")] = Path(
         "leaderboard/entries"
     ),
     rliable: Annotated[
@@ -53,7 +55,7 @@ def export(
 
     With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
     thresholds (in [0, 1], more is better), of every entry that was trained on all tasks of --across with the same
-    options. `dict(numpy.load("FILE.npz"))` is what rliable takes.
+    options. Read the file for rliable by `dict(numpy.load("FILE.npz"))`.
 
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """

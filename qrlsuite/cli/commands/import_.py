@@ -37,8 +37,8 @@ def import_entries(
 ) -> None:
     """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only what is missing.
 
-    Of a results folder agents and checkpoints come along. An export holds learning curves alone. Seeds that are here
-    already stay. Stop with Ctrl-C at any time; the same command continues.
+    From a results folder, agents and checkpoints are copied too. An export holds only learning curves. Seeds that
+    are here already stay. Stop with Ctrl-C at any time; the same command continues.
 
     Example: qrlsuite import /mnt/cluster/runs
     """

@@ -73,15 +73,15 @@ def leaderboard(
 ) -> None:
     """Rank the entries of each task by significant outperformance.
 
-    A tier is 1 + the longest chain of entries that outperform one another above it. Entries are compared at
-    equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: environment steps
-    until (and whenever) fewer than delta of the runs score 1 - epsilon, with its 5th to 95th percentile.
-    With --published, an entry that you trained less far than the published one is shown beside it.
+    A tier is 1 + the length of the longest chain of entries above that outperform one another. Entries are
+    compared at equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: the
+    environment steps at which fewer than a fraction delta of the runs score 1 - epsilon or more, with its 5th to
+    95th percentile. With --published, your own copy of a published entry is shown too if it has fewer epochs.
 
-    A second table ranks the same entries by mean time below threshold, with the differences in percent and the ranks
-    that the decided pairs leave, at one error probability for all pairs (--alpha). --across compares entries that were
-    trained on several tasks with the same options. The page also shows the plans of `qrlsuite decide` in the results
-    folder.
+    A second table ranks the same entries by mean time below threshold, with the differences in percent and the
+    ranks that are possible after all decided pairs, with one error probability for all pairs (--alpha). --across
+    compares entries that were trained on several tasks with the same options. The page also shows the plans of
+    `qrlsuite decide` in the results folder.
 
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """

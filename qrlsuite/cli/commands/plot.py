@@ -67,7 +67,8 @@ def plot(
 ) -> None:
     """Draw a picture from the results, or of a task's environment.
 
-    Entries that would cut the others to their own length are left out and named, unless --entry names them.
+    All entries of a picture are cut to the shortest. An entry that ends before the others is left out, and named,
+    unless --entry asks for it.
 
     Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface --set style=3d;
     qrlsuite plot trajectories --task beam6g --set environment.degree=5

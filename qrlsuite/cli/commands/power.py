@@ -34,7 +34,8 @@ POWERS = (0.8, 0.9)
 
 def power(
     first: Annotated[
-        str, typer.Argument(metavar="ENTRY", help="An entry like those to be compared, of two seeds or more.")
+        str,
+        typer.Argument(metavar="ENTRY", help="An entry like those to compare, with two seeds or more."),
     ],
     second: Annotated[
         str | None, typer.Argument(metavar="[ENTRY]", help="Another one, to be told apart from the first.")
@@ -49,8 +50,9 @@ def power(
 ) -> None:
     """Say how many seeds it takes to find that another entry is 10, 25 or 50 percent slower than this one.
 
-    Of two entries: how many it takes to find the difference between them, too. Pairs are simulated from the curves
-    and judged by rule `times` at alpha = .05: all seeds at once, and by a plan as `qrlsuite decide` runs it.
+    For two entries, also say how many it takes to find the difference between them. Pairs are simulated from the
+    curves and judged by rule `times` at alpha = .05: all seeds at once, and by a plan as `qrlsuite decide` runs
+    it.
 
     Example: qrlsuite power "mlp width=64" --published
     """

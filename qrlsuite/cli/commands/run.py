@@ -90,7 +90,7 @@ def run(
     device: DeviceOption = "cpu",
     track: TrackOption = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Go on where training would take more than a day.")
+        bool, typer.Option("--yes", help="Also start a training that will take more than a day.")
     ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,

@@ -31,7 +31,7 @@ def runs(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENTRY]...", help="For rm: name or label, [TASK/] before it, or the beginning."
+            metavar="[ENTRY]...", help="For rm: its name or label, or the beginning of one, after [TASK/]."
         ),
     ] = None,
     task: TaskOption = None,

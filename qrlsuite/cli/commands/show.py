@@ -49,7 +49,7 @@ def show(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Show a thing's options with their defaults and meaning, a task's protocol, an entry's provenance.
+    """Show options with their defaults and meaning, a task's protocol, or how an entry was made.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4
     """

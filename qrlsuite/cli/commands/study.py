@@ -53,7 +53,7 @@ MapOption = Annotated[
     typer.Option(
         "--model-map",
         metavar="MODEL=MODEL",
-        help="Another model in the place of one: vqc-native=vqc-pennylane.",
+        help="Replace a model by another one: vqc-native=vqc-pennylane.",
     ),
 ]
 OnlyOption = Annotated[
@@ -61,7 +61,7 @@ OnlyOption = Annotated[
     typer.Option(
         "--only",
         metavar="WORD",
-        help="Only entries whose group, label or task has the word, or one of several; or one entry by name.",
+        help="Only entries with this word in group, label or task, or with this name. Repeatable.",
     ),
 ]
 OutOption = Annotated[

@@ -165,43 +165,31 @@ def tune(
     if out is not None and (len(models) > 1 or out.suffix != ".toml"):
         raise OptionError(f"--out {out}: one file ending in .toml, for one model")
     limit = None if budget is None else seconds(budget)
-    shared = tuple(options.parse_setting(word) for word in settings or [])
-    requests = []
-    for text in models:
-        model, own = search.split_model(text)
-        requests.append(
-            search.Request(
-                task=task,
-                model=model,
-                algorithm=algorithm,
-                settings=(*shared, *own),
-                grid=None if grid is None else space.load(grid),
-                varied=tuple(space.parse_varied(word) for word in vary or []),
-                sampler=sampler.value if sampler else search.default_sampler(grid or vary),
-                trials=trials,
-                core_hours=core_hours,
-                sampler_seed=sampler_seed,
-                seeds=search.tuning_seeds(seeds),
-                epochs=epochs,
-                objective=objective.value,
-            )
-        )
-    searches = runner.build(requests, runs)
+    shared = search.Request(
+        task=task,
+        algorithm=algorithm,
+        settings=tuple(options.parse_setting(word) for word in settings or []),
+        grid=None if grid is None else space.load(grid),
+        varied=tuple(space.parse_varied(word) for word in vary or []),
+        sampler=sampler.value if sampler else search.default_sampler(grid or vary),
+        trials=trials,
+        core_hours=core_hours,
+        sampler_seed=sampler_seed,
+        seeds=search.tuning_seeds(seeds),
+        epochs=epochs,
+        objective=objective.value,
+    )
+    searches = runner.build(search.for_each_model(shared, models), runs)
     execution = execution_of(engine, workers, partition, time, engine_options, device)
     display = TuneDisplay(searches, execution, quiet=json_output)
     display.begin()
     if dry_run:
         if json_output:
-            typer.echo(
-                json.dumps({"searches": [search.as_dict(each) for each in searches], "complete": False})
-            )
+            content = {"searches": [search.as_dict(each) for each in searches], "complete": False}
+            typer.echo(json.dumps(content))
         return
-    planned = sum(each.planned for each in searches)
-    if planned > LARGE and not yes and limit is None:
-        raise OptionError(
-            f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "
-            "--sampler one-at-a-time or --sampler random --trials 50 tries fewer"
-        )
+    if not yes and limit is None:
+        _require_few(searches)
     try:
         complete = runner.run(searches, runs, execution, display, limit, out)
     except KeyboardInterrupt:
@@ -216,6 +204,15 @@ def tune(
     _report(searches, runs, complete)
     if not complete and not any(each.trials or each.pending for each in searches):
         raise OptionError("--budget does not hold one trial: give more time, or fewer --seeds or --epochs")
+
+
+def _require_few(searches: Sequence[Search]) -> None:
+    planned = sum(each.planned for each in searches)
+    if planned > LARGE:
+        raise OptionError(
+            f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "
+            "--sampler one-at-a-time or --sampler random --trials 50 tries fewer"
+        )
 
 
 def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
