@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,10 +12,12 @@ import pytest
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
+from rich.console import Console
 from torch import Tensor, nn
 
 from qrlsuite import population
 from qrlsuite.engine import execution, local, worker
+from qrlsuite.engine.display import Bar
 from qrlsuite.errors import PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Tuned, parse_setting
@@ -253,6 +256,27 @@ def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -
         )
         found = Halving(wanted, tmp_path) if sampler == "halving" else search.Search(wanted, tmp_path)
         assert found.beside == beside, words
+
+
+def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp_path: Path) -> None:
+    by = execution.Execution(local.LocalEngine(), 1)
+    found = halving(tiny_task, tmp_path)
+    shown = io.StringIO()
+    display = TuneDisplay([found], by)
+    display.console = Console(force_terminal=True, width=120, file=shown)
+    display.bar = Bar(display.console)
+
+    def train(chosen: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
+        begun = [execution.plan(found.runs, entry, by, seeds, epochs) for entry in chosen]
+        display.begin_trials(begun)
+        display.training(begun)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        found.step(train, by.room)
+    display.interrupted()
+    assert "trials 1-2/7  epoch 0/1" in shown.getvalue()
+    assert "every finished epoch is saved" in shown.getvalue()
 
 
 def preset(found: Halving) -> str:
