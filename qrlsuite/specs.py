@@ -198,13 +198,15 @@ class CircuitBackendSpec(Spec):
         Reference to a pydantic dataclass.
     factory:
         Reference to `factory(circuit, options) -> backend`, see `qrlsuite.circuit.api.CircuitBackend`.
-    mean_field:
-        Whether it computes `Circuit.mean_field` too; where not, such a circuit is refused before it gets there.
+    mean_field, products:
+        Whether it computes `Circuit.mean_field` too, and measures products of Pauli Z (`Circuit.measured`); where not,
+        such a circuit is refused before it gets there.
     """
 
     options: str
     factory: str
     mean_field: bool = False
+    products: bool = False
 
 
 @dataclass(frozen=True, slots=True)

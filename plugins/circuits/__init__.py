@@ -36,6 +36,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             options=f"{_HERE}.options:NativeOptions",
             factory=f"{_HERE}.native:NativeBackend",
             mean_field=True,
+            products=True,
         )
     )
     register(
@@ -44,6 +45,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             summary="Any PennyLane device by name; options: device, diff_method, shots",
             options=f"{_HERE}.options:PennyLaneOptions",
             factory=f"{_HERE}.pennylane:PennyLaneBackend",
+            products=True,
         )
     )
     register(
@@ -52,5 +54,6 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             summary="Qiskit's simulator Aer; options: estimator, gradient, shots, noise_model",
             options=f"{_HERE}.options:QiskitOptions",
             factory=f"{_HERE}.qiskit:QiskitBackend",
+            products=True,
         )
     )

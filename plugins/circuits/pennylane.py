@@ -195,7 +195,10 @@ class PennyLaneBackend:
             rows = list(angles) if self.table.count else []
             for operation, indices in zip(self.circuit, self.table.rows):
                 _apply(operation, _arguments(indices, rows))
-            return [qml.expval(qml.PauliZ(q)) for q in self.circuit.observables]
+            return [
+                qml.expval(qml.prod(*map(qml.PauliZ, qubits)) if len(qubits) > 1 else qml.PauliZ(qubits[0]))
+                for qubits in self.circuit.measured
+            ]
 
         # The shift rule is applied outside, so that the QNode need not be differentiable.
         method = None if self.diff_method == "parameter-shift" else self.diff_method

@@ -80,11 +80,13 @@ class QiskitBackend:
         self.gradient_circuits = 2 if self.gradient == "spsa" else 2 * self.elementary.rotations
         self._native = NativeBackend(circuit) if self.gradient == "adjoint" else None
         self._circuit = quantum_circuit(self.elementary, circuit.qubits)
-        self._measured = list(circuit.observables)
+        self._products = circuit.measured
+        self._measured = sorted({q for qubits in self._products for q in qubits})
         self._simulator = _simulator(options, circuit.qubits)
         self._samples = self.shots is not None and options.estimator == "aer"
         self.observables = [
-            SparsePauliOp.from_sparse_list([("Z", [q], 1.0)], circuit.qubits) for q in self._measured
+            SparsePauliOp.from_sparse_list([("Z" * len(qubits), qubits, 1.0)], circuit.qubits)
+            for qubits in self._products
         ]
         self._executed = self._circuit
         if self._samples:
@@ -185,7 +187,8 @@ class QiskitBackend:
         (result,) = estimator.run([pub]).result()
         means = np.asarray(result.data.evs, np.float64).reshape(len(self.observables), -1).T
         if self.options.noise_model is not None:  # the density matrix is before the readout
-            means = means * (1.0 - 2.0 * self.options.readout_error)
+            weights = [len(qubits) for qubits in self._products]
+            means = means * (1.0 - 2.0 * self.options.readout_error) ** np.array(weights)
         return np.broadcast_to(means, (len(rotations), len(self.observables)))
 
     def _count(self, rotations: NDArray[np.float64], number: int) -> NDArray[np.float64]:
@@ -198,12 +201,16 @@ class QiskitBackend:
         given = {"parameter_binds": [binds]} if binds else {}
         copies = self._executed if binds else [self._executed] * lanes
         result = self._simulator.run(copies, shots=shots, seed_simulator=number, **given).result()
-        means = np.empty((lanes, len(self._measured)))
+        place = {qubit: bit for bit, qubit in enumerate(self._measured)}
+        members = np.zeros((len(place), len(self._products)), np.int64)
+        for o, qubits in enumerate(self._products):
+            members[[place[q] for q in qubits], o] = 1
+        means = np.empty((lanes, len(self._products)))
         for lane, experiment in enumerate(result.results):
             counts = experiment.data.counts
             outcomes = np.array([int(outcome, 16) for outcome in counts])
-            bits = outcomes[:, None] >> np.arange(len(self._measured)) & 1
-            means[lane] = 1.0 - 2.0 * np.array(list(counts.values())) @ bits / shots
+            odd = ((outcomes[:, None] >> np.arange(len(place)) & 1) @ members) % 2
+            means[lane] = 1.0 - 2.0 * np.array(list(counts.values())) @ odd / shots
         return means
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from qrlsuite.circuit.description import Circuit
+from qrlsuite.errors import CircuitError
 
 
 class AngleTable:
@@ -45,6 +46,8 @@ class AngleTable:
                 if angle.input is None and angle.weight is None:
                     rows.append(angle.constant)
                     continue
+                if angle.factor is not None:
+                    raise CircuitError("products of inputs are written as inputs by `create_backend`")
                 rows.append(len(constant))
                 constant.append(angle.constant)
                 self.controlled.append(operation.control is not None)

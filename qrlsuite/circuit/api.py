@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from qrlsuite.circuit.description import MAX_QUBITS, Circuit, mean_field_refusal
+from qrlsuite.circuit.description import MAX_QUBITS, Circuit, mean_field_refusal, without_products
 from qrlsuite.errors import OptionError, nearest
 
 if TYPE_CHECKING:
@@ -126,8 +126,45 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
     from qrlsuite import specs
 
     spec, chosen = _backend(name, circuit, options)
-    backend: CircuitBackend = specs.resolve(spec.factory)(circuit, chosen)
-    return backend
+    return _make(specs.resolve(spec.factory), circuit, chosen)
+
+
+class _WithProducts:
+    """A backend of a circuit whose angles have products of inputs, which the backend gets as further inputs."""
+
+    def __init__(self, backend: CircuitBackend, products: tuple[tuple[int, int], ...]) -> None:
+        self.backend = backend
+        self.products = products
+        self.shots = backend.shots
+        for name in ("draws", "gradient_circuits", "simulator"):
+            if hasattr(backend, name):
+                setattr(self, name, getattr(backend, name))
+
+    def __call__(
+        self,
+        inputs: torch.Tensor,
+        parameters: Mapping[str, torch.Tensor],
+        seeds: Sequence[int] | None = None,
+    ) -> torch.Tensor:
+        """Return expectation values, see `CircuitBackend`."""
+        return self.backend(extended(inputs, self.products), parameters, seeds)
+
+
+def extended(inputs: torch.Tensor, products: Sequence[tuple[int, int]]) -> torch.Tensor:
+    """Return inputs (..., in) with products of two of them behind, see `without_products`."""
+    import torch
+
+    if not products:
+        return inputs
+    first, second = zip(*products)
+    return torch.cat([inputs, inputs[..., list(first)] * inputs[..., list(second)]], dim=-1)
+
+
+def _make(factory: Any, circuit: Circuit, chosen: Any) -> CircuitBackend:
+    """Return the backend of a circuit."""
+    plain, products = without_products(circuit)
+    backend: CircuitBackend = factory(plain, chosen)
+    return _WithProducts(backend, products) if products else backend
 
 
 def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[CircuitBackendSpec, Any]:
@@ -138,6 +175,12 @@ def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[C
     spec = registry.circuit_backend(name)
     if circuit.mean_field and not spec.mean_field:
         raise OptionError(mean_field_refusal(name))
+    if circuit.measures_products and not spec.products:
+        raise OptionError(f"backend '{name}' measures Pauli Z of single qubits, and not products of them")
+    if circuit.measures_products and circuit.mean_field:
+        raise OptionError(
+            "a mean-field approximation has no correlations, and so no products of Pauli Z to measure"
+        )
     return spec, option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
 
 
@@ -166,7 +209,7 @@ def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> Circuit
         kept.move_to_end(key)
         return kept[key]
     # A copy: a backend may read its circuit at every call, and the caller may append to it.
-    backend: CircuitBackend = specs.resolve(spec.factory)(copy.deepcopy(circuit), chosen)
+    backend = _make(specs.resolve(spec.factory), copy.deepcopy(circuit), chosen)
     kept[key] = backend
     if len(kept) > PREPARED:
         kept.popitem(last=False)
@@ -206,7 +249,7 @@ def expectations(
     Returns
     -------
     Tensor
-        (B, len(circuit.observables)): the expectation values of Pauli Z, in [-1, 1].
+        (B, len(circuit.observables)): the expectation values of its observables, in [-1, 1].
 
     Raises
     ------

@@ -5,8 +5,9 @@ A `Circuit` is a list of operations on qubits 0..n-1. Every rotation angle is af
     angle = constant + scale * input + weight
 
 where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale
-with an input present counts as 1). Reading order is application order. Qubit 0 is the most significant bit of
-a basis state's index, as in PennyLane. The measured observables are Pauli Z on chosen qubits (default: every).
+with an input present counts as 1), and `input` may be a product of two inputs. Reading order is application order.
+Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured observables are Pauli Z on
+chosen qubits (default: every), or products of them.
 
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
@@ -69,11 +70,15 @@ GATES: dict[str, GateSignature] = {
 `U3(t, p, d) = [[cos t/2, -e^{id} sin t/2], [e^{ip} sin t/2, e^{i(p+d)} cos t/2]]`.
 """
 
-COMPOSED = {
-    "RZZ": "CNOT (a, b), RZ b, CNOT (a, b)",
-    "RXX": "H a, H b, CNOT (a, b), RZ b, CNOT (a, b), H a, H b",
-    **{f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"},
+ISING: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
+    "RXX": (("H", ()), ("H", ())),
+    "RYY": (("RX", (math.pi / 2,)), ("RX", (-math.pi / 2,))),
+    "RZZ": (),
 }
+"""Rotations exp(-i a PP / 2) of two qubits, which `Circuit.append` writes as CNOT, RZ, CNOT: by what turns both qubits
+before, and back after."""
+
+COMPOSED = {f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"}
 """Gates that others have, and how to append them here."""
 
 
@@ -87,19 +92,37 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Angle:
-    """`constant + scale * input + weight`, in radians. Built with `+` and `*` from inputs and parameters."""
+    """`constant + scale * input + weight`, in radians. Built with `+` and `*` from inputs and parameters.
+
+    Attributes
+    ----------
+    factor:
+        A second input, by which the first is multiplied.
+    """
 
     constant: float = 0.0
     input: int | None = None
     scale: Element | None = None
     weight: Element | None = None
+    factor: int | None = None
 
     def __mul__(self, other: Angle) -> Angle:
-        """Multiply an input by a trainable scale (in either order); nothing else may be multiplied."""
+        """Multiply an input by another one or by a trainable scale (in any order); nothing else may be multiplied."""
         for a, b in ((self, other), (other, self)):
             if isinstance(b, Angle) and a.is_bare_input and b.is_bare_weight:
-                return Angle(input=a.input, scale=b.weight)
-        raise CircuitError("an angle is affine: only input * parameter can be multiplied")
+                return Angle(input=a.input, scale=b.weight, factor=a.factor)
+            if isinstance(b, Angle) and a.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
+                return Angle(input=a.input, factor=b.input)
+            if (
+                isinstance(b, Angle)
+                and a._is_scaled_input
+                and b.is_bare_input
+                and a.factor is b.factor is None
+            ):
+                return Angle(input=a.input, scale=a.scale, factor=b.input)
+        raise CircuitError(
+            "an angle is affine: only input * parameter, input * input and input * input * parameter can be multiplied"
+        )
 
     def __add__(self, other: Angle | float) -> Angle:
         """Add two angles: at most one input term and one weight may remain."""
@@ -115,14 +138,21 @@ class Angle:
             input=term.input,
             scale=term.scale,
             weight=self.weight or other.weight,
+            factor=term.factor,
         )
 
     __radd__ = __add__
 
     @property
     def is_bare_input(self) -> bool:
-        """Whether this is an input and nothing else."""
+        """Whether this is an input, or a product of two, and nothing else."""
         return self.input is not None and self.scale is None and self.weight is None and self.constant == 0.0
+
+    @property
+    def _is_scaled_input(self) -> bool:
+        return (
+            self.input is not None and self.scale is not None and self.weight is None and self.constant == 0.0
+        )
 
     @property
     def is_bare_weight(self) -> bool:
@@ -197,7 +227,7 @@ class Circuit:
         self.mean_field = mean_field
         self.parameters: dict[str, Parameter] = {}
         self._operations: list[Operation] = []
-        self._observables: tuple[int, ...] = tuple(range(qubits))
+        self._observables: tuple[int | tuple[int, ...], ...] = tuple(range(qubits))
 
     @property
     def operations(self) -> tuple[Operation, ...]:
@@ -205,17 +235,40 @@ class Circuit:
         return tuple(self._operations)
 
     @property
-    def observables(self) -> tuple[int, ...]:
-        """The qubits whose Pauli Z is measured, in output order."""
+    def observables(self) -> tuple[int | tuple[int, ...], ...]:
+        """What is measured, in output order: the qubit of a Pauli Z, or the qubits of a product of several."""
         return self._observables
 
-    def measure(self, wires: Sequence[int]) -> None:
-        """Measure Pauli Z on these qubits, in this order, instead of on all."""
-        if not wires or len(set(wires)) != len(wires) or not all(0 <= w < self.qubits for w in wires):
+    @property
+    def measured(self) -> tuple[tuple[int, ...], ...]:
+        """The qubits of every observable, in output order: it is the product of their Pauli Z."""
+        return tuple((o,) if isinstance(o, int) else o for o in self._observables)
+
+    @property
+    def measures_products(self) -> bool:
+        """Whether some observable is a product."""
+        return any(not isinstance(o, int) for o in self._observables)
+
+    def measure(self, wires: Sequence[int | Sequence[int]]) -> None:
+        """Measure these observables, in this order, instead of Pauli Z on every qubit.
+
+        Parameters
+        ----------
+        wires:
+            A qubit stands for its Pauli Z, several qubits for the product of theirs: `measure([0, (1, 2)])` measures
+            Z_0 and Z_1 Z_2.
+        """
+        groups = [(w,) if isinstance(w, int) else tuple(w) for w in wires]
+        if (
+            not groups
+            or len(set(map(frozenset, groups))) != len(groups)
+            or any(not g or len(set(g)) != len(g) or not all(0 <= w < self.qubits for w in g) for g in groups)
+        ):
             raise CircuitError(
-                f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1} are needed"
+                f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1}, or distinct groups of them, are "
+                "needed"
             )
-        self._observables = tuple(int(w) for w in wires)
+        self._observables = tuple(int(g[0]) if len(g) == 1 else tuple(map(int, g)) for g in groups)
 
     def input(self, index: int) -> Angle:
         """Return input feature `index` as an angle (radians)."""
@@ -244,17 +297,20 @@ class Circuit:
         Parameters
         ----------
         gate:
-            A key of `GATES`.
+            A key of `GATES`; or RXX, RYY, RZZ, which are appended as the CNOTs and rotations that they are made of.
         wires:
-            The qubit, or (control, target) for CNOT, or the pair for CZ and SWAP.
+            The qubit, or (control, target) for CNOT, or the pair for CZ, SWAP, RXX, RYY and RZZ.
         angles:
             As many as the gate takes, in radians.
         control:
             Apply the gate only where this qubit is 1 (rotations only).
         """
+        if gate in ISING:
+            self._append_ising(gate, wires, angles, control)
+            return
         if gate not in GATES:
             hint = COMPOSED.get(gate.upper())
-            known = f"; write it as {hint}" if hint else nearest(gate, GATES)
+            known = f"; write it as {hint}" if hint else nearest(gate, [*GATES, *ISING])
             raise CircuitError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]
         targets = (wires,) if isinstance(wires, int) else tuple(wires)
@@ -272,11 +328,35 @@ class Circuit:
             self._check(angle)
         self._operations.append(Operation(gate, targets, exact, control))
 
+    def _append_ising(
+        self,
+        gate: str,
+        wires: int | Sequence[int],
+        angles: Sequence[Angle | float],
+        control: int | None,
+    ) -> None:
+        pair = (wires,) if isinstance(wires, int) else tuple(wires)
+        if len(pair) != 2 or len(angles) != 1 or control is not None:
+            raise CircuitError(f"{gate} takes 2 wires, 1 angle and no control")
+        turns = ISING[gate]
+        for name, values in turns[:1]:
+            for wire in pair:
+                self.append(name, wire, *values)
+        self.append("CNOT", pair)
+        self.append("RZ", pair[1], *angles)
+        self.append("CNOT", pair)
+        for name, values in turns[1:]:
+            for wire in pair:
+                self.append(name, wire, *values)
+
     def _check(self, angle: Angle) -> None:
         if not math.isfinite(angle.constant):
             raise CircuitError("an angle's constant must be finite")
-        if angle.input is not None and not 0 <= angle.input < self.inputs:
-            raise CircuitError(f"input {angle.input}: this circuit has inputs 0..{self.inputs - 1}")
+        for feature in (angle.input, angle.factor):
+            if feature is not None and not 0 <= feature < self.inputs:
+                raise CircuitError(f"input {feature}: this circuit has inputs 0..{self.inputs - 1}")
+        if angle.factor is not None and angle.input is None:
+            raise CircuitError("a second input needs a first one to multiply")
         if angle.scale is not None and angle.input is None:
             raise CircuitError("a scale needs an input to multiply")
         for element in (angle.scale, angle.weight):
@@ -287,13 +367,13 @@ class Circuit:
                 raise CircuitError(f"the angle uses {element}, which this circuit does not declare")
 
     def components(self) -> list[list[int]]:
-        """Return the qubits in groups that gates connect, directly or through others: each group in rising order.
+        """Return the qubits in groups that gates or observables connect, directly or through others: each in order.
 
         Without an entangling gate every qubit is a group of its own.
         """
         group = {q: {q} for q in range(self.qubits)}
-        for operation in self._operations:
-            first, *others = operation.qubits
+        for connected in [*(operation.qubits for operation in self._operations), *self.measured]:
+            first, *others = connected
             for other in others:
                 if group[other] is not group[first]:
                     group[first] |= group[other]
@@ -345,6 +425,39 @@ class Circuit:
     def __repr__(self) -> str:
         kind = ", mean_field=True" if self.mean_field else ""
         return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count}{kind})"
+
+
+def without_products(circuit: Circuit) -> tuple[Circuit, tuple[tuple[int, int], ...]]:
+    """Write products of inputs as inputs of their own, behind the others.
+
+    Returns
+    -------
+    tuple
+        A circuit without products (the same one where it has none), and the two factors of each further input.
+    """
+    pairs = [
+        (angle.input, angle.factor)
+        for operation in circuit
+        for angle in operation.angles
+        if angle.input is not None and angle.factor is not None
+    ]
+    if not pairs:
+        return circuit, ()
+    products = tuple(dict.fromkeys(pairs))
+    plain = Circuit(circuit.qubits, circuit.inputs + len(products), circuit.mean_field)
+    plain.parameters = dict(circuit.parameters)
+    for operation in circuit:
+        angles = [
+            angle
+            if angle.input is None or angle.factor is None
+            else replace(
+                angle, input=circuit.inputs + products.index((angle.input, angle.factor)), factor=None
+            )
+            for angle in operation.angles
+        ]
+        plain.append(operation.gate, operation.wires, *angles, control=operation.control)
+    plain.measure(circuit.observables)
+    return plain, products
 
 
 def mean_field_refusal(backend: str) -> str:

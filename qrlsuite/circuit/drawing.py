@@ -26,7 +26,8 @@ def angle_text(angle: Angle) -> str:
     terms = []
     if angle.input is not None:
         scale = "" if angle.scale is None else f"{angle.scale.parameter}[{angle.scale.index}]*"
-        terms.append(f"{scale}x{angle.input}")
+        factor = "" if angle.factor is None else f"*x{angle.factor}"
+        terms.append(f"{scale}x{angle.input}{factor}")
     if angle.weight is not None:
         terms.append(f"{angle.weight.parameter}[{angle.weight.index}]")
     if angle.constant or not terms:

@@ -44,9 +44,11 @@ def expectation_values(
         state = np.moveaxis(state, range(k), wires)
     probabilities = np.abs(state) ** 2
     values = []
-    for wire in circuit.observables:
-        marginal = probabilities.sum(axis=tuple(q for q in range(n) if q != wire))
-        values.append(float(marginal[0] - marginal[1]))
+    for qubits in circuit.measured:
+        signs = np.ones((2,) * n)
+        for q in qubits:
+            signs = signs * np.array([1.0, -1.0]).reshape([2 if axis == q else 1 for axis in range(n)])
+        values.append(float((signs * probabilities).sum()))
     return np.array(values)
 
 
@@ -64,14 +66,15 @@ def _mean_field_values(
         a, b = operation.qubits
         together = (matrix @ np.kron(states[a], states[b]) @ matrix.conj().T).reshape(2, 2, 2, 2)
         states[a], states[b] = np.einsum("ikjk->ij", together), np.einsum("kikj->ij", together)
-    return np.array([float(np.trace(_Z @ states[q]).real) for q in circuit.observables])
+    return np.array([float(np.trace(_Z @ states[q]).real) for (q,) in circuit.measured])
 
 
 def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:
     value = angle.constant
     if angle.input is not None:
         scale = 1.0 if angle.scale is None else parameters[angle.scale.parameter].flat[angle.scale.index]
-        value += float(scale * inputs[angle.input])
+        factor = 1.0 if angle.factor is None else inputs[angle.factor]
+        value += float(scale * inputs[angle.input] * factor)
     if angle.weight is not None:
         value += float(parameters[angle.weight.parameter].flat[angle.weight.index])
     return value

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit
+from qrlsuite.circuit.api import extended
+from qrlsuite.circuit.description import without_products
 from qrlsuite.plugins.circuits.native.program import (
     AXIS_X,
     AXIS_Y,
@@ -47,8 +49,9 @@ def states(circuit: Circuit, inputs: Tensor, flat: Tensor) -> Tensor:
 
     Qubit 0 is the highest bit of a basis state's index.
     """
-    program = compile_circuit(circuit)
-    angles = _angles(program, inputs, flat)
+    plain, factors = without_products(circuit)
+    program = compile_circuit(plain)
+    angles = _angles(program, extended(inputs, factors), flat)
     angles = angles.reshape(inputs.shape[0] * inputs.shape[1], -1 if angles.shape[2] else 0)
     together = torch.ones(len(angles), 1, dtype=COMPLEX[angles.dtype], device=angles.device)
     for component in _components(program):
@@ -128,9 +131,8 @@ class _DenseExpectations(torch.autograd.Function):
                 _apply(program, component.qubits, state, step, angles)
         ctx.program = program
         ctx.save_for_backward(angles, *states)
-        diagonals = [_diagonals(program, component, angles) for component in _components(program)]
         total = angles.new_zeros((len(angles), len(program.observables)))
-        for state, diagonal in zip(states, diagonals):
+        for state, diagonal in zip(states, diagonals(program, angles)):
             total += state.abs().square() @ diagonal
         return total
 
@@ -165,12 +167,32 @@ def _steps(program: Program, component: Component) -> list[list[int]]:
     return steps
 
 
+def diagonals(program: Program, like: Tensor) -> list[Tensor]:
+    """Return every component's diagonals of all observables, (2^n, O) each; type and device are those of `like`."""
+    return [_diagonals(program, component, like) for component in _components(program)]
+
+
 def _diagonals(program: Program, component: Component, angles: Tensor) -> Tensor:
     """Return the diagonals of the observables on a component, (2^n, O): +1 or -1, 0 where one is not on it."""
-    states = torch.arange(1 << component.qubits, device=angles.device)
-    bits = torch.from_numpy(program.observables).to(angles.device) - component.bit
-    here = ((bits >= 0) & (bits < component.qubits)).to(angles.dtype)
-    return here * (1 - 2 * ((states[:, None] >> bits.clamp(0, component.qubits - 1)) & 1)).to(angles.dtype)
+    basis = torch.arange(1 << component.qubits, device=angles.device)
+    number = [tuple(row) for row in program.components.tolist()].index(component)
+    columns = []
+    for index in program.observables.tolist():
+        bit = index - component.bit
+        owner, mask = (
+            program.products[index - program.qubits]
+            if index >= program.qubits
+            else (number, 1 << max(bit, 0))
+        )
+        if owner != number or (index < program.qubits and not 0 <= bit < component.qubits):
+            columns.append(torch.zeros_like(basis))
+            continue
+        odd = torch.zeros_like(basis)
+        for place in range(component.qubits):
+            if mask >> place & 1:
+                odd ^= basis >> place & 1
+        columns.append(1 - 2 * odd)
+    return torch.stack(columns, dim=1).to(angles)
 
 
 def _begin(component: Component, angles: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ from qrlsuite.plugins.circuits.native.vectors import LANES, load, splat, store, 
 
 Tables = namedtuple(
     "Tables",
-    "components steps angles constants rotations factors blocks cycles negative observables",
+    "components steps angles constants rotations factors blocks cycles negative products observables",
 )
 """A program's arrays, see `Program` for each, in the form that kernels take."""
 
@@ -73,8 +73,9 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
 
 
 def scratch(program: Program, lanes: int, dtype: Any) -> Scratch:
-    """Allocate working memory: inputs (I, V), values (2^n of the largest component, V), results (n, V)."""
-    rows = (program.inputs, 1 << int(program.components[:, 0].max()), program.qubits)
+    """Allocate working memory: inputs (I, V), values (2^n of the largest component, V), results (n + Q, V)."""
+    results = program.qubits + len(program.products)
+    rows = (program.inputs, 1 << int(program.components[:, 0].max()), results)
     return Scratch(*(aligned((count, lanes), dtype) for count in rows))
 
 
@@ -183,14 +184,32 @@ def _run(t: Any, states: Any, gates: Any) -> None:
 
 
 @inlined
+def _odd(state: int) -> int:
+    """Return whether an odd number of bits is set."""
+    odd = 0
+    while state:
+        odd ^= 1
+        state &= state - 1
+    return odd
+
+
+@inlined
 def _measure(t: Any, states: Any, w: Any) -> None:
-    """Write <Z> of every bit to `results`: fold the probabilities, highest bit first."""
+    """Write <Z> of every bit to `results`: fold the probabilities, highest bit first. Products come before, in sums."""
+    products = w.results.shape[0] - t.products.shape[0]
     for c in range(t.components.shape[0]):
         qubits, state = _component(t, c, states)
         size = 1 << qubits
         for i in range(size):
             re, im = load(state, 2 * i), load(state, 2 * i + 1)
             store(w.values, i, re * re + im * im)
+        for p in range(t.products.shape[0]):
+            if t.products[p, 0] == c:
+                mean = splat(w.values, 0.0)
+                for i in range(size):
+                    x = load(w.values, i)
+                    mean = mean - x if _odd(i & t.products[p, 1]) else mean + x
+                store(w.results, products + p, mean)
         for bit in range(qubits - 1, -1, -1):
             size >>= 1
             difference = splat(w.values, 0.0)
@@ -244,6 +263,12 @@ def _weigh(t: Any, cotangent: Any, seed: int, first: int, final: Any, psi: Any, 
                 f = load(w.values, i)
                 store(w.values, 2 * i, f + g)
                 store(w.values, 2 * i + 1, f - g)
+        for p in range(t.products.shape[0]):
+            if t.products[p, 0] == c:
+                g = load(w.results, w.results.shape[0] - t.products.shape[0] + p)
+                for i in range(1 << qubits):
+                    f = load(w.values, i)
+                    store(w.values, i, f - g if _odd(i & t.products[p, 1]) else f + g)
         for i in range(1 << qubits):
             f = load(w.values, i)
             j = 2 * (start + i)

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.circuit.description import Angle, Circuit, Operation
+from qrlsuite.errors import CircuitError
 
 AXIS_X, AXIS_Y, AXIS_Z, PHASE = 0, 1, 2, 3
 ROTATE, HADAMARD, PERMUTE, SIGN = 0, 1, 2, 3
@@ -91,8 +92,10 @@ class Program:
         (X,) int64: basis states along each cycle of each permutation; the last of a cycle is marked by ~state.
     negative:
         (Y,) int64: basis states whose sign changes.
+    products:
+        (Q, 2) int64: of every measured product of several Z its component, and the mask of its bits there.
     observables:
-        (O,) int64: the measured bits, counted through all components.
+        (O,) int64: the measured bits, counted through all components; n + q stands for product q.
     """
 
     qubits: int
@@ -108,6 +111,7 @@ class Program:
     blocks: NDArray[np.int64]
     cycles: NDArray[np.int64]
     negative: NDArray[np.int64]
+    products: NDArray[np.int64]
     observables: NDArray[np.int64]
 
     def source(self, first: int, last: int, qubits: int) -> NDArray[np.int64]:
@@ -251,6 +255,8 @@ class Compiler:
 
     def angle(self, angle: Angle) -> int:
         """Add an angle to the table; returns its index."""
+        if angle.factor is not None:
+            raise CircuitError("products of inputs are written as inputs by `create_backend`")
         scale, weight = (
             NONE if element is None else self.offset[element.parameter] + element.index
             for element in (angle.scale, angle.weight)
@@ -338,6 +344,16 @@ def compile_circuit(circuit: Circuit) -> Program:
         compiler.component(gates, wires)
         for wire in reversed(wires):  # bit by bit
             places[wire] = len(places)
+    products: list[tuple[int, int]] = []
+    observables: list[int] = []
+    for measured in circuit.measured:
+        if len(measured) == 1:
+            observables.append(places[measured[0]])
+            continue
+        component = member[measured[0]]  # the same for all: observables connect their qubits
+        first = compiler.components[component].bit
+        products.append((component, sum(1 << (places[wire] - first) for wire in measured)))
+        observables.append(circuit.qubits + len(products) - 1)
     return Program(
         qubits=circuit.qubits,
         inputs=circuit.inputs,
@@ -352,5 +368,6 @@ def compile_circuit(circuit: Circuit) -> Program:
         blocks=np.array(compiler.blocks, np.int64),
         cycles=np.array(compiler.cycles, np.int64),
         negative=np.array(compiler.negative, np.int64),
-        observables=np.array([places[wire] for wire in circuit.observables], np.int64),
+        products=np.array(products, np.int64).reshape(-1, 2),
+        observables=np.array(observables, np.int64),
     )

@@ -27,6 +27,7 @@ from qrlsuite.circuit.description import Angle, Circuit
 from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.circuit.shifts import Rule, measured, random_signs, shift_rule, spsa_rule, stream
+from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.plugins.circuits.native.cpu import NUMPY, Simulator
 from qrlsuite.plugins.circuits.options import NativeOptions
 
@@ -61,7 +62,9 @@ class Sampler:
         self.gradient_circuits = 2 if options.gradient == "spsa" else shifts
         self.simulator = Simulator(executed)
         self._components = [tuple(row) for row in self.simulator.program.components.tolist()]
-        self._signs = [_signs(qubits) for qubits, *_ in self._components]
+        self._weights = np.array([len(qubits) for qubits in circuit.measured])
+        diagonals = dense.diagonals(self.simulator.program, torch.zeros((), dtype=torch.float64))
+        self._signs = [diagonal.numpy() for diagonal in diagonals]
 
     def __call__(
         self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None
@@ -110,15 +113,13 @@ class Sampler:
             x = x.new_zeros((*x.shape[:2], 1))
         if self.options.shots is None:
             values = self.simulator(x, x.new_zeros((1, 0)))[0].reshape(lanes, trajectories, -1).mean(1)
-            return values * (1.0 - 2.0 * self.options.readout_error)
-        means = np.concatenate(
-            [
-                self._draw(states.reshape(lanes, trajectories, -1), source) @ signs
-                for states, signs in zip(self._probabilities(x), self._signs)
-            ],
-            axis=1,
-        )
-        return torch.from_numpy(means[:, self.simulator.program.observables]).to(angles)
+            return values * torch.from_numpy((1.0 - 2.0 * self.options.readout_error) ** self._weights).to(
+                values
+            )
+        means = np.zeros((lanes, len(self._weights)))
+        for states, signs in zip(self._probabilities(x), self._signs):
+            means += self._draw(states.reshape(lanes, trajectories, -1), source) @ signs
+        return torch.from_numpy(means).to(angles)
 
     def _errors(self, runs: int, source: np.random.Generator) -> NDArray[np.float64]:
         """Return random error angles (runs, 2 per gate and wire): 0 or pi about X, 0 or pi about Z."""
@@ -128,7 +129,7 @@ class Sampler:
             happens = source.random(runs) < rate
             codes = np.where(happens, source.integers(0, 4 ** len(wires), runs), 0)
             columns += [(codes >> bit) & 1 for bit in range(2 * len(wires))]
-        return math.pi * np.stack(columns, axis=1).astype(np.float64)
+        return math.pi * np.array(columns, np.float64).reshape(len(columns), runs).T
 
     def _probabilities(self, x: Tensor) -> list[NDArray[np.float64]]:
         """Return the probabilities of each component's outcomes, (lanes, 2^qubits), of angles (1, lanes, A)."""
@@ -166,12 +167,6 @@ class Sampler:
         share[: shots % trajectories] += 1
         counts = source.multinomial(share, probabilities).sum(axis=1)
         return counts / shots
-
-
-def _signs(qubits: int) -> NDArray[np.float64]:
-    """Return Z of every bit, +1 or -1, for each of 2^qubits outcomes, (2^qubits, qubits)."""
-    outcomes = np.arange(1 << qubits)[:, None]
-    return 1.0 - 2.0 * ((outcomes >> np.arange(qubits)) & 1)
 
 
 def _with_free_angles(circuit: Circuit, table: AngleTable) -> Circuit:

@@ -1,0 +1,182 @@
+"""Rotations of two qubits, products of inputs, and products of Pauli Z: the same on all backends."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import expm
+
+from qrlsuite import registry
+from qrlsuite.circuit import Circuit, create_backend, expectations
+from qrlsuite.circuit.angles import AngleTable
+from qrlsuite.circuit.description import without_products
+from qrlsuite.circuit.drawing import angle_text, draw_text
+from qrlsuite.circuit.resources import shift_evaluations
+from qrlsuite.errors import CircuitError, OptionError
+from qrlsuite.plugins.circuits.native import NativeBackend, dense
+from qrlsuite.testing.dense import expectation_values
+from tests.circuits.test_backends import assert_close, draw, evaluate
+
+BACKENDS = registry.load().names("circuit_backends")
+PAULI = {"X": np.array([[0, 1], [1, 0]]), "Y": np.array([[0, -1j], [1j, 0]]), "Z": np.diag([1, -1])}
+
+
+def rich():
+    """Return a circuit with all of it: qubits 0-2 are connected by gates, 2 and 3 by an observable alone."""
+    circuit = Circuit(4, inputs=3)
+    w = circuit.parameter("w", (9,))
+    for q in range(4):
+        circuit.append("RY", q, circuit.input(q % 3) + w[q])
+    circuit.append("RXX", (0, 1), circuit.input(0) * circuit.input(1))
+    circuit.append("RYY", (2, 1), w[4] * circuit.input(1) * circuit.input(2) + w[5])
+    circuit.append("RZZ", (0, 2), w[6] * (circuit.input(0) * circuit.input(0)) + 0.3)
+    circuit.append("RX", 3, circuit.input(0) * circuit.input(1) + w[7], control=None)
+    circuit.append("RY", 0, w[8], control=2)
+    circuit.measure([3, (0, 1), 1, (3, 2), 0, (0, 1, 2)])
+    return circuit
+
+
+@pytest.mark.parametrize("gate", ["RXX", "RYY", "RZZ"])
+def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
+    circuit = Circuit(2, inputs=1)
+    for q in range(2):
+        circuit.append("RY", q, 0.4 + q)
+        circuit.append("RX", q, 0.9 - q)
+    circuit.append(gate, (0, 1), circuit.input(0))
+    circuit.append("RX", 0, 0.7)
+    circuit.append("RY", 1, 0.8)
+    circuit.measure([0, 1, (0, 1)])
+
+    def turn(pauli, angle):
+        return expm(-0.5j * angle * PAULI[pauli])
+
+    state = np.kron(*(turn("X", 0.9 - q) @ turn("Y", 0.4 + q) @ [1, 0] for q in range(2)))
+    state = expm(-0.5j * 1.3 * np.kron(PAULI[gate[1]], PAULI[gate[1]])) @ state
+    state = np.kron(turn("X", 0.7), turn("Y", 0.8)) @ state
+    z, one = PAULI["Z"], np.eye(2)
+    expected = [np.vdot(state, op @ state).real for op in (np.kron(z, one), np.kron(one, z), np.kron(z, z))]
+    np.testing.assert_allclose(expectations(circuit, [[1.3]], {})[0].numpy(), expected, atol=1e-12)
+    assert shift_evaluations(circuit) == 2
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_values_and_gradients_on_every_backend(backend):
+    circuit = rich()
+    inputs, parameters, cotangent = draw(circuit, 2, 2)
+    got = evaluate(create_backend(backend, circuit), inputs, parameters, cotangent)
+    x, w, c = inputs.numpy(), parameters["w"].numpy(), cotangent.numpy()
+
+    def values(x, w):
+        return np.array([[expectation_values(circuit, row, {"w": w[s]}) for row in x[s]] for s in range(2)])
+
+    np.testing.assert_allclose(got[0], values(x, w), atol=1e-10)
+    for which, gradient in ((x, got[1].numpy()), (w, got[2].numpy())):
+        for index in np.ndindex(which.shape):
+            kept, sides = which[index], []
+            for step in (1e-5, -1e-5):
+                which[index] = kept + step
+                sides.append((values(x, w) * c).sum())
+            which[index] = kept
+            assert gradient[index] == pytest.approx((sides[0] - sides[1]) / 2e-5, abs=1e-6)
+
+
+def test_torch_operations_and_kernels_agree():
+    circuit = rich()
+    inputs, parameters, cotangent = draw(circuit, 2, 3)
+    backend = NativeBackend(without_products(circuit)[0])
+    ours = create_backend("native", circuit)
+
+    def by_torch(x, parameters):
+        return backend.by_torch(torch.cat([x, x[..., [0, 1, 0]] * x[..., [1, 2, 0]]], -1), parameters["w"])
+
+    got = evaluate(by_torch, inputs, parameters, cotangent)
+    assert_close(got, evaluate(ours, inputs, parameters, cotangent), 1e-12)
+    states = dense.states(circuit, inputs, parameters["w"])[0, 0].numpy()
+    z = np.kron([1, 1, -1, -1], [1, 1, 1, 1])  # qubit 0 is the highest of four bits
+    assert float(got[0][0, 0, 4]) == pytest.approx((z * np.abs(states) ** 2).sum())
+
+
+@pytest.mark.parametrize(
+    ("backend", "options"),
+    [
+        ("native", {}),
+        ("native", {"noise_model": "depolarizing"}),
+        ("pennylane", {}),
+        ("qiskit", {"estimator": "aer"}),
+    ],
+)
+def test_a_product_is_that_of_the_same_bits(backend, options):
+    circuit = Circuit(3)
+    for q in range(3):
+        circuit.append("RY", q, circuit.input(q))
+    circuit.measure([0, 1, 2, (0, 1), (2, 0), (0, 1, 2)])
+    x = torch.full((1, 12, 3), 1.2, dtype=torch.float64)
+    bits = create_backend(backend, circuit, shots=1, **options)(x, {}, [1])[0]
+    a, b, c = bits[:, :3].T
+    assert torch.equal(bits[:, 3:], torch.stack([a * b, a * c, a * b * c], dim=1))
+    assert len(torch.unique(bits, dim=0)) > 2
+
+
+@pytest.mark.parametrize("backend", [("native", {}), ("qiskit", {"estimator": "aer"})])
+def test_a_readout_error_counts_for_every_bit_of_a_product(backend):
+    circuit = Circuit(2)
+    circuit.measure([0, (0, 1)])
+    noise = {"noise_model": "depolarizing", "noise_rate": 0.0, "readout_error": 0.1}
+    x = torch.zeros(1, 1, 2, dtype=torch.float64)
+    values = create_backend(backend[0], circuit, **noise, **backend[1])(x, {}, [1])
+    assert_close([values], [torch.tensor([[[0.8, 0.64]]], dtype=torch.float64)], 1e-10)
+
+
+def test_an_observable_connects_its_qubits():
+    circuit = Circuit(3)
+    circuit.append("CNOT", (0, 1))
+    assert circuit.components() == [[0, 1], [2]]
+    circuit.measure([(1, 2)])
+    assert circuit.components() == [[0, 1, 2]]
+    assert circuit.observables == ((1, 2),)
+    assert circuit.measured == ((1, 2),)
+
+
+def test_products_are_drawn():
+    circuit = rich()
+    angles = [angle_text(a) for op in circuit for a in op.angles]
+    assert "w[4]*x1*x2 + w[5]" in angles
+    assert "x0*x1" in draw_text(circuit, angles=True)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda c: c.input(0) * c.input(1) * c.input(0), "an angle is affine: only"),
+        (lambda c: c.append("RZZ", 0, 0.1), "RZZ takes 2 wires, 1 angle and no control"),
+        (lambda c: c.append("RXY", (0, 1), 0.1), "unknown gate 'RXY'; did you mean 'RX"),
+        (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, are needed"),
+        (lambda c: c.measure([(0, 0)]), "are needed"),
+        (lambda c: c.measure([()]), "are needed"),
+        (lambda c: c.measure([(0, 2)]), r"distinct qubits 0\.\.1"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(write, message):
+    with pytest.raises(CircuitError, match=message):
+        write(Circuit(2))
+
+
+def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
+    circuit = Circuit(2)
+    circuit.measure([(0, 1)])
+    spec = registry.circuit_backend("pennylane")
+    import dataclasses
+
+    single = dataclasses.replace(spec, products=False)
+    monkeypatch.setattr(registry, "circuit_backend", lambda name: single)
+    with pytest.raises(OptionError, match="'pennylane' measures Pauli Z of single qubits"):
+        create_backend("pennylane", circuit)
+    monkeypatch.undo()
+    classical = Circuit(2, mean_field=True)
+    classical.measure([(0, 1)])
+    with pytest.raises(OptionError, match="a mean-field approximation has no correlations"):
+        create_backend("native", classical)
+    product = Circuit(1)
+    product.append("RX", 0, product.input(0) * product.input(0))
+    for read in (AngleTable, NativeBackend(product).simulator):
+        with pytest.raises(CircuitError, match="written as inputs by `create_backend`"):
+            read(product) if read is AngleTable else read()
