@@ -249,7 +249,7 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),
         (
             ["show", "mlp", "--set", "width=4"],
-            "model 'mlp': --qubits, --layers, --set and --figure draw an ansatz",
+            "model 'mlp': --qubits, --layers, --set, --figure and --format draw an ansatz",
         ),
         (["leaderboard", "--format", "markdwn"], "'markdwn' is not one of"),
         (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),

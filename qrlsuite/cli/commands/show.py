@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite import circuit, registry
-from qrlsuite.circuit import drawing
+from qrlsuite.circuit import drawing, export
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import printable_lines
@@ -46,12 +46,20 @@ def show(
     figure: Annotated[
         Path | None, typer.Option("--figure", help="For an ansatz: draw to this picture file.")
     ] = None,
+    format: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane.",
+        ),
+    ] = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Show options with their defaults and meaning, a task's protocol, or how an entry was made.
 
-    Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4
+    Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4;
+    qrlsuite show ansatz iqp --format qasm3
     """
     manual = _hook(name, second)
     if manual is not None:
@@ -75,13 +83,18 @@ def show(
     content = describe(kinds[0], target)
     if kinds[0] == "significance_tests":
         content["promises"] = rules.load(target).promise
-    if kinds[0] != "ansatzes" and (settings or figure or qubits is not None or layers is not None):
+    if kinds[0] != "ansatzes" and (settings or figure or format or qubits is not None or layers is not None):
         raise OptionError(
-            f"{registry.SINGULAR[kinds[0]]} '{target}': --qubits, --layers, --set and --figure draw an ansatz; options "
+            f"{registry.SINGULAR[kinds[0]]} '{target}': --qubits, --layers, --set, --figure and --format draw an "
+            "ansatz; options "
             "are changed where they are used, as in `qrlsuite run --set NAME=VALUE`"
         )
     if kinds[0] == "ansatzes":
         size = (4 if qubits is None else qubits, 2 if layers is None else layers)
+        if format is not None:
+            text = export.export(_circuit(target, *size, settings or []), format)
+            typer.echo(json.dumps({"format": format, "text": text}) if json_output else text, nl=json_output)
+            return
         content["drawing"] = _draw(target, *size, settings or [], figure, content)
     typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
 
@@ -126,6 +139,11 @@ def _entry_folder(runs: Path, name: str) -> Path | None:
         return None
 
 
+def _circuit(name: str, qubits: int, layers: int, settings: list[str]) -> circuit.Circuit:
+    chosen = {setting.name: setting.value for setting in map(parse_setting, settings)}
+    return circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
+
+
 def _draw(
     name: str, qubits: int, layers: int, settings: list[str], figure: Path | None, content: dict[str, Any]
 ) -> str:
@@ -133,8 +151,7 @@ def _draw(
     format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
     if figure is not None and format_ not in pictures.FORMATS:
         raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
-    chosen = {setting.name: setting.value for setting in map(parse_setting, settings)}
-    drawn = circuit.ansatz(name, qubits=qubits, layers=layers, **chosen)
+    drawn = _circuit(name, qubits, layers, settings)
     counted = dataclasses.asdict(drawing.resources(drawn))
     content["resources"] = {}
     for resource, count in counted.items():
