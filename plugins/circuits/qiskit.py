@@ -168,7 +168,7 @@ class QiskitBackend:
         """Run the circuit once per lane: rotation angles (R, lanes) to expectation values (lanes, observables)."""
         values = [
             self._call(some.T.numpy(), stream(entropy, call, number))
-            for number, some in enumerate(rotations.split(LANES_PER_CALL, dim=1))
+            for number, some in enumerate(torch.split(rotations, LANES_PER_CALL, dim=1))
         ]
         return torch.from_numpy(np.concatenate(values))
 

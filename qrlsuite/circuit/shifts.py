@@ -124,7 +124,8 @@ def spsa_rule(signs: Callable[[tuple[int, ...]], Tensor]) -> Rule:
 
         def combine(values: Tensor, grad: Tensor) -> Tensor:
             up, down = values.reshape(2, *grad.shape)
-            return ((up - down) * grad).sum(1) / (2 * math.sin(SPSA_STEP)) * direction
+            slope: Tensor = ((up - down) * grad).sum(1) / (2 * math.sin(SPSA_STEP))
+            return slope * direction
 
         return moved, combine
 

@@ -390,8 +390,11 @@ def play(
         played = None if kept is None else kept.get(block, lanes)
         if played is None:
             ended = play_episodes(envs, lambda: build(envs.inner, block))  # noqa: B023 - called in this round
-            both = (values.reshape(agents, lanes) for values in (ended.returns, ended.scores))
-            played = Round(*both, int(ended.lengths.sum()))
+            played = Round(
+                ended.returns.reshape(agents, lanes),
+                ended.scores.reshape(agents, lanes),
+                int(ended.lengths.sum()),
+            )
             if kept is not None:
                 kept.add(block, lanes, played)
         returns[:, columns], scores[:, columns] = played.returns, played.scores

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from qrlsuite.plugins.circuits.native.backend import NativeBackend, NativeOptions
+from qrlsuite.plugins.circuits.native.backend import NativeBackend
+from qrlsuite.plugins.circuits.options import NativeOptions
 
 __all__ = ["NativeBackend", "NativeOptions"]

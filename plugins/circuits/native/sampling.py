@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.circuit.shifts import Rule, measured, random_signs, shift_rule, spsa_rule, stream
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.plugins.circuits.native.cpu import NUMPY, Simulator
+from qrlsuite.plugins.circuits.native.program import Program
 from qrlsuite.plugins.circuits.options import NativeOptions
 
 PART_BYTES = 64 << 20
@@ -61,9 +63,10 @@ class Sampler:
             shifts = 2 * self.angles
         self.gradient_circuits = 2 if options.gradient == "spsa" else shifts
         self.simulator = Simulator(executed)
-        self._components = [tuple(row) for row in self.simulator.program.components.tolist()]
+        program = cast(Program, self.simulator.program)  # of a circuit, not of a mean-field approximation
+        self._components = [tuple(row) for row in program.components.tolist()]
         self._weights = np.array([len(qubits) for qubits in circuit.measured])
-        diagonals = dense.diagonals(self.simulator.program, torch.zeros((), dtype=torch.float64))
+        diagonals = dense.diagonals(program, torch.zeros((), dtype=torch.float64))
         self._signs = [diagonal.numpy() for diagonal in diagonals]
 
     def __call__(
