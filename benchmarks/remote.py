@@ -1,10 +1,13 @@
 """What engine `dask` costs: processor time against the local engine, and memory where many groups are queued.
 
     python benchmarks/remote.py overhead [--model mlp] [--set width=16] [--epochs 100] [--seeds 20] [--workers 2]
+    python benchmarks/remote.py task [--model mlp] [--set width=16] [--seeds 20] [--repeat 5]
     python benchmarks/remote.py queue [--groups 1000] [--minutes 1]
 
 `overhead` runs `qrlsuite run` with each engine in turn and counts the processor seconds of the command with all that it
 started (for dask a scheduler and its workers on this machine), which other work on the same cores does not stretch.
+`task` has this process work on tasks of one epoch, and counts the processor seconds that are not the epoch's: building
+the agents and environments, decoding, restoring, encoding, and at the client decoding and saving the checkpoint.
 `queue` starts a scheduler and two workers, has one command send a task for each of many groups of one seed, and prints
 the largest memory (RSS) of the command and of the scheduler.
 """
@@ -72,6 +75,43 @@ def overhead(given: argparse.Namespace) -> dict[str, Any]:
     }
 
 
+def task(given: argparse.Namespace) -> dict[str, Any]:
+    from qrlsuite.engine.remote import POLICY
+    from qrlsuite.experiment.entry import resolve
+    from qrlsuite.options import parse_setting
+    from qrlsuite.results import checkpoint
+    from qrlsuite.results.store import EntryStore
+    from qrlsuite.training.advance import advance, pack, unpack
+
+    entry = resolve("beam6g", given.model, settings=[parse_setting(word) for word in given.set])
+    seeds, arrays, beside, size = list(range(given.seeds)), {}, [], 0
+    header = {
+        "token": "",
+        "entry": entry.record(),
+        "seeds": seeds,
+        "seconds": 0,
+        "device": "cpu",
+        "versions": {},
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        store = EntryStore.create(Path(folder), entry)
+        for epoch in range(given.repeat + 1):  # the first imports and compiles
+            began = time.process_time()
+            content = advance(pack({**header, "epoch": epoch, "epochs": given.repeat + 2}, arrays))
+            answer, arrays = unpack(content)
+            arrays = {name: array for name, array in arrays.items() if not name.startswith(POLICY)}
+            checkpoint.save(store, seeds, epoch + 1, arrays)
+            training = sum(timing["cpu"] * given.seeds for timing in answer["timings"])
+            beside.append(time.process_time() - began - training)
+            size = len(content)
+    seconds = statistics.median(beside[1:])
+    return {
+        "seconds beside training": round(seconds, 2),
+        "of a minute": f"{seconds / 60:.1%}",
+        "MB": round(size / 2**20, 1),
+    }
+
+
 def queue(given: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scheduler.json"
@@ -118,18 +158,18 @@ def queue(given: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["overhead", "queue"])
+    parser.add_argument("what", choices=["overhead", "task", "queue"])
     parser.add_argument("--model", default="mlp")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--epochs", type=int, default=100)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--groups", type=int, default=1000)
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--seconds", type=float, default=60.0, help="of a task, for `queue`")
     given = parser.parse_args()
-    print(json.dumps(overhead(given) if given.what == "overhead" else queue(given)))
+    print(json.dumps({"overhead": overhead, "task": task, "queue": queue}[given.what](given)))
 
 
 if __name__ == "__main__":

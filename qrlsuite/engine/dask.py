@@ -41,6 +41,9 @@ LOOK_SECONDS = 1.0
 SEND_SECONDS = 0.1
 """The same where something is: a worker that has just come is known before it gets a task."""
 
+POLL_SECONDS = 0.1
+"""Seconds between two looks at whether an answer has come."""
+
 FETCH_SECONDS = 5.0
 """For which an answer is fetched; one whose worker has died meanwhile is worked on again first."""
 
@@ -170,7 +173,7 @@ class DaskLink:
             ended = [key for key, future in self._futures.items() if future.status != "pending"]
             if ended or time.monotonic() >= deadline:
                 break
-            time.sleep(0.02)
+            time.sleep(POLL_SECONDS)
         answers = [answer for key in ended if (answer := self._fetch(key)) is not None]
         lost = bool(self._unsent) or any(answer.content is None for answer in answers)
         if lost or time.monotonic() - self._looked >= LOOK_SECONDS:

@@ -119,10 +119,8 @@ def advance(task: bytes) -> bytes:
         more, arrays = _trained(header, seeds, arrays)
     content = pack({**answer, **more}, arrays)
     if len(content) > MOST_BYTES:
-        error = too_large(len(content), len(seeds))
-        return pack(
-            {**answer, **more, "epoch": header["epoch"], "lines": [], "timings": [], "error": error}, {}
-        )
+        nothing = {"epoch": header["epoch"], "lines": [], "timings": []}
+        return pack({**answer, **more, **nothing, "error": too_large(len(content), len(seeds))}, {})
     return content
 
 
