@@ -89,7 +89,7 @@ def test_finished_rounds_are_kept_and_two_parts_equal_one(
     (path,) = (trained.path / "evaluations").glob("*.jsonl")
     path.write_bytes(path.read_bytes() + b'{"round":1,"to')  # a writer was killed
     resumed = scores(12)
-    assert len(path.read_bytes().splitlines()) == 1 + 3
+    assert [json.loads(line).get("round") for line in path.read_text().splitlines()] == [None, 0, 1, 2]
     path.unlink()
     whole = scores(12)
     np.testing.assert_array_equal(resumed, whole)
@@ -128,6 +128,7 @@ def test_a_device_that_is_no_simulator_needs_a_yes(trained: EntryStore, unreliab
     unreliable.batches = 0
     with pytest.raises(OptionError, match=r"is no simulator: 1 agents.*80 circuits.*400 shots; add --yes"):
         evaluate(runs, entry, **given)
+    assert unreliable.batches == 0  # nothing was executed
     unreliable.batches = 22
     assert evaluate(runs, entry, **given, yes=True).policies[1].name.endswith("device=unreliable.qpu shots=5")
 

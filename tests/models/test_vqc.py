@@ -200,8 +200,16 @@ def test_shots_are_counted_with_both_kinds_of_executions():
     assert together.executions.as_dict() == {"forward": 3, "parameter_shift": 36, "shots": 390}
 
 
-def test_shot_noise_is_new_in_every_pass_and_resumes_exactly():
-    given = small(qubits=2, layers=1, shots=20)
+@pytest.mark.parametrize(
+    ("backend", "random"),
+    [
+        ("pennylane", {"shots": 20}),
+        ("native", {"shots": 20}),
+        ("native", {"noise_model": "depolarizing", "noise_rate": 0.9, "trajectories": 5}),
+    ],
+)
+def test_shot_noise_is_new_in_every_pass_and_resumes_exactly(backend, random):
+    given = small(backend, qubits=2, layers=1, **random)
     x = observations(3, 4, 3)
     together = vqc.population(agents(3, given), given)
     first = together(x)
@@ -209,7 +217,7 @@ def test_shot_noise_is_new_in_every_pass_and_resumes_exactly():
     assert state["shot_count"].tolist() == [1, 1, 1]
     second = together(x)
     assert not torch.equal(first, second)
-    resumed = vqc.population(agents(3, small(qubits=2, layers=1, shots=20)), given)
+    resumed = vqc.population(agents(3, given), given)
     resumed.load_state_dict(state)
     assert torch.equal(resumed(x), second)
 
