@@ -18,7 +18,7 @@ from qrlsuite.plugins.circuits.options import NativeOptions
 
 if TYPE_CHECKING:
     from qrlsuite.plugins.circuits.native.cpu import Simulator
-    from qrlsuite.plugins.circuits.native.sampling import Sampler
+    from qrlsuite.plugins.circuits.native.sampling import ShotSampler
 
 NOT_FINITE = "the circuit's inputs or parameters are not finite (NaN or infinite)"
 
@@ -60,11 +60,11 @@ class NativeBackend:
         self.circuit = copy.deepcopy(circuit)
         self.shapes = {name: p.shape for name, p in circuit.parameters.items()}
         self._simulator: Simulator | None = None
-        self._sampler: Sampler | None = None
+        self._sampler: ShotSampler | None = None
         if self.draws or self.options.gradient != "auto":
-            from qrlsuite.plugins.circuits.native.sampling import Sampler
+            from qrlsuite.plugins.circuits.native.sampling import ShotSampler
 
-            self._sampler = Sampler(self.circuit, self.options)
+            self._sampler = ShotSampler(self.circuit, self.options)
             self.gradient_circuits = self._sampler.gradient_circuits
 
     def __call__(

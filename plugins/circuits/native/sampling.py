@@ -37,7 +37,7 @@ PART_BYTES = 64 << 20
 """Memory that the states of one call of the kernels may take."""
 
 
-class Sampler:
+class ShotSampler:
     """A circuit with shots, noise or both.
 
     Attributes
