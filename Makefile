@@ -39,8 +39,8 @@ docs: install-dev
 
 # The documentation, and the leaderboard of published entries beside it, in one folder whose links are all checked.
 site: docs
-	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board
-	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board/index.html
+	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board.html
+	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
 
 # What a release publishes; and what a user gets of it, who has no clone.
 dist: $(BIN)/python

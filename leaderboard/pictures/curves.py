@@ -53,7 +53,12 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
             axes.plot(steps, entry.curves.T, color=look.color, linewidth=0.5, alpha=0.25)
         if not many:
             axes.fill_between(steps, low, high, color=look.color, alpha=0.15 if single else 0.1, linewidth=0)
-        axes.plot(steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry))
+        (line,) = axes.plot(
+            steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry)
+        )
+        if len(steps) == 1:  # a line of one point is nothing to see
+            line.set(marker="o", markersize=9)
+            axes.errorbar(steps, middle, [middle - low, high - middle], color=look.color, linewidth=2)
     relative = style.relative(entries)
     axes.set_xlabel("environment steps")
     axes.set_ylabel("validation score (received / optimal)" if relative else "validation score")

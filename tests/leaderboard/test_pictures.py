@@ -6,6 +6,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +263,20 @@ def test_curves_show_single_runs_of_few() -> None:
     many = pictures.draw("curves", [learner(seeds=50)])
     assert len(many.axes[0].get_lines()) == 1
     assert not [c for c in many.axes[0].collections if isinstance(c, PathCollection)]
+
+
+def test_a_curve_of_one_epoch_can_be_seen() -> None:
+    both = [learner(seeds=3), replace(learner("ddqn mlp width=8"), curves=learner().curves[:, :1])]
+    longer, point = (
+        next(
+            line
+            for line in pictures.draw("curves", both).axes[0].get_lines()
+            if line.get_label().startswith(entry.label)
+        )
+        for entry in both
+    )
+    assert longer.get_marker() == "None"
+    assert point.get_marker() == "o"
 
 
 @pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers", "few-runs"])
