@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
@@ -143,9 +144,9 @@ class Section:
     """What that rule controls."""
 
 
-@dataclass(frozen=True)
-class Leaderboard:
-    """All sections, and what was refused and why. In a notebook, and printed by rich, it is two tables per section."""
+@dataclass(frozen=True, repr=False)
+class Leaderboard(Shown):
+    """All sections, and what was refused and why. It shows itself as two tables per section."""
 
     sections: tuple[Section, ...]
     refused: tuple[str, ...]
@@ -180,9 +181,9 @@ class Leaderboard:
         return tables.board_html(self)
 
 
-@dataclass(frozen=True, eq=False)
-class EntryComparison(Comparison):
-    """The result of `compare_entries`. In a notebook, and printed by rich, it is a table of signs and a sentence.
+@dataclass(frozen=True, eq=False, repr=False)
+class EntryComparison(Shown, Comparison):
+    """The result of `compare_entries`. It shows itself as a table of signs and a sentence.
 
     Attributes
     ----------

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
@@ -24,9 +25,9 @@ from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.results.text import counted
 
 
-@dataclass(frozen=True)
-class EntryCurves:
-    """An entry with the learning curves of its complete runs. In a notebook, and printed by rich, it is a table.
+@dataclass(frozen=True, repr=False)
+class EntryCurves(Shown):
+    """An entry with the learning curves of its complete runs. It shows itself as a short table.
 
     Attributes
     ----------

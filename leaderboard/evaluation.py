@@ -32,7 +32,7 @@ WIDE = 100
 """Columns of a terminal in which the whole table can be read."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Shown):
     """What policies earned on the same fresh episodes of one task.
 

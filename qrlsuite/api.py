@@ -10,8 +10,9 @@
     api.evaluate("mlp width=16", best=4)
     api.decide("width.toml")
 
-Results print as tables, in a notebook and in a terminal (with rich). Errors are those of `qrlsuite.errors`; where a
-message names an option of a command, such as `--task`, the function's argument has the same name.
+Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
+those of `qrlsuite.errors`; where a message names an option of a command, such as `--task`, the function's argument has
+the same name.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from qrlsuite.engine import execution
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.execution import Execution
-from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.terminal import Shown, show_figures_in_notebook
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board as boards
@@ -56,6 +57,8 @@ if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
 __all__ = ["board", "compare", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"]
+
+show_figures_in_notebook()
 
 Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
@@ -619,7 +622,7 @@ def tune(
     return searches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StudyRun(Shown):
     """The state of a study after `run_study`.
 

@@ -13,13 +13,40 @@ from rich.console import Console
 
 
 class Shown:
-    """A result that prints itself with rich, in a terminal as in a notebook (`__rich_console__`)."""
+    """A result that shows itself as its table: printed, at a Python prompt, and in a notebook.
+
+    Subclasses have `__rich_console__` or `__rich__`, and are dataclasses with `repr=False`.
+    """
+
+    def __repr__(self) -> str:
+        text = io.StringIO()
+        width = table_console().width
+        Console(file=text, width=width, color_system=None, highlight=False, force_jupyter=False).print(self)
+        return "\n".join(line.rstrip() for line in text.getvalue().rstrip().split("\n"))
 
     def _repr_html_(self) -> str:
         console = Console(record=True, file=io.StringIO(), width=130, highlight=False, force_jupyter=False)
         console.print(self)
         style = "white-space:pre;overflow-x:auto;line-height:normal;font-family:monospace"
         return console.export_html(inline_styles=True, code_format=f"<pre style='{style}'>{{code}}</pre>")
+
+
+def show_figures_in_notebook() -> None:
+    """Let the notebook in which this process runs, if any, show matplotlib figures.
+
+    IPython does so once pyplot was imported. Figures of the suite are made without pyplot, which would keep them all.
+    """
+    if "IPython" not in sys.modules:
+        return
+    from IPython import get_ipython
+    from IPython.core.pylabtools import select_figure_formats
+
+    shell = get_ipython()
+    if (
+        shell is not None
+        and "matplotlib.figure.Figure" not in shell.display_formatter.formatters["image/png"]
+    ):
+        select_figure_formats(shell, {"png"})
 
 
 def table_console(least: int = 130) -> Console:

@@ -33,7 +33,7 @@ Hours = tuple[float, float]
 """Least and most core-hours to be expected; both the same where they were measured on the entry's own seeds."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DecisionOutcome(Shown):
     """A plan with what it has decided so far.
 

@@ -79,7 +79,7 @@ class PendingEntry:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Overview(Shown):
     """A table of a study's entries: finished seeds, missing seeds, and their estimated time."""
 

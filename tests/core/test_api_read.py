@@ -103,16 +103,17 @@ def test_what_is_left_out_of_a_board_is_named(large: EntryCurves) -> None:
 def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None:
     board = api.board("beam6g", entries=[small, large], **WHERE)
     comparison = api.compare(large, small)
-    for shown in (board._repr_html_(), printed(board)):
+    for shown in (board._repr_html_(), printed(board), repr(board), str(board)):
         assert "ddqn mlp width=64" in shown
         assert "60k (56k to 66k)" in shown
         assert "score: median over seeds" in shown
-    for shown in (comparison._repr_html_(), printed(comparison)):
+    for shown in (comparison._repr_html_(), printed(comparison), repr(comparison), str(comparison)):
         assert "ddqn mlp width=64 against ddqn mlp width=16, 100 seeds each, 200000 steps" in shown
         assert comparison.sentence in shown
         assert "+ significantly fewer samples" in shown
     assert "ddqn-mlp-" in small._repr_html_()
     assert "387" in printed(small)
+    assert repr(small).startswith("task        beam6g\nentry       ddqn mlp width=16 (ddqn-mlp-")
     heads = [
         next(line for line in printed(board, width).splitlines() if "tier" in line) for width in (80, 200)
     ]
