@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -21,7 +21,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.results.seeds import parse_seeds
+from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.text import counted
 
 
@@ -117,6 +117,36 @@ class EntryCurves(Shown):
         """Return the first epochs of every run that has reached a number of them; None for none."""
         reached = self.reaching(epochs)
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
+
+    def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryCurves:
+        """Return the entry with these seeds only, to see what fewer seeds would have said.
+
+        Parameters
+        ----------
+        seeds:
+            A number (20: seeds 0 to 19), the seeds themselves, or text ('0:20').
+
+        Raises
+        ------
+        OptionError
+            If the entry lacks one of them.
+        """
+        wanted = read_seeds(seeds)
+        missing = sorted(set(wanted) - set(self.seeds))
+        if missing:
+            raise OptionError(f"'{self.label}' has no complete run of seed {missing[0]}")
+        places = [self.seeds.index(seed) for seed in wanted]
+        records = {seed: self.records[seed] for seed in wanted if seed in self.records}
+        return replace(
+            self,
+            curves=self.curves[places],
+            seeds=tuple(wanted),
+            left_out=(),
+            runs={},
+            records=records,
+            hours=sum(float(record["hours"]) for record in records.values()),
+            executions=sum(int(record["executions"]) for record in records.values()),
+        )
 
     def to_table(self) -> pyarrow.Table:
         """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.

@@ -100,6 +100,17 @@ def test_what_is_left_out_of_a_board_is_named(large: EntryCurves) -> None:
         api.board(entries=[large], min_seeds=101, **WHERE)
 
 
+def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryCurves) -> None:
+    few = small.with_seeds([7, 3])
+    assert few.seeds == (3, 7)
+    assert np.array_equal(few.curves, small.curves[[3, 7]])
+    assert few.hours == pytest.approx(sum(small.records[seed]["hours"] for seed in (3, 7)))
+    assert small.with_seeds("0:20").seeds == small.with_seeds(20).seeds == tuple(range(20))
+    assert api.compare(small.with_seeds(19), small).sentence == "undecided: fewer than 20 seeds"
+    with pytest.raises(OptionError, match="'ddqn mlp width=16' has no complete run of seed 100"):
+        small.with_seeds([0, 100])
+
+
 def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None:
     board = api.board("beam6g", entries=[small, large], **WHERE)
     comparison = api.compare(large, small)
