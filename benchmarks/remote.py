@@ -6,6 +6,7 @@
 
 `overhead` runs `qrlsuite run` with each engine in turn and counts the processor seconds of the command with all that it
 started (for dask a scheduler and its workers on this machine), which other work on the same cores does not stretch.
+A run of one epoch before, which is not counted, compiles the kernels.
 `task` has this process work on tasks of one epoch, and counts the processor seconds that are not the epoch's: building
 the agents and environments, decoding, restoring, encoding, and at the client decoding and saving the checkpoint.
 `queue` starts a scheduler and two workers, has one command send a task for each of many groups of one seed, and prints
@@ -58,15 +59,17 @@ def spent() -> float:
 def overhead(given: argparse.Namespace) -> dict[str, Any]:
     seconds: dict[str, list[float]] = {"local": [], "dask": []}
     clock: dict[str, list[float]] = {"local": [], "dask": []}
-    for _ in range(given.repeat):
+    for repeat in range(given.repeat + 1):
+        epochs = given.epochs if repeat else 1
         for engine in seconds:
             with tempfile.TemporaryDirectory() as folder:
-                more = ["--seeds", str(given.seeds), "--epochs", str(given.epochs), "--engine", engine]
+                more = ["--seeds", str(given.seeds), "--epochs", str(epochs), "--engine", engine]
                 words = command(Path(folder), given.model, given.set, *more, "--workers", str(given.workers))
                 before, began = spent(), time.monotonic()
                 subprocess.run(words, check=True, env=ENVIRONMENT, capture_output=True)
-                seconds[engine].append(spent() - before)
-                clock[engine].append(time.monotonic() - began)
+                if repeat:
+                    seconds[engine].append(spent() - before)
+                    clock[engine].append(time.monotonic() - began)
     medians = {engine: round(statistics.median(values), 1) for engine, values in seconds.items()}
     return {
         "processor seconds": medians,

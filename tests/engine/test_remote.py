@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import platform
 import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -325,3 +327,28 @@ def test_numbers_that_json_rounds_survive() -> None:
     again, arrays = unpack(pack(header, {"a": np.arange(6.0).reshape(2, 3).T}))
     assert again == json.loads(json.dumps(header)) == header
     np.testing.assert_array_equal(arrays["a"], np.arange(6.0).reshape(2, 3).T)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="sets what glibc's allocator does")
+def test_a_worker_keeps_freed_memory() -> None:
+    """As Dask starts workers, arrays of a megabyte would be fetched from the system again and again."""
+    program = """if True:
+        import resource, sys, threading
+        import numpy as np
+        from qrlsuite.training.advance import keep_freed_memory
+        faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        def work():
+            keep_freed_memory()
+            before = faults()
+            for _ in range(100):
+                np.ones(1 << 17)
+            print(faults() - before)
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    """
+    environment = {**os.environ, "MALLOC_TRIM_THRESHOLD_": "65536"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 100 * 256 / 4  # pages of 4 kB of 100 arrays of 1 MB
