@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,12 @@ from matplotlib.figure import Figure
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.collect import read_entry
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.studies.study import Member, PictureSection, Study
 
 Report = Callable[[str, int, int], None]
@@ -101,6 +104,27 @@ def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
         if curves is not None:
             curves_by_name[member.entry.name] = curves
     return curves_by_name
+
+
+def decided_pairs(entries: Iterable[EntryCurves]) -> tuple[int, int]:
+    """Count the pairs of entries that rule `times` decides, and all pairs that it tests: both of 20 seeds or more.
+
+    Entries are compared within a task, at its shortest horizon; Holm's procedure goes over the task's pairs. Entries
+    of a decision plan are left out: their number of seeds depends on what the seeds showed.
+    """
+    by_task: dict[str, list[EntryCurves]] = {}
+    for entry in entries:
+        if entry.plan is None:
+            by_task.setdefault(entry.task_hash, []).append(entry)
+    counts = [(0, 0)]
+    for group in by_task.values():
+        ranking = ranking_of(group)
+        horizon = min(ranking.horizons)
+        long = [reached for e in group if (reached := e.reaching(horizon // e.steps_per_epoch))]
+        if sum(len(entry.seeds) >= MIN_RUNS for entry in long) > 1:
+            result = rank_by_time(long, ranking.grid, horizon)
+            counts.append((result.n_decided, result.n_pairs))
+    return sum(decided for decided, _ in counts), sum(pairs for _, pairs in counts)
 
 
 def draw(

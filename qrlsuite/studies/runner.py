@@ -54,6 +54,11 @@ class PendingEntry:
         return self.plan.left * self.estimate.seconds
 
     @property
+    def complete(self) -> bool:
+        """Whether all of its seeds are finished."""
+        return self.finished == len(self.plan.seeds)
+
+    @property
     def range(self) -> tuple[float, float] | None:
         """The least and the most core-seconds left, None where unknown."""
         return self.estimate.range(self.plan.left) if self.plan.groups else (0.0, 0.0)
@@ -154,6 +159,76 @@ def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:
     return sum(low for low, _ in ranges), sum(high for _, high in ranges)
 
 
+@dataclass(frozen=True, repr=False)
+class Status(Shown):
+    """A table of studies: what is trained of each, how many of its pairs are decided, and what the rest takes.
+
+    Attributes
+    ----------
+    rows:
+        A study, its entries, and of its pairs of entries those that are decided, and all that can be tested yet.
+    """
+
+    rows: Sequence[tuple[Study, Sequence[PendingEntry], tuple[int, int]]]
+    workers: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "studies": [
+                {
+                    "name": study.name,
+                    "entries": len(items),
+                    "complete": sum(item.complete for item in items),
+                    "seeds": sum(len(item.plan.seeds) for item in items),
+                    "finished": sum(item.finished for item in items),
+                    "pairs": pairs,
+                    "decided": decided,
+                    "core_hours_range": [seconds / 3600 for seconds in _total(items)],
+                    "complete_estimate": all(item.seconds is not None for item in items),
+                }
+                for study, items, (decided, pairs) in self.rows
+            ],
+            "core_hours_range": [seconds / 3600 for seconds in _total(self._once())],
+            "workers": self.workers,
+        }
+
+    def _once(self) -> list[PendingEntry]:
+        """Return the entries of all studies, each once."""
+        return list({item.plan.store.path: item for _, items, _ in self.rows for item in items}.values())
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show a row per study, and the sum, in which an entry of several studies counts once."""
+        table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+        for column in ("study", "entries complete", "seeds", "pairs decided", "core-hours left"):
+            table.add_column(column, justify="left" if column == "study" else "right", overflow="fold")
+        for study, items, (decided, pairs) in self.rows:
+            table.add_row(
+                study.name,
+                f"{sum(item.complete for item in items)} of {len(items)}" if items else "-",
+                f"{sum(item.finished for item in items)} of {sum(len(item.plan.seeds) for item in items)}"
+                if items
+                else "-",
+                f"{decided} of {pairs}" if pairs else "-",
+                _hours_left(items),
+            )
+        yield table
+        low, high = _total(self._once())
+        yield Text(
+            f"left, each entry once: {duration_range(low / self.workers, high / self.workers)} with {self.workers} "
+            f"worker{'s' * (self.workers != 1)} ({hours_range(low / 3600, high / 3600)} core-hours)"
+        )
+        yield Text("pairs: of entries with 20 seeds or more, by mean time below threshold at an error of 5%")
+
+
+def _hours_left(items: Sequence[PendingEntry]) -> str:
+    if not any(item.plan.groups for item in items):
+        return "-"
+    low, high = _total(items)
+    unknown = sum(item.seconds is None for item in items)
+    return hours_range(low / 3600, high / 3600) + (f" and {unknown} unknown" if unknown else "")
+
+
 def select(
     study: Study,
     settings: Sequence[Setting] = (),
@@ -220,6 +295,12 @@ def survey(
         estimate = speeds.estimate(entry, work.together)
         items.append(PendingEntry(work, tuple(dict.fromkeys(groups[key])), estimate))
     return items
+
+
+def work_left(items: Sequence[PendingEntry]) -> tuple[int, float]:
+    """Return a sort key of studies: how many entries are of unknown cost, and the core-seconds left of the others."""
+    costs = [item.seconds for item in items]
+    return costs.count(None), sum(cost or 0.0 for cost in costs)
 
 
 def cheapest_first(items: Sequence[PendingEntry]) -> list[PendingEntry]:
@@ -311,9 +392,12 @@ class Session:
     trained: int = 0
     clock: Callable[[], float] = time.monotonic
     _planned: float = 0.0
+    _began: float | None = None
 
     def run(self, items: Sequence[PendingEntry]) -> list[PendingEntry]:
         """Train what is missing, cheapest first; returns the items that did not fit into the budget.
+
+        The budget counts from the first call: that of several studies is one.
 
         Raises
         ------
@@ -322,7 +406,8 @@ class Session:
         QrlSuiteError
             If a group failed; finished epochs are kept.
         """
-        began = self.clock()
+        if self._began is None:
+            self._began = self.clock()
         left_over = []
         order = cheapest_first(items)
         for number, first in enumerate(order, start=1):
@@ -330,7 +415,7 @@ class Session:
             while item.plan.groups:
                 chosen = item.plan.missing
                 if self.budget is not None:
-                    left = self.budget - (self.clock() - began) - self._planned
+                    left = self.budget - (self.clock() - self._began) - self._planned
                     chosen = fitting(item, left, self.execution.workers) if left > 0 else []
                 if not chosen:
                     left_over.append(item)

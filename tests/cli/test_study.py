@@ -23,8 +23,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
-from qrlsuite.specs import EngineSpec
-from qrlsuite.studies.runner import PendingEntry, cheapest_first, check_budget, fitting, survey
+from qrlsuite.specs import EngineSpec, StudySpec
+from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check_budget, fitting, survey
 from qrlsuite.studies.study import parse
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
@@ -356,8 +356,6 @@ def test_a_budget_is_kept_and_the_same_command_continues(widths: str, tmp_path: 
 
 
 def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -> None:
-    from qrlsuite.studies.runner import Session
-
     ticks = iter(range(0, 10_000, 60))
     known = speeds(0.1, 0.2)
     session = Session(
@@ -404,6 +402,72 @@ def test_ctrl_c_saves_and_draws_and_the_same_command_resumes(widths: str, tmp_pa
     (folder,) = (runs / "tiny").iterdir()
     (straight,) = (tmp_path / "straight" / "tiny").iterdir()
     assert all(results(folder, seed) == results(straight, seed) for seed in (0, 1))
+
+
+@pytest.fixture
+def two_studies(widths: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register two studies, and no others: `widths`, and `without-circuit` with one of its entries."""
+    wide = tmp_path / "without-circuit.toml"
+    text = Path(widths).read_text().replace("[16, 4]", "[16]").replace('"widths"', '"without-circuit"')
+    wide.write_text(re.sub(r'\[\[entries\]\]\nname = "vqc".*?(?=\[\[pict)', "", text, flags=re.DOTALL))
+    registered = {
+        path.stem: registry.Registered(StudySpec(path.stem, "for tests", str(path)), "tests")
+        for path in (Path(widths), wide)
+    }
+    monkeypatch.setitem(registry.load().entries, "studies", registered)
+
+
+@pytest.mark.usefixtures("two_studies")
+def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> None:
+    words = ("--engine", "here", "--seeds", "2", "--epochs", "1", "--runs", str(tmp_path / "runs"))
+    said = say("run", "all", *words).stdout
+    assert said.index("study without-circuit:") < said.index("study widths:")
+    assert "study-without-circuit-curves.png" in said
+    assert "study-widths-curves.png" in said
+    assert [label for label, _ in Here.trained].count("ddqn mlp width=16") == 1, (
+        "an entry of both is trained once"
+    )
+    assert answer("run", "all", "--dry-run", *words)["steps"] == []
+
+
+@pytest.mark.usefixtures("two_studies")
+def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
+    words = ("--only", "vqc", "--runs", str(tmp_path / "runs"))
+    assert {step["label"] for step in answer("run", "all", "--dry-run", *words)["steps"]} == {
+        "ddqn vqc-native qubits=2 layers=1"
+    }
+    with pytest.raises(OptionError, match="has no such entry"):
+        say("run", "all", "--dry-run", "--only", "nothing")
+
+
+@pytest.mark.usefixtures("two_studies")
+def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
+    ticks = iter(range(0, 10_000, 60))
+    execution, known = Execution(Here(), 1), speeds(0.1, 0.2)
+    session = Session(
+        tmp_path / "runs", execution, known, budget=100, quiet=True, clock=lambda: float(next(ticks))
+    )
+    for path in ("without-circuit.toml", "widths.toml"):
+        left = session.run(items(str(tmp_path / path), tmp_path, known))
+    assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))]
+    assert [item.plan.entry.label for item in left] == [
+        "ddqn mlp width=4",
+        "ddqn vqc-native qubits=2 layers=1",
+    ]
+
+
+@pytest.mark.usefixtures("two_studies")
+def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
+    words = ("--engine", "here", "--epochs", "10", "--runs", str(tmp_path / "runs"))
+    say("run", "widths", "--only", "mlp", "--seeds", "20", *words)
+    wide, widths = answer("status", "without-circuit", "widths", "--seeds", "20", *words)["studies"]
+    assert (wide["complete"], wide["entries"], wide["pairs"]) == (1, 1, 0)
+    assert (widths["complete"], widths["entries"], widths["finished"], widths["seeds"]) == (2, 3, 40, 60)
+    assert widths["pairs"] == 1
+    assert 0 <= widths["decided"] <= 1
+    said = say("status", "--seeds", "20", *words).stdout
+    assert re.search(r"widths +2 of 3 +40 of 60 +[01] of 1", said)
+    assert "left, each entry once: " in said
 
 
 def test_listing() -> None:

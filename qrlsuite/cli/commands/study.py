@@ -31,10 +31,19 @@ from qrlsuite.results.text import counted, duration_range
 from qrlsuite.studies import runner
 from qrlsuite.studies.study import Member, Study, load
 
-app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: list, show, run, draw.")
+app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: list, status, show, run, draw.")
+
+ALL = "all"
+"""In the place of a study's name: every registered one."""
 
 StudyArgument = Annotated[
     str, typer.Argument(metavar="STUDY", help="A study (see `qrlsuite study list`) or a study file's path.")
+]
+SomeStudies = Annotated[
+    list[str] | None, typer.Argument(metavar="[STUDY]...", help="Studies, or files; default: all.")
+]
+StudyOrAll = Annotated[
+    str, typer.Argument(metavar="STUDY", help="A study, a study file's path, or `all` that are registered.")
 ]
 SeedsOption = Annotated[
     str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: each task's protocol.")
@@ -128,8 +137,37 @@ def show(
 
 
 @app.command()
+def status(
+    names: SomeStudies = None,
+    seeds: SeedsOption = None,
+    epochs: EpochsOption = None,
+    engine: EngineOption = "local",
+    workers: WorkersOption = None,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Show every study in a line: finished seeds, decided pairs of entries, and the core-hours of what is missing.
+
+    Example: qrlsuite study status
+    """
+    execution = execution_of(engine, workers)
+    seed_numbers = None if seeds is None else parse_seeds(seeds)
+    speeds = speed.known(runs)
+    rows = []
+    for name in names or registry.load().names("studies"):
+        study, members = _members(name)
+        items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
+        rows.append((study, items, studies.decided_pairs(studies.read(runs, members).values())))
+    overview = runner.Status(rows, execution.workers)
+    if json_output:
+        typer.echo(json.dumps(overview.as_dict()))
+    else:
+        table_console().print(overview, soft_wrap=True)
+
+
+@app.command()
 def run(
-    name: StudyArgument,
+    name: StudyOrAll,
     seeds: SeedsOption = None,
     epochs: EpochsOption = None,
     budget: Annotated[
@@ -157,42 +195,56 @@ def run(
     """Train a study's missing seeds, cheapest entry first, and draw its pictures.
 
     Entries are those that `qrlsuite run` trains, in the same folders: nothing is trained twice. Stop with Ctrl-C at
-    any time, or give a --budget; the same command continues.
+    any time, or give a --budget; the same command continues. `all` begins with the study that lacks least, so that
+    the next answer comes as soon as it can.
 
-    Example: qrlsuite study run fig6 --seeds 20 --budget 30min
+    Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run all --budget 8h
     """
     _check_format(format_)
     execution = execution_of(engine, workers, partition, time, engine_options, device)
     limit = seconds(budget) if budget is not None else None
-    study, members = _members(name, settings, models, only)
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
-    items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
+    chosen = _chosen(name, settings, models, only)
+
+    def items_of(members: Sequence[Member]) -> list[runner.PendingEntry]:
+        return runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
+
+    chosen.sort(key=lambda pair: runner.work_left(items_of(pair[1])))
+    every = items_of([member for _, members in chosen for member in members])
     if limit is not None:
-        runner.check_budget(items, limit, execution.workers)
+        runner.check_budget(every, limit, execution.workers)
     if dry_run:
-        _dry_run(study, runner.dry_run(items, limit, execution.workers), json_output)
+        _dry_run(name, runner.dry_run(every, limit, execution.workers), json_output)
         return
     session = runner.Session(runs, execution, speeds, limit, quiet=json_output)
-    try:
-        left_over = session.run(items)
-    except KeyboardInterrupt:
+    left_over: dict[Path, runner.PendingEntry] = {}
+    results = []
+    for study, members in chosen:
+        if len(chosen) > 1 and not json_output:
+            typer.echo(f"\nstudy {study.name}: {study.file.summary}")
+        try:
+            left_over |= {item.plan.store.path: item for item in session.run(items_of(members))}
+        except KeyboardInterrupt:
+            if not json_output:
+                _say(studies.write(study, members, runs, format_))
+            raise typer.Exit(130) from None
+        drawn = studies.write(study, members, runs, format_)
         if not json_output:
-            _say(studies.write(study, members, runs, format_))
-        raise typer.Exit(130) from None
-    drawn = studies.write(study, members, runs, format_)
-    if json_output:
-        after = runner.survey(members, runs, execution, speed.known(runs), seed_numbers, epochs)
-        content = runner.Overview(study, after, execution.workers).as_dict()
+            _say(drawn)
+            continue
+        content = runner.Overview(study, items_of(members), execution.workers).as_dict()
         content |= {"trained": session.trained, "submitted": session.submitted}
-        typer.echo(json.dumps(content | {"pictures": [each.as_dict() for each in drawn]}))
+        results.append(content | {"pictures": [each.as_dict() for each in drawn]})
+    if json_output:
+        typer.echo(json.dumps(results if name == ALL else results[0]))
         return
-    _say(drawn)
     for line in session.submitted:
         typer.echo(line)
     if left_over and not session.submitted:
         unfinished = ", ".join(
-            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})" for item in left_over[:4]
+            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})"
+            for item in list(left_over.values())[:4]
         )
         more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
         typer.echo(f"the budget is used up; left: {unfinished}{more}. The same command continues.")
@@ -227,13 +279,15 @@ def draw(
 
 
 def _check_format(format_: str) -> None:
-
     if format_ not in ("png", "pdf", "svg"):
         raise OptionError(f"--format {format_}{nearest(format_, ['png', 'pdf', 'svg'])}")
 
 
 def _members(
-    name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
+    name: str,
+    settings: list[str] | None = None,
+    models: list[str] | None = None,
+    only: list[str] | None = None,
 ) -> tuple[Study, list[Member]]:
     """Load a study and resolve its entries."""
     parsed = [options.parse_setting(word) for word in settings or []]
@@ -248,9 +302,35 @@ def _members(
     return loaded, runner.select(loaded, parsed, mapped, only or [])
 
 
-def _dry_run(study: Study, steps: Sequence[dict[str, Any]], json_output: bool) -> None:
+def _chosen(
+    name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
+) -> list[tuple[Study, list[Member]]]:
+    """Load one study, or all that are registered: of these, those that have the options and entries that are wanted.
+
+    Raises
+    ------
+    QrlSuiteError
+        If there is none.
+    """
+    if name != ALL:
+        return [_members(name, settings, models, only)]
+    chosen, refusals = [], []
+    for each in registry.load().names("studies"):
+        try:
+            study, members = _members(each, settings, models, only)
+        except OptionError as error:
+            refusals.append(error)
+            continue
+        if members:
+            chosen.append((study, members))
+    if not chosen:
+        raise refusals[0] if refusals else OptionError("no study that is registered trains anything")
+    return chosen
+
+
+def _dry_run(name: str, steps: Sequence[dict[str, Any]], json_output: bool) -> None:
     if json_output:
-        typer.echo(json.dumps({"name": study.name, "steps": steps}))
+        typer.echo(json.dumps({"name": name, "steps": steps}))
         return
     for step in steps:
         cost = step["core_seconds_range"]
