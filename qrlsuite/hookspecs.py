@@ -292,8 +292,9 @@ def run_started(run: Mapping[str, Any]) -> None:
     """Observe a seed's run beginning or resuming, in the worker that trains it.
 
     `run` is a mapping: what the seed's `run.json` says (task, entry, label, algorithm, model, their options, seed,
-    ...), `epochs`, the number of epochs that are finished, and `folder`, the seed's folder. What a tracker prints
-    goes to the worker's output, which nobody reads: write to a file.
+    ...), `epochs`, the number of epochs that are finished, `history`, their records as `epoch_finished` is given them,
+    and `folder`, the seed's folder. What a tracker prints goes to the worker's output, which nobody reads: write to a
+    file.
 
     A run that was stopped resumes from its last checkpoint, so epochs after `run["epochs"]` may come a second time:
     they are equal to those of the first. A tracker that raises is reported once and left out; it never stops a run.
@@ -317,7 +318,7 @@ def epoch_finished(run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
 
     It has `epoch`, the validation `scores` (a list of numbers), and the algorithm's metrics (`loss`, ...),
     `train_return` and `train_score`: numbers, or None where there is no value. `run` is as in `run_started`,
-    without `epochs`::
+    without `epochs` and `history`::
 
         from pathlib import Path
         from qrlsuite import hookimpl
@@ -334,7 +335,7 @@ def epoch_finished(run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
 def run_finished(run: Mapping[str, Any]) -> None:
     """Observe a seed's run reaching its last epoch; its results are complete on disk.
 
-    `run` is as in `run_started`::
+    `run` is as in `run_started`, without `history`::
 
         from pathlib import Path
         from qrlsuite import hookimpl

@@ -161,6 +161,7 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
         importlib.import_module(f"distributed.cli.dask_{words[0]}").main(words[1:], standalone_mode=False)
         return 0
     warnings.simplefilter("error")
+    warnings.filterwarnings("ignore", "The ``noload`` loader strategy", DeprecationWarning)  # MLflow's tables
     if program == "worker":
         return worker.main(words)
     if program == "pytest":

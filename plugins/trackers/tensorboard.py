@@ -24,6 +24,8 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from qrlsuite.plugins.trackers import common
+
 
 class TensorBoard:
     """Writes event files.
@@ -40,10 +42,7 @@ class TensorBoard:
 
     def run_started(self, run: Mapping[str, Any]) -> None:
         """Open a new event file for a seed, which goes on after `run["epochs"]`."""
-        run_folder = Path(run["folder"])
-        folder = run_folder / "tensorboard"
-        if self.target is not None:
-            folder = self.target / run["task"] / run["entry"] / run_folder.name
+        folder = common.folder(self.target, run, "tensorboard")
         folder.mkdir(parents=True, exist_ok=True)
         # readers go through files in the order of their names
         path = folder / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}"
@@ -57,12 +56,7 @@ class TensorBoard:
 
     def epoch_finished(self, run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
         """Append an epoch's scalars."""
-        scores = record["scores"]
-        scalars = {"validation/score": sum(scores) / len(scores)}
-        for name, value in record.items():
-            if name != "epoch" and isinstance(value, int | float):  # None: there is no value in this epoch
-                scalars[f"training/{name.removeprefix('train_')}"] = float(value)
-        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
+        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in common.scalars(record).items()]
         event = Event(wall_time=time.time(), step=record["epoch"], summary=Summary(value=values))
         _append(self._files[run["folder"]], event)
 

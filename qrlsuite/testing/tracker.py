@@ -175,8 +175,9 @@ def _a_run(send: Callable[..., None], folder: Path) -> None:
         seed_folder.mkdir(exist_ok=True)
         runs.append({**RUN, "seed": seed, "folder": str(seed_folder)})
     for first, last in ((1, 2), (2, 2)):
+        history = [{**RECORD, "epoch": epoch} for epoch in range(1, first)]
         for run in runs:
-            _unchanged(send, "run_started", run={**run, "epochs": first - 1})
+            _unchanged(send, "run_started", run={**run, "epochs": first - 1, "history": history})
         for epoch in range(first, last + 1):
             for run in runs:
                 _unchanged(send, "epoch_finished", run=run, record=copy.deepcopy({**RECORD, "epoch": epoch}))

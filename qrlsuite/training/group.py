@@ -113,7 +113,8 @@ class GroupFiles:
                 "provenance": _with_origin(folder.record() or {}, origin),
             }
             folder.write_record(record)
-            self.events.send("run_started", run={**record, "folder": str(folder.path)})
+            told = {**record, "folder": str(folder.path), "history": folder.epochs()}
+            self.events.send("run_started", run=told)
 
     def add_origin(self, origin: Mapping[str, Any]) -> None:
         """Note in `run.json` of every seed where else it is trained."""

@@ -1,0 +1,49 @@
+"""What all built-in trackers do alike: the names of the metrics, the settings of a run, and what one run is."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+def scalars(record: Mapping[str, Any]) -> dict[str, float]:
+    """Return an epoch's numbers by name: `validation/score`, the mean over episodes, and `training/METRIC`."""
+    scores = record["scores"]
+    values = {"validation/score": sum(scores) / len(scores)}
+    for name, value in record.items():
+        if name != "epoch" and isinstance(value, int | float):  # None: there is no value in this epoch
+            values[f"training/{name.removeprefix('train_')}"] = float(value)
+    return values
+
+
+def settings(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a run was trained with, as a flat mapping: `task`, `seed`, ..., `algorithm.gamma`, `model.width`."""
+    names = ("task", "task_hash", "entry", "label", "algorithm", "model", "family", "seed")
+    found = {name: run[name] for name in names}
+    for part in ("algorithm", "model"):
+        found |= {f"{part}.{name}": value for name, value in run[f"{part}_options"].items()}
+    return found
+
+
+def title(run: Mapping[str, Any]) -> str:
+    """Return what a run is called in a list of runs."""
+    return f"{run['label']} seed {run['seed']}"
+
+
+def identity(run: Mapping[str, Any]) -> str:
+    """Return the 8 characters under which a tracker knows this run, resumed or not: `tracking-id` in its folder.
+
+    They are drawn when the run is first tracked. Results that are deleted and trained again are another run.
+    """
+    path = Path(run["folder"], "tracking-id")
+    if not path.exists():
+        path.write_text(secrets.token_hex(4))
+    return path.read_text()
+
+
+def folder(target: Path | None, run: Mapping[str, Any], name: str) -> Path:
+    """Return the folder in which a tracker keeps a run: `name` in its own, or below `target` one for each seed."""
+    own = Path(run["folder"])
+    return own / name if target is None else target / run["task"] / run["entry"] / own.name
