@@ -79,7 +79,7 @@ def test_a_killed_run_goes_on_as_the_same_run(
     process = start_worker(*words, "1000000", env=env)
     while most_epochs(entry) < 4:
         assert process.poll() is None
-        time.sleep(0.02)
+        time.sleep(0.2)
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     ids = [(entry / f"seed-000{seed}" / "tracking-id").read_text() for seed in (0, 1)]
