@@ -107,32 +107,44 @@ class ShotSampler:
     def _part(self, angles: Tensor, trajectories: int, source: np.random.Generator) -> Tensor:
         """Return estimates (L, O) of so few lanes that their states fit into memory."""
         lanes = angles.shape[1]
-        x = angles.T[:, None].expand(-1, trajectories, -1)
+        place = np.arange(lanes).repeat(trajectories)  # of every trajectory, the run that gives its result
+        x = angles.T
         if self.noisy:
-            errors = torch.from_numpy(self._errors(lanes * trajectories, source)).to(x)
-            x = torch.cat([x, errors.reshape(lanes, trajectories, -1)], dim=2)
-        x = x.reshape(1, lanes * trajectories, -1)
+            # At small rates most trajectories have no error: those of a lane are one run of the circuit.
+            hit, errors = self._errors(lanes * trajectories, source)
+            x = torch.cat([x, x[torch.from_numpy(place[hit])]])
+            place[hit] = lanes + np.arange(len(hit))
+            angles_of_errors = x.new_zeros((len(x), errors.shape[1]))
+            angles_of_errors[lanes:] = math.pi * torch.from_numpy(errors)
+            x = torch.cat([x, angles_of_errors], dim=1)
+        x = x[None]
         if x.shape[2] == 0:  # a circuit has at least one input
             x = x.new_zeros((*x.shape[:2], 1))
         if self.options.shots is None:
-            values = self.simulator(x, x.new_zeros((1, 0)))[0].reshape(lanes, trajectories, -1).mean(1)
+            values = self.simulator(x, x.new_zeros((1, 0)))[0][torch.from_numpy(place)]
+            values = values.reshape(lanes, trajectories, -1).mean(1)
             return values * torch.from_numpy((1.0 - 2.0 * self.options.readout_error) ** self._weights).to(
                 values
             )
         means = np.zeros((lanes, len(self._weights)))
         for states, signs in zip(self._probabilities(x), self._signs):
-            means += self._draw(states.reshape(lanes, trajectories, -1), source) @ signs
+            means += self._draw(states, place.reshape(lanes, trajectories), source) @ signs
         return torch.from_numpy(means).to(angles)
 
-    def _errors(self, runs: int, source: np.random.Generator) -> NDArray[np.float64]:
-        """Return random error angles (runs, 2 per gate and wire): 0 or pi about X, 0 or pi about Z."""
-        columns = []
+    def _errors(self, runs: int, source: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Draw errors for a number of runs: which H have any (H,), and theirs (H, 2 per gate and wire): X, Z or not."""
+        drawn = []
         for wires in self._slots:
             rate = self.options.noise_rate / (1 if len(wires) == 2 else 10)
-            happens = source.random(runs) < rate
-            codes = np.where(happens, source.integers(0, 4 ** len(wires), runs), 0)
-            columns += [(codes >> bit) & 1 for bit in range(2 * len(wires))]
-        return math.pi * np.array(columns, np.float64).reshape(len(columns), runs).T
+            happens = np.flatnonzero(source.random(runs) < rate)
+            codes = np.zeros(runs, np.uint8)
+            codes[happens] = source.integers(0, 4 ** len(wires), len(happens), np.uint8)
+            drawn.append(codes)
+        hit = np.flatnonzero(np.logical_or.reduce(drawn)) if drawn else np.empty(0, np.int64)
+        columns = [
+            (codes[hit] >> bit) & 1 for codes, wires in zip(drawn, self._slots) for bit in range(2 * len(wires))
+        ]
+        return hit, np.array(columns, np.uint8).reshape(len(columns), len(hit)).T
 
     def _probabilities(self, x: Tensor) -> list[NDArray[np.float64]]:
         """Return the probabilities of each component's outcomes, (lanes, 2^qubits), of angles (1, lanes, A)."""
@@ -162,14 +174,24 @@ class ShotSampler:
             probabilities = probabilities.reshape(len(probabilities), -1)
         return probabilities
 
-    def _draw(self, probabilities: NDArray[np.float64], source: np.random.Generator) -> NDArray[np.float64]:
-        """Return frequencies (L, 2^n) of outcomes drawn from probabilities (L, T, 2^n), the shots shared out evenly."""
-        shots, trajectories = self.options.shots, probabilities.shape[1]
+    def _draw(
+        self, probabilities: NDArray[np.float64], place: NDArray[np.int64], source: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Return frequencies (L, 2^n) of outcomes drawn from each run's probabilities (R, 2^n).
+
+        The shots of a lane are shared out evenly among its trajectories, whose runs `place` names (L, T): the first L
+        runs are the lanes' own, and each of the others is one trajectory.
+        """
+        shots, (lanes, trajectories) = self.options.shots, place.shape
         assert shots is not None
         share = np.full(trajectories, shots // trajectories)
         share[: shots % trajectories] += 1
-        counts = source.multinomial(share, probabilities).sum(axis=1)
-        return counts / shots
+        of_run = np.bincount(place.ravel(), np.tile(share, lanes), len(probabilities)).astype(np.int64)
+        counts = source.multinomial(of_run, probabilities)
+        totals = counts[:lanes]
+        lane, trajectory = np.nonzero(place >= lanes)
+        np.add.at(totals, lane, counts[place[lane, trajectory]])
+        return totals / shots
 
 
 def _with_free_angles(circuit: Circuit, table: AngleTable) -> Circuit:
