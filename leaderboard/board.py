@@ -262,18 +262,10 @@ def build(
     """
     check_probability(alpha, "alpha")
     sections: list[Section] = []
-    problems = list(refused) + [f"{entry.folder}: {_PLANNED}" for entry in entries if entry.plan]
-    fixed = [entry for entry in entries if not entry.plan]
-    for task in sorted({entry.task for entry in fixed}):
-        members = [entry for entry in fixed if entry.task == task]
-        hashes = [entry.task_hash for entry in members]
-        definition = max(sorted(set(hashes)), key=hashes.count)
-        good = [entry for entry in members if entry.task_hash == definition]
-        problems += [
-            f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"
-            for entry in members
-            if entry.task_hash != definition
-        ]
+    ranked, unranked = of_one_definition(entries)
+    problems = [*refused, *unranked]
+    for task in sorted({entry.task for entry in ranked}):
+        good = [entry for entry in ranked if entry.task == task]
         for steps, provisional, group in _by_horizon(good, horizon):
             try:
                 chosen = rule or rule_of(group)
@@ -283,6 +275,30 @@ def build(
             except QrlSuiteError as error:
                 problems.append(f"task '{task}' at {steps} steps: {error}")
     return Leaderboard(tuple(sections), tuple(problems))
+
+
+def of_one_definition(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], list[str]]:
+    """Leave out entries of decision plans, and those made under another definition of their task than most.
+
+    Returns
+    -------
+    tuple
+        The entries that stay, task by task, and one line for each that was left out.
+    """
+    problems = [f"{entry.folder}: {_PLANNED}" for entry in entries if entry.plan]
+    fixed = [entry for entry in entries if not entry.plan]
+    kept = []
+    for task in sorted({entry.task for entry in fixed}):
+        members = [entry for entry in fixed if entry.task == task]
+        hashes = [entry.task_hash for entry in members]
+        definition = max(sorted(set(hashes)), key=hashes.count)
+        kept += [entry for entry in members if entry.task_hash == definition]
+        problems += [
+            f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"
+            for entry in members
+            if entry.task_hash != definition
+        ]
+    return kept, problems
 
 
 def _by_horizon(

@@ -273,6 +273,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         seeds=tuple(run.seed for run in kept),
         left_out=tuple(run.seed for run in runs if len(run.scores) < length),
         hours=sum(run.seconds for run in runs) / 3600,
+        clocked=any(run.clocked for run in runs),
         folder=store.path,
         identity=identity,
         options={

@@ -48,6 +48,8 @@ class EntryCurves(Shown):
         Every run's own curve by seed, shorter ones and longer ones; empty where all have T epochs.
     hours:
         Core-hours spent on the runs, those that were left out too.
+    clocked:
+        Whether any of these hours are by the clock and not processor time; None where the record does not say.
     identity:
         What the entry's hash covers: task, algorithm, model and their resolved options.
     options:
@@ -102,6 +104,7 @@ class EntryCurves(Shown):
     records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     networks: int | None = None
     fixed: int = 0
+    clocked: bool | None = None
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -228,6 +231,11 @@ class EntryCurves(Shown):
             self.algorithm, False
         )
         return self.networks is None and not one
+
+    @property
+    def has_circuit(self) -> bool:
+        """Whether its model is, in part, a quantum circuit."""
+        return self.executions > 0 or self.parameters[1] > 0
 
     @property
     def settings(self) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard, Row, Section
+from qrlsuite.leaderboard.costs import CostBoard, CostSection
 from qrlsuite.leaderboard.tables import tier_text
 from qrlsuite.leaderboard.times import TimeRow
 from qrlsuite.results.text import steps_text
@@ -118,6 +119,24 @@ def across_table(board: AcrossBoard) -> str:
     lines = [tuple(map(escaped, board.cells(place))) for place in range(len(board.order))]
     caption = f"{escaped(board.title)}. " + " ".join(f"{escaped(note)}." for note in board.notes())
     return _table("lrlllll", tuple(map(escaped, board.columns())), lines, caption, "tab:across")
+
+
+def cost_tables(board: CostBoard) -> str:
+    """Return one table per section of a board by cost."""
+    return "\n".join(_costs(section) for section in board.sections)
+
+
+def _costs(section: CostSection) -> str:
+    lines = [tuple(map(escaped, section.cells(row))) for row in section.rows]
+    caption = f"{escaped(section.title)}. " + " ".join(f"{escaped(note)}." for note in section.notes())
+    label = "".join(c if c.isascii() and c.isalnum() else "-" for c in section.task)
+    return _table(
+        "llrrrlllll",
+        tuple(map(escaped, section.columns())),
+        lines,
+        caption,
+        f"tab:{label}-{section.unit.name}",
+    )
 
 
 def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str) -> str:

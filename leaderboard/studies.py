@@ -10,12 +10,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from qrlsuite import options, specs
+from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.collect import read_entry
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS
@@ -82,9 +83,18 @@ def check(study: Study) -> None:
         options.build(specs.resolve(kind.options), picture.settings, f"{location}.settings")
         if kind.data is None and picture.entries:
             raise OptionError(f"{location}.entries: picture '{picture.kind}' shows no entries")
-        if (picture.evaluation is not None) != (kind.data == "episodes"):
-            rule = "needs" if kind.data == "episodes" else "takes no"
+        played = kind.data in ("episodes", "deployed")
+        if (picture.evaluation is not None) != played:
+            rule = "needs" if played else "takes no"
             raise OptionError(f"{location}.evaluation: picture '{picture.kind}' {rule} evaluation")
+        deployed = picture.evaluation.deployed if picture.evaluation is not None else None
+        if (deployed is not None) != (kind.data == "deployed"):
+            rule = "needs" if kind.data == "deployed" else "takes no"
+            raise OptionError(f"{location}.evaluation.deployed: picture '{picture.kind}' {rule} deployed")
+        if deployed is not None:
+            backend = specs.resolve(registry.circuit_backend(deployed.backend).options)
+            for value in deployed.values:
+                options.build(backend, deployed.chosen(value), f"{location}.evaluation.deployed")
 
 
 def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
@@ -206,6 +216,8 @@ def _attempt(
     try:
         if pictures.KINDS[picture.kind].data == "episodes":
             figure = _episodes(picture, entries, report)
+        elif pictures.KINDS[picture.kind].data == "deployed":
+            figure = _deployed(picture, entries, report)
         else:
             figure = pictures.draw(picture.kind, entries, **picture.settings)
     except QrlSuiteError as error:
@@ -215,9 +227,8 @@ def _attempt(
 
 def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
     """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
-    tasks = {entry.task_hash for entry in entries}
-    if len(tasks) > 1 or picture.evaluation is None:
-        raise OptionError(f"picture '{picture.kind}' shows entries of one task")
+    assert picture.evaluation is not None  # `check` saw to it
+    cells.one_task(entries, picture.kind)
     from qrlsuite.training import evaluation  # torch, which most pictures do without
 
     best, episodes = picture.evaluation.best, picture.evaluation.episodes
@@ -235,3 +246,38 @@ def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: R
     }
     histogram: Callable[..., Figure] = specs.resolve(f"{pictures.KINDS[picture.kind].module}:draw")
     return histogram(values, **settings)
+
+
+def _deployed(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
+    """Play the entries' best runs as they were trained, and those with a circuit on the backend at every value.
+
+    What was played on the backend is kept in the entries' folders, and not played again.
+    """
+    assert picture.evaluation is not None  # `check` saw to it, and to the next
+    assert picture.evaluation.deployed is not None
+    cells.one_task(entries, picture.kind)
+    from qrlsuite.leaderboard.pictures import deployed as drawing  # matplotlib
+    from qrlsuite.training import evaluation  # torch, which most pictures do without
+    from qrlsuite.training.deployment import Deployment
+
+    best, episodes, where = picture.evaluation.best, picture.evaluation.episodes, picture.evaluation.deployed
+    more: Mapping[str, Any] = {} if report is None else {"report": report}
+    lines = []
+    for entry in entries:
+        store = EntryStore(entry.folder)
+        trained = evaluation.trained(store, best, episodes, **more)
+        elsewhere = []
+        if getattr(store.entry().model_options, "backend", None) is not None:
+            for value in where.values:
+                deployment = Deployment(store, where.backend, where.chosen(value), best)
+                if not deployment.simulator:
+                    raise OptionError(
+                        f"{deployment.name} is no simulator: a study executes nothing on hardware; use `qrlsuite "
+                        "evaluate` with --yes"
+                    )
+                elsewhere.append(deployment.play(episodes, 0, **more))
+        lines.append(drawing.Line(trained, tuple(elsewhere)))
+    settings = {"title": style.heading(entries), "axis": where.vary, **picture.settings}
+    return drawing.draw(
+        lines, [f"{value:,}" if type(value) is int else f"{value}" for value in where.values], **settings
+    )

@@ -19,6 +19,7 @@ from qrlsuite.statistics import Comparison
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.across import AcrossBoard
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
+    from qrlsuite.leaderboard.costs import CostBoard, CostSection
 
 COLUMNS = (
     "tier",
@@ -273,6 +274,30 @@ def across_table(board: AcrossBoard) -> Table:
     return result
 
 
+def cost_table(section: CostSection) -> Table:
+    """Return a section by cost as a table."""
+    columns = section.columns()
+    result = table(
+        columns,
+        title=section.title,
+        caption="\n".join(section.notes()),
+        left=NAMES,
+        fixed=[name for name in columns if name not in NAMES],
+    )
+    for row in section.rows:
+        result.add_row(*map(Text, section.cells(row)))
+    return result
+
+
+def cost_markdown(board: CostBoard) -> str:
+    """Return a board by cost as Markdown."""
+    lines = []
+    for section in board.sections:
+        rows = [section.cells(row) for row in section.rows]
+        lines += _markdown_table(section.title, section.columns(), rows, section.notes())
+    return "\n".join(lines)
+
+
 def markdown(board: Leaderboard) -> str:
     """Return a board as Markdown: for each section two tables, each with heading and notes."""
     lines = []
@@ -345,6 +370,16 @@ def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
 def _harmless(value: object) -> object:
     """Keep spreadsheets from reading a name as a formula."""
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+def cost_html(board: CostBoard) -> str:
+    """Return a board by cost as HTML for a notebook."""
+    parts = []
+    for section in board.sections:
+        rows = [section.cells(row) for row in section.rows]
+        parts.append(html_table(section.columns(), rows, section.title, section.notes()))
+    parts += [f"<p>left out: {escape(line)}</p>" for line in board.refused]
+    return "".join(parts)
 
 
 def board_html(board: Leaderboard) -> str:

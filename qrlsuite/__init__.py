@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from qrlsuite import api as api
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
+    from qrlsuite.api import costs as costs
     from qrlsuite.api import decide as decide
     from qrlsuite.api import evaluate as evaluate
     from qrlsuite.api import load as load
@@ -32,12 +33,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "decide", "evaluate", "hookimpl", "load", "plot",
+    "__version__", "api", "board", "compare", "costs", "decide", "evaluate", "hookimpl", "load", "plot",
     "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(
-    {"board", "compare", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"}
+    {"board", "compare", "costs", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"}
 )
 """Functions of `qrlsuite.api` that are attributes here too: no submodule may have one of these names."""
 

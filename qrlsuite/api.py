@@ -6,6 +6,7 @@
     large = api.load("mlp width=64", task="beam6g", published=True)
     api.compare(large, small)
     api.board("beam6g", published=True)
+    api.costs("beam6g", by="executions", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
     api.decide("width.toml")
@@ -35,7 +36,9 @@ from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board as boards
 from qrlsuite.leaderboard import collect, rules, studies
+from qrlsuite.leaderboard import costs as by_cost
 from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
+from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.studies import Drawn
@@ -56,7 +59,7 @@ from qrlsuite.tuning.search import Request, Search, default_sampler, for_each_mo
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
-__all__ = ["board", "compare", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"]
+__all__ = ["board", "compare", "costs", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"]
 
 show_figures_in_notebook()
 
@@ -162,6 +165,53 @@ def board(
     lookup.check_tasks(folder, *task_names)
     selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
     return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
+
+
+def costs(
+    tasks: str | Sequence[str] | None = None,
+    *,
+    by: str = "executions",
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    alpha: float = ALPHA,
+    horizon: int | None = None,
+    entries: Sequence[str | EntryCurves] = (),
+    min_seeds: int = 1,
+) -> CostBoard:
+    """Rank entries by what their learning cost, task by task, within the same budget for all.
+
+    Parameters
+    ----------
+    by:
+        `executions` (of circuits), `shots` or `core-hours`.
+    tasks, runs, published, alpha, horizon, entries, min_seeds:
+        As for `board`.
+
+    Returns
+    -------
+    CostBoard
+        `sections`, one per task, with a row per entry; `refused`; `as_dict()`. Entries whose record does not hold the
+        cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
+
+    Raises
+    ------
+    UnknownNameError
+        If a task or an entry is unknown, or no entry is left.
+    OptionError
+        If there is no such cost, or the horizon is no whole number of epochs.
+    StoreError
+        If there is no results folder, and `published` is false.
+
+    Examples
+    --------
+    >>> found = costs("beam6g", runs="none-yet", published=True, entries=["vqc-native qubits=6", "mlp width=16"])
+    >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
+    [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
+    """
+    folder, task_names = Path(runs), _several(tasks)
+    lookup.check_tasks(folder, *task_names)
+    selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
+    return by_cost.build(selected, by, alpha, left_out)
 
 
 def compare(

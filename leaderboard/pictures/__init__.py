@@ -33,12 +33,13 @@ class Picture:
     module:
         The module with its dataclass of settings and its function `draw`.
     data:
-        What `draw` takes first: entries, or episode values by policy; None where it takes the settings alone.
+        What `draw` takes first: entries, episode values by policy, or scores of trained agents on a circuit backend;
+        None where it takes the settings alone.
     """
 
     summary: str
     module: str
-    data: Literal["entries", "episodes"] | None = "entries"
+    data: Literal["entries", "episodes", "deployed"] | None = "entries"
 
     @property
     def options(self) -> str:
@@ -53,11 +54,15 @@ KINDS: dict[str, Picture] = {
     "curves": Picture("learning curves: median, 5th to 95th percentile", f"{_HERE}.curves"),
     "surface": Picture("sample complexity over epsilon and delta, a map per entry", f"{_HERE}.surface"),
     "bars": Picture("sample complexity per cell, with percentile whiskers", f"{_HERE}.bars"),
+    "costs": Picture("sample complexity in steps, circuit executions and shots", f"{_HERE}.costs"),
     "scaling": Picture("sample complexity against width, qubits, degree, ...", f"{_HERE}.scaling"),
     "tiers": Picture("who outperforms whom, tier by tier", f"{_HERE}.tiers"),
     "few-runs": Picture("how 5 seeds mislead: two entries, or one against itself", f"{_HERE}.few_runs"),
     "histogram": Picture(
         "episode sums against optimal and random (qrlsuite evaluate)", f"{_HERE}.histogram", data="episodes"
+    ),
+    "deployed": Picture(
+        "scores of trained agents with shots or noise (studies)", f"{_HERE}.deployed", data="deployed"
     ),
     "estimator": Picture(
         "how likely P_hat falls below delta, given P and 100 runs", f"{_HERE}.estimator", data=None

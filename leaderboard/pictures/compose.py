@@ -82,6 +82,8 @@ def compose(
     data = pictures.KINDS[kind].data
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
+    if data == "deployed":
+        raise OptionError(f"picture '{kind}' is drawn by: qrlsuite study run deploy")
     selection = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
     if data is None:
         if any(selection.values()):

@@ -14,6 +14,7 @@ from markupsafe import Markup
 import qrlsuite
 from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.report import entries, planned, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
@@ -30,6 +31,7 @@ def render(
     title: str = "Sample complexity leaderboard",
     plans: Sequence[DecisionOutcome] = (),
     across: AcrossBoard | None = None,
+    costs: CostBoard | None = None,
 ) -> str:
     """Return a leaderboard as one self-contained HTML page.
 
@@ -46,6 +48,8 @@ def render(
         Decision plans, for a section of their own.
     across:
         A comparison over several tasks, for a section of its own.
+    costs:
+        The same entries by cost, for sections of their own.
     """
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
@@ -66,6 +70,7 @@ def render(
             entries=shown,
             plans=[planned.view(plan) for plan in plans],
             across=across,
+            costs=() if costs is None else costs.sections,
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,

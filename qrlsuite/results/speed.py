@@ -381,9 +381,22 @@ def _options(task: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, 
 
 
 def _nearest(subject: Speed, known: Sequence[Speed]) -> Speed | None:
-    """Return the most similar speed of the same kind: few options differ, and numbers by a small ratio."""
-    same = [speed for speed in known if speed.kind == subject.kind]
+    """Return the most similar speed of the same kind: few options differ, and numbers by a small ratio.
+
+    Exact circuits say nothing about sampled or noisy ones, nor does one way to gradients about another: with the
+    parameter-shift rule an epoch takes a hundred times as long.
+    """
+    same = [
+        speed
+        for speed in known
+        if speed.kind == subject.kind and _work(speed.options) == _work(subject.options)
+    ]
     return min(same, key=lambda speed: _distance(subject.options, speed.options), default=None)
+
+
+def _work(options: Mapping[str, Any]) -> tuple[bool, Any, Any]:
+    """Return how circuits are computed: whether with shots, with which noise, and by which gradient."""
+    return options.get("shots") is not None, options.get("noise_model"), options.get("gradient") or "auto"
 
 
 def _distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:

@@ -186,6 +186,8 @@ class SeedRun:
         (T, validation episodes), one row per epoch; (T, 1), their means, of seeds that were imported from an export.
     seconds:
         Core-seconds spent on it, see `SeedStore.seconds`.
+    clocked:
+        Whether any of them are time by the clock, which other work on the same cores stretches.
     executions:
         Circuit executions of training, gradients and validation together. A circuit that is sampled with many shots
         is executed once.
@@ -196,6 +198,7 @@ class SeedRun:
     scores: NDArray[np.float32 | np.float64]
     seconds: float
     executions: int
+    clocked: bool = False
 
     @property
     def finished(self) -> bool:
@@ -312,14 +315,19 @@ class SeedStore:
         StoreError
             If a line of the timings is damaged.
         """
-        total = 0.0
+        return self._timed()[0]
+
+    def _timed(self) -> tuple[float, bool]:
+        """Return the core-seconds, and whether any of them are by the clock."""
+        total, clocked = 0.0, False
         for line in read_lines(self.timings):
+            clocked |= "cpu" not in line
             for name in ("cpu",) if "cpu" in line else ("train", "validate"):
                 value = line.get(name, 0.0)
                 if not isinstance(value, int | float) or not 0 <= value < 1e12:
                     raise StoreError(f"{self.timings}: {name} = {value!r} is not a number of seconds")
                 total += value
-        return total
+        return total, clocked
 
     def read(self) -> SeedRun:
         """Return what the run holds so far.
@@ -348,7 +356,8 @@ class SeedStore:
                 "the seed's folder"
             )
         shaped = scores if rows else np.empty((0, 0), np.float32)
-        return SeedRun(self.seed, record, shaped, self.seconds(), self._executions(rows))
+        seconds, clocked = self._timed()
+        return SeedRun(self.seed, record, shaped, seconds, self._executions(rows), clocked)
 
     def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
         total = 0

@@ -59,11 +59,27 @@ class EntriesSection(_StudyTable):
     match: MatchSection | None = None
 
 
+class DeploymentSection(_StudyTable):
+    """A circuit backend on which trained agents act, with several values of one of its options."""
+
+    backend: Annotated[str, Field(min_length=1)]
+    vary: Annotated[str, Field(min_length=1, description="the option that takes each of the values")]
+    values: Annotated[list[bool | int | float | str], Field(min_length=1)]
+    options: Annotated[dict[str, Any], Field(description="its other options, as in --backend-set")] = {}
+
+    def chosen(self, value: Any) -> dict[str, Any]:
+        """Return the backend's options with one of the values."""
+        return {**self.options, self.vary: value}
+
+
 class EvaluationSection(_StudyTable):
     """For a picture of episodes: how many of each entry's runs play how many episodes."""
 
     best: Annotated[int, Field(ge=1)] = 10
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    deployed: Annotated[
+        DeploymentSection | None, Field(description="for picture 'deployed': where the agents act")
+    ] = None
 
 
 class PictureSection(_StudyTable):

@@ -136,6 +136,8 @@ STUDIES = (
     "estimator",
     "few-runs",
     "matched",
+    "deploy",
+    "shots",
 )
 SIZES = {"qubits = [": "qubits = [2, 3]", "layers = [": "layers = [1, 2]", "width = [": "width = [4, 8]"}
 """Grids of sizes, and what they become."""
@@ -151,6 +153,7 @@ def reduced(name: str, folder: Path) -> str:
     for beginning, grid in SIZES.items():
         text = re.sub(rf"{re.escape(beginning)}[^]]*\]", grid, text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
+    text = re.sub(r"\b(episodes|trajectories|shots) = \d+", r"\1 = 5", text)
     text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::10])}]", text)
 
     def task(match: re.Match[str]) -> str:
@@ -190,6 +193,42 @@ def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
         assert Path(picture["file"]).read_bytes().startswith(b"\x89PNG")
         assert all(point["seeds"] == seeds for point in picture["seeds"])
     assert answer("run", *words, "--dry-run")["steps"] == [], "nothing is trained twice"
+
+
+DEPLOYED = """
+format_version = 1
+name = "there"
+summary = "Trained agents elsewhere"
+
+[[entries]]
+name = "all"
+task = "TASK"
+model = ["vqc-native", "mlp"]
+
+[[pictures]]
+kind = "deployed"
+
+[pictures.evaluation]
+best = 2
+episodes = 3
+deployed = { backend = "native", vary = "shots", values = [1, 50] }
+"""
+
+
+def test_agents_of_a_study_act_on_a_backend_once(tmp_path: Path) -> None:
+    (tmp_path / "tiny.toml").write_text(TINY)
+    path, runs = tmp_path / "there.toml", tmp_path / "runs"
+    path.write_text(DEPLOYED.replace("TASK", str(tmp_path / "tiny.toml")))
+    words = [str(path), "--seeds", "2", "--epochs", "1", "--engine", "here", "--runs", str(runs)]
+    (drawn,) = answer("run", *words, "--set", "qubits=2", "--set", "layers=1")["pictures"]
+    assert drawn["problem"] is None, drawn
+    kept = sorted(runs.rglob("evaluations/*.jsonl"))
+    assert len(kept) == 2, "one for each value; the network has no circuit"
+    before, figure = [path.read_bytes() for path in kept], Path(drawn["file"]).read_bytes()
+    settings = ["--set", "qubits=2", "--set", "layers=1"]
+    (again,) = answer("draw", str(path), "--runs", str(runs), *settings)["pictures"]
+    assert [path.read_bytes() for path in kept] == before
+    assert Path(again["file"]).read_bytes() == figure
 
 
 def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp_path: Path) -> None:
@@ -498,6 +537,10 @@ def test_listing() -> None:
         (["show", "bad.toml"], "pictures.0.kind: unknown picture 'bar'; did you mean 'bars'"),
         (["show", "worse.toml"], "worse.toml: pictures.0.settings"),
         (["show", "episodes.toml"], "pictures.0.evaluation: picture 'histogram' needs evaluation"),
+        (["show", "nowhere.toml"], "pictures.0.evaluation.deployed: picture 'deployed' needs deployed"),
+        (["show", "backend.toml"], "unknown circuit backend 'nativ'; did you mean 'native'"),
+        (["show", "zero.toml"], "pictures.0.evaluation.deployed: shots = 0"),
+        (["show", "option.toml"], "no option 'shot'; did you mean 'shots'"),
     ],
 )
 def test_wrong_input_gives_one_clear_line_and_exit_code_2(
@@ -512,6 +555,12 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     Path("bad.toml").write_text(f'{head}kind = "bar"\n')
     Path("worse.toml").write_text(f'{head}kind = "estimator"\nsettings = {{ runs = "many" }}\n')
     Path("episodes.toml").write_text(f'{head}kind = "histogram"\n')
+    Path("nowhere.toml").write_text(f'{head}kind = "deployed"\nevaluation = {{ episodes = 3 }}\n')
+    there = f'{head}kind = "deployed"\n[pictures.evaluation.deployed]\n'
+    there += 'backend = "native"\nvary = "shots"\nvalues = [9]\n'
+    Path("backend.toml").write_text(there.replace('"native"', '"nativ"'))
+    Path("zero.toml").write_text(there.replace("[9]", "[9, 0]"))
+    Path("option.toml").write_text(there.replace('"shots"', '"shot"'))
     before = sorted(tmp_path.iterdir())
     monkeypatch.setattr(sys, "argv", ["qrlsuite", "study", *words])
     with pytest.raises(SystemExit) as stopped:

@@ -13,10 +13,13 @@ import pennylane as qml
 import pytest
 from typer.testing import CliRunner
 
+from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.evaluation import evaluate
 from qrlsuite.results.store import EntryStore
+from qrlsuite.studies import study
 from qrlsuite.training import deployment, evaluation
 from qrlsuite.training.deployment import Deployment, on_backend
 
@@ -131,6 +134,54 @@ def test_a_device_that_is_no_simulator_needs_a_yes(trained: EntryStore, unreliab
     assert unreliable.batches == 0  # nothing was executed
     unreliable.batches = 22
     assert evaluate(runs, entry, **given, yes=True).policies[1].name.endswith("device=unreliable.qpu shots=5")
+
+
+STUDY = """
+format_version = 1
+name = "hardware"
+summary = "Agents on a device"
+
+[[entries]]
+name = "vqc"
+task = "TASK"
+model = "vqc-native"
+options = { qubits = 2, layers = 1 }
+
+[[pictures]]
+kind = "deployed"
+
+[pictures.evaluation]
+episodes = 4
+deployed = { backend = "pennylane", vary = "shots", values = [5], options = { device = "unreliable.qpu" } }
+"""
+
+
+def test_a_study_executes_nothing_on_hardware(
+    trained: EntryStore, tiny_task: str, unreliable: type[Unreliable]
+) -> None:
+    unreliable.batches = 0
+    parsed = study.parse(STUDY.replace("TASK", tiny_task), "hardware.toml")
+    (drawn,) = studies.draw(parsed, parsed.members(), trained.path.parent.parent)
+    assert (
+        "device=unreliable.qpu shots=5 is no simulator: a study executes nothing on hardware" in drawn.problem
+    )
+    assert unreliable.batches == 0
+
+
+def test_from_python(trained: EntryStore) -> None:
+    runs, entry = trained.path.parent.parent, str(trained.path)
+    given: dict[str, Any] = {"best": 2, "episodes": 5, "progress": False, "runs": runs}
+    there: dict[str, Any] = {"backend": "native", "backend_options": {"shots": 1}}
+    found = api.evaluate(entry, **given, **there)
+    exact, sampled = found.policies[:2]
+    assert sampled.name == f"{exact.name} on native shots=1"
+    assert sampled.seeds == exact.seeds
+    np.testing.assert_array_equal(
+        sampled.returns, Deployment(trained, "native", {"shots": 1}, best=2).play(5, 0).returns
+    )
+    np.testing.assert_array_equal(exact.returns, api.evaluate(entry, **given).policies[0].returns)
+    with pytest.raises(OptionError, match="--backend-set needs --backend"):
+        api.evaluate(entry, **given, backend_options={"shots": 1})
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,16 @@ def test_a_reference_is_the_nearest_one() -> None:
     assert known.estimate(vqc(5, "gate=u3", "environment.degree=5"), 1).seconds == 1.0
 
 
+def test_exact_circuits_say_nothing_about_sampled_ones() -> None:
+    exact, sampled, guessed = vqc(4), vqc(4, "shots=100"), vqc(4, "shots=100", "gradient=spsa")
+    known = Speeds([Speed(KIND, {"qubits": 4, "ansatz": "iqp"}, 0.1, exact.hash)], REFERENCES)
+    assert known.estimate(sampled, 1).basis == "unknown"
+    known.references = [*REFERENCES, Speed(KIND, {"qubits": 4, "shots": 1000}, 8.0)]
+    assert known.estimate(sampled, 1) == Estimate(8.0, "reference", 3.0)
+    assert known.estimate(guessed, 1).basis == "unknown"
+    assert known.estimate(vqc(8), 1) == Estimate(pytest.approx(0.3), "scaled", 2.0)
+
+
 def test_what_was_measured_scales_the_references() -> None:
     eight = vqc(8)
     measured = Speed(KIND, {"qubits": 8, "ansatz": "iqp"}, 6.0, eight.hash, within=1.5)

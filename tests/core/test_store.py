@@ -229,10 +229,12 @@ def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[.
     lines = store.read_lines(seed.timings)
     assert [line["epoch"] for line in lines] == [1, 2]
     assert seed.seconds() == pytest.approx(sum(float(line["cpu"]) for line in lines))
+    assert not seed.read().clocked
     seed.timings.write_text(
         '{"train": 2.0, "validate": 1.0, "cpu": 0.5}\n{"train": 3.0, "validate": 1.0}\n', encoding="utf-8"
     )
     assert seed.seconds() == 4.5, "an older version's epoch counts by the clock"
+    assert seed.read().clocked
     seed.timings.write_text('{"train": 2.0, "validate": 1.0, "cpu": -1}\n', encoding="utf-8")
     with pytest.raises(StoreError, match="cpu = -1 is not a number of seconds"):
         seed.seconds()

@@ -79,6 +79,13 @@ EXPECTED = {
     "estimator": [],
     "few-runs": mlps("ddqn", (32, 64)),
     "matched": mlps("ddqn", (10, 11, 12, 13, 14)) + vqcs("ddqn", (6, 7, 8, 9, 10)),
+    "deploy": mlps("ddqn", (10, 16)) + vqcs("ddqn", (6, 10)),
+    "shots": vqcs("ddqn", (4,))
+    + [
+        f"beam6g ddqn vqc-native qubits=4 shots={n}{gradient}"
+        for gradient in ("", " gradient=spsa")
+        for n in (100, 1000, 10000)
+    ],
 }
 
 
@@ -215,6 +222,11 @@ def test_every_error_of_a_file_is_named_with_its_place() -> None:
             "two pictures are named 'picture'",
         ),
         ("grid = { qubits = [2, 3] }", "grid = { qubits = [] }", "entries.0.grid.qubits"),
+        (
+            'kind = "curves"',
+            'kind = "deployed"\nevaluation.deployed = { backend = "native", values = [1] }',
+            "missing key 'pictures.0.evaluation.deployed.vary'",
+        ),
         ("format_version = 1", "format_version = 2", "format_version = 2"),
         ("[[entries]]", "[[entries", "not valid TOML"),
     ],

@@ -32,6 +32,7 @@ from qrlsuite.leaderboard import board as boards
 from qrlsuite.leaderboard import latex, report, rules, tables
 from qrlsuite.leaderboard import plans as decision_plans
 from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
 
@@ -45,6 +46,15 @@ class Format(StrEnum):
     csv = "csv"
     html = "html"
     latex = "latex"
+
+
+class By(StrEnum):
+    """What entries are ranked by."""
+
+    steps = "steps"
+    executions = "executions"
+    shots = "shots"
+    core_hours = "core-hours"
 
 
 app = typer.Typer(cls=SeveralTasksGroup, invoke_without_command=True)
@@ -67,6 +77,12 @@ def leaderboard(
     ] = None,
     rule: RuleOption = None,
     alpha: AlphaOption = ALPHA,
+    by: Annotated[
+        By,
+        typer.Option(
+            "--by", help="What learning is measured in; other than steps: by mean cost below threshold."
+        ),
+    ] = By.steps,
     across: AcrossOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
@@ -83,6 +99,9 @@ def leaderboard(
     compares entries that were trained on several tasks with the same options. The page also shows the plans of
     `qrlsuite decide` in the results folder.
 
+    --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
+    the same budget for all. Entries whose record does not hold it, or not so that it can be compared, have no rank.
+
     Example: qrlsuite leaderboard --task beam6g --format markdown
     """
     if context.invoked_subcommand is not None:
@@ -90,9 +109,27 @@ def leaderboard(
 
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
+    if by is not By.steps and (across is not None or rule is not None):
+        other = "--across" if across is not None else f"--rule {rule}"
+        raise OptionError(f"--by {by.value}: leave {other} out, which counts in environment steps")
     if across is not None:
         _across(across, task, entry or [], horizon, min_seeds, format_, output, rule, alpha, published, runs)
         return
+    costs = None
+    if by is not By.steps:
+        costs = api.costs(
+            task,
+            by=by.value,
+            runs=runs,
+            published=published,
+            alpha=alpha,
+            horizon=horizon,
+            entries=entry or (),
+            min_seeds=min_seeds,
+        )
+        if format_ is not Format.html:
+            _by_cost(costs, format_, task, runs)
+            return
     board = api.board(
         task,
         runs=runs,
@@ -108,13 +145,10 @@ def leaderboard(
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
-    if format_ is Format.html and _page(board, output, runs, [task] if task else [], published):
+    if format_ is Format.html and _page(board, output, runs, [task] if task else [], published, costs=costs):
         return
     if not board.sections:
-        raise UnknownNameError(
-            f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run; "
-            "--published shows those that come with the suite"
-        )
+        raise _empty(runs, task)
     if format_ is Format.markdown:
         typer.echo(tables.markdown(board))
     elif format_ is Format.csv:
@@ -131,6 +165,34 @@ def leaderboard(
             typer.echo(f"rule '{name}': {promise}")
 
 
+def _empty(runs: Path, task: str | None) -> UnknownNameError:
+    return UnknownNameError(
+        f"{runs} holds no results{f' of task {task}' if task else ''} yet: qrlsuite run; "
+        "--published shows those that come with the suite"
+    )
+
+
+def _by_cost(board: CostBoard, format_: Format, task: str | None, runs: Path) -> None:
+    """Write a board by cost."""
+    if format_ is Format.json:
+        typer.echo(json.dumps(board.as_dict()))
+        return
+    for line in board.refused:
+        typer.echo(f"left out: {line}", err=True)
+    if not board.sections:
+        raise _empty(runs, task)
+    if format_ is Format.markdown:
+        typer.echo(tables.cost_markdown(board))
+    elif format_ is Format.csv:
+        typer.echo(tables.csv_rows(board.flat()), nl=False)
+    elif format_ is Format.latex:
+        typer.echo(latex.cost_tables(board), nl=False)
+    else:
+        console = table_console(tables.WIDE)
+        for section in board.sections:
+            console.print(tables.cost_table(section))
+
+
 def _page(
     board: Leaderboard,
     output: Path | None,
@@ -138,6 +200,7 @@ def _page(
     tasks: Sequence[str],
     published: bool,
     across: several.AcrossBoard | None = None,
+    costs: CostBoard | None = None,
 ) -> bool:
     """Write the page, with the decision plans of the tasks; returns whether there is anything to show."""
     plans, unreadable = decision_plans.collected(runs, tasks, published)
@@ -147,7 +210,7 @@ def _page(
         return False
     path = output or runs / "leaderboard.html"
     shown = replace(board, refused=(*board.refused, *unreadable))
-    write_atomically(path, report.render(shown, plans=plans, across=across).encode())
+    write_atomically(path, report.render(shown, plans=plans, across=across, costs=costs).encode())
     typer.echo(f"wrote {path}")
     return True
 

@@ -1,0 +1,105 @@
+"""Sample complexity of entries in environment steps, circuit executions and shots, side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from qrlsuite import options
+from qrlsuite.leaderboard.costs import price
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.results.text import steps_text
+
+AXES = {"steps": "environment steps", "executions": "circuit executions", "shots": "shots"}
+
+
+@dataclass(frozen=True)
+class CostsOptions:
+    """Settings of the picture."""
+
+    units: Annotated[
+        list[Literal["steps", "executions", "shots"]],
+        Field(min_length=1, description="what sample complexity is counted in, a panel each"),
+    ] = Field(default_factory=lambda: ["steps", "executions", "shots"])
+    epsilons: Annotated[
+        list[float] | None,
+        Field(min_length=1, max_length=1, description="one; by default the reference cell's"),
+    ] = None
+    deltas: Annotated[
+        list[float] | None,
+        Field(min_length=1, max_length=1, description="one; by default the reference cell's"),
+    ] = None
+    horizon: Annotated[
+        int | None,
+        Field(ge=1, description="environment steps at which S_hat is capped; by default the task's"),
+    ] = None
+
+
+def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+    """Draw S_hat of each entry at one cell, with its 5th to 95th percentile, in each unit on a logarithmic axis.
+
+    An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.costs.price`. One that
+    has no such cost (networks execute no circuits, exact values take no shots) has no point there.
+
+    Raises
+    ------
+    OptionError
+        If the entries belong to different tasks, or a setting does not fit them.
+    """
+    chosen: CostsOptions = options.build(CostsOptions, settings, "picture 'costs'")
+    cells.one_task(entries, "costs")
+    reference = entries[0].task_file.ranking.reference_grid
+    grid = reference
+    if chosen.epsilons or chosen.deltas:
+        epsilons = chosen.epsilons or (
+            None if reference.epsilons is None else list(map(float, reference.levels))
+        )
+        grid = cells.choose_grid(entries[0], epsilons, chosen.deltas or list(map(float, reference.deltas)))
+    horizon = cells.choose_horizon(entries, chosen.horizon)
+    measured = [cells.measure(entry, grid, horizon) for entry in entries]
+    figure = Figure(figsize=(2.2 + 2.9 * len(chosen.units), 1.6 + 0.36 * len(entries)), layout="constrained")
+    panels = figure.subplots(1, len(chosen.units), squeeze=False, sharey=True)[0]
+    heights = np.arange(len(entries))[::-1]
+    for axes, unit in zip(panels, chosen.units):
+        for k, (entry, found) in enumerate(zip(entries, measured)):
+            per_step = price(entry, unit).per_step
+            if math.isnan(per_step):
+                axes.text(
+                    0.02, heights[k], "none", transform=axes.get_yaxis_transform(), va="center", fontsize=8
+                )
+                continue
+            look = style.of(entry, k)
+            point, (low, high) = found.points[0, 0] * per_step, found.intervals[0, 0] * per_step
+            axes.plot([max(low, per_step), high], [heights[k]] * 2, color=look.color, lw=1.6)
+            axes.plot(max(point, per_step), heights[k], look.marker, color=look.color, ms=7, mec="white")
+            if found.unsettled[0, 0]:
+                axes.text(high * 1.08, heights[k], "≥", va="center", fontsize=9)
+        axes.set_xscale("log")
+        axes.margins(x=0.15)
+        axes.set_xlabel(f"Ŝ ({AXES[unit]})")
+        axes.xaxis.set_major_formatter(steps_text)
+        style.tidy(axes)
+    panels[0].set_yticks(
+        heights, [f"{name}: {style.seeds_text(e)}" for name, e in zip(style.labels(entries), entries)]
+    )
+    panels[0].set_ylim(-0.6, len(entries) - 0.4)
+    cell = f"{cells.level_name(grid)} = {cells.levels(grid)[0]}, δ = {cells.probabilities(grid)[0]}"
+    figure.suptitle(
+        f"{style.heading(entries)}: sample complexity Ŝ at {cell}", x=0.01, ha="left", fontsize="medium"
+    )
+    style.footnotes(
+        figure,
+        "lines: 5th to 95th percentile",
+        "≥: a lower bound" if any(found.unsettled.any() for found in measured) else "",
+        "executions and shots: of training, gradients and validation",
+        cells.cut_note(entries, horizon),
+        style.note(entries),
+    )
+    return figure

@@ -1,0 +1,216 @@
+"""Boards by cost: who is first by hand, what is not ranked and why, and every way to write them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from qrlsuite import api
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import costs, report
+from qrlsuite.leaderboard.curves import EntryCurves
+from tests.leaderboard import boards
+
+STEPS = 2000
+"""Environment steps of an epoch."""
+PAID = {"epochs": 100, "executions": 1, "hours": 1}
+
+
+def learner(
+    label: str, epochs_below: int, per_step: float, seeds: int = 20, epochs: int = 100, **facts: Any
+) -> EntryCurves:
+    """An entry whose runs score 0, and 1 from an epoch on (every second one an epoch later); each step has a cost."""
+    entry = boards.entry(label, seeds, epochs, quantum=144)
+    curves = np.ones((seeds, epochs))
+    for run in range(seeds):
+        curves[run, : epochs_below + run % 2] = 0
+    paid = {
+        "epochs": epochs,
+        "executions": per_step * STEPS * epochs,
+        "hours": per_step * STEPS * epochs / 3600,
+    }
+    known = {"clocked": False, "processors": ("Alpha",)}
+    return replace(entry, curves=curves, records=dict.fromkeys(range(seeds), paid), **{**known, **facts})
+
+
+def section(*entries: EntryCurves, by: str = "executions") -> costs.CostSection:
+    (found,) = costs.build(entries, by).sections
+    return found
+
+
+def labels(found: costs.CostSection) -> list[str]:
+    return [row.entry.label for row in found.rows]
+
+
+def test_the_cheaper_step_can_outweigh_the_fewer_steps() -> None:
+    few, cheap = learner("few steps", 20, 20), learner("cheap steps", 30, 10)
+    found = section(few, cheap)
+    assert found.budget == 100 * STEPS * 10, "what the cheaper one spent in all"
+    assert labels(found) == ["cheap steps", "few steps"]
+    first, second = found.rows
+    assert found.mean(first).mean * found.part == pytest.approx(30.5 * STEPS * 10, abs=found.part)
+    assert found.mean(second).mean * found.part == pytest.approx(20.5 * STEPS * 20, abs=found.part)
+    assert [found.rank_text(row) for row in found.rows] == ["1", "2"]
+    assert found.cells(first)[4:6] == ("10", "620k (620k to 620k)"), (
+        "31 epochs: half of the runs are there after 30"
+    )
+    assert found.cells(first)[-2:] == ("few steps", "-")
+    assert found.cells(second)[-2:] == ("-", "cheap steps")
+    (by_steps,) = boards.of([few, cheap]).sections
+    assert [row.entry.label for row in by_steps.times.rows] == ["few steps", "cheap steps"]
+
+
+def test_cheap_steps_do_not_make_an_entry_first_that_never_learns() -> None:
+    never, learns = learner("never", 100, 1), learner("learns", 20, 10)
+    found = section(never, learns)
+    assert found.budget == 100 * STEPS, "10 of 100 epochs of the one that learns"
+    assert [found.mean(row).at_cap.mean() for row in found.rows] == [1, 1]
+    assert [found.rank_text(row) for row in found.rows] == ["1-2", "1-2"]
+    of_never = next(row for row in found.rows if row.entry is never)
+    assert found.cells(of_never)[5] == ">= 200k (200k to 200k, at cap)"
+
+
+def test_equal_prices_are_compared_at_whole_epochs() -> None:
+    found = section(learner("a", 20, 7), learner("b", 30, 7))
+    assert found.exact
+    assert found.part == pytest.approx(7 * STEPS)
+    assert [found.mean(row).mean for row in found.rows] == [20.5, 30.5]
+    assert not any("parts" in line for line in found.notes())
+
+
+@pytest.mark.parametrize(
+    ("change", "by", "problem"),
+    [
+        ({"records": {0: {**PAID, "executions": 0}}, "parameters": (9, 0)}, "executions", "executes no circuits"),
+        ({"records": {0: {**PAID, "executions": 0}}}, "executions", "no circuit executions in its"),
+        ({}, "shots", "exact values, without shots"),
+        ({"records": {0: {**PAID, "hours": 0}}}, "core-hours", "no times in its record"),
+        ({"records": {}}, "core-hours", "no times in its record"),
+        ({"clocked": None}, "core-hours", "does not say whether its hours are processor time"),
+        ({"clocked": True}, "core-hours", "hours by the clock"),
+        ({"processors": ("Alpha", "Beta")}, "core-hours", "made on Alpha, Beta"),
+        ({"processors": ()}, "core-hours", "its processor is not recorded"),
+        ({"processors": ("Beta",)}, "core-hours", "made on Beta, the others on Alpha"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_compared_has_no_rank_and_a_reason(
+    change: dict[str, Any], by: str, problem: str
+) -> None:
+    options = {"model": {"shots": 100}}
+    others = [learner("one", 20, 2, options=options), learner("two", 30, 2, options=options)]
+    found = section(replace(learner("odd", 1, 0.1), **change), *others, by=by)
+    assert labels(found) == ["one", "two", "odd"], "not first, whatever it would cost"
+    assert [found.rank_text(row) for row in found.rows] == ["1", "2", "-"]
+    assert problem in found.rows[2].price.problem
+    assert any(line.startswith("not ranked: odd: ") and problem in line for line in found.notes())
+    assert found.row_dict(found.rows[2])["comparable"] is False
+
+
+def test_numbers_that_cannot_be_compared_are_marked() -> None:
+    found = section(learner("clock", 20, 2, clocked=True), learner("other", 20, 2), by="core-hours")
+    marked = next(row for row in found.rows if row.entry.label == "clock")
+    assert found.cells(marked)[4].startswith("~")
+    assert "~ : not to be compared with the others" in found.notes()
+    alone = section(learner("clock", 20, 2, clocked=True), by="core-hours")
+    assert alone.compared is None
+    assert alone.row_dict(alone.rows[0])["mean_cost"] is None
+
+
+def test_seeds_that_cost_differently_and_seeds_without_a_record() -> None:
+    entry = learner("uneven", 20, 1)
+    records = {
+        seed: {**record, "executions": 1000 * (2 if seed else 3)} for seed, record in entry.records.items()
+    }
+    found = section(replace(entry, records=records))
+    assert any("up to 1.5 times as much in one seed" in line for line in found.notes())
+    records[0]["executions"] = 0
+    found = section(replace(entry, records=records))
+    assert found.rows[0].price.problem == "the records of some of its seeds hold no executions"
+
+
+def test_shots_are_executions_times_shots() -> None:
+    many, few = ({"model": {"shots": shots}} for shots in (1000, 10))
+    entries = [learner("many", 20, 1, options=many), learner("few", 40, 1, options=few)]
+    assert labels(section(*entries)) == ["many", "few"]
+    assert any("--by shots counts shots" in line for line in section(*entries).notes())
+    found = section(*entries, by="shots")
+    assert labels(found) == ["few", "many"]
+    assert [row.price.per_step for row in found.rows] == [10, 1000]
+
+
+def test_few_seeds_and_short_entries() -> None:
+    short = learner("short", 1, 0.001, epochs=3)
+    board = costs.build([learner("a", 20, 2), learner("few", 20, 2, seeds=5), short], "executions")
+    assert [board.sections[0].rank_text(row) for row in board.sections[0].rows] == ["1", "undecided"]
+    assert board.refused == ("short: ends at 6000 steps; --horizon 6000 shows it",)
+    assert board.sections[0].budget == 2 * 100 * STEPS, "the short entry does not shrink the budget"
+
+
+def test_bad_units() -> None:
+    with pytest.raises(
+        OptionError, match="choose among steps, executions, shots, core-hours; did you mean 'shots'"
+    ):
+        costs.build([learner("a", 20, 2)], "shot")
+    with pytest.raises(OptionError, match="alpha"):
+        costs.build([learner("a", 20, 2)], "shots", alpha=2)
+
+
+def say(*words: str) -> Result:
+    command = ["leaderboard", "--published", "--task", "beam6g", "--runs", "none", *words]
+    return CliRunner().invoke(build(), command, catch_exceptions=False)
+
+
+PAIR = ("--entry", "vqc-native qubits=6", "--entry", "beam6g/ddqn mlp width=32")
+
+
+def test_the_board_in_every_format(tmp_path: Any) -> None:
+    content = json.loads(say("--by", "executions", *PAIR, "--format", "json").stdout)
+    (found,) = content["sections"]
+    circuit, network = found["rows"]
+    assert (found["by"], circuit["ranks"], network["ranks"]) == ("executions", [1, 1], None)
+    assert circuit["per_step"] == pytest.approx((60_400 + 3_686_400) / 2000), "of an epoch, by its record"
+    assert circuit["sample_complexity"] == pytest.approx(166_000 * circuit["per_step"])
+    assert network["problem"] == "executes no circuits"
+    rows = list(csv.DictReader(io.StringIO(say("--by", "executions", *PAIR, "--format", "csv").stdout)))
+    assert [row["rank_best"] for row in rows] == ["1", ""]
+    markdown = say("--by", "executions", *PAIR, "--format", "markdown").stdout
+    assert "### beam6g by executions, within 375M" in markdown
+    latex = say("--by", "executions", *PAIR, "--format", "latex").stdout
+    assert r"\label{tab:beam6g-executions}" in latex
+    assert "1.87k" in latex
+    assert "not ranked: ddqn mlp width=32: executes no" in " ".join(
+        say("--by", "executions", *PAIR).stdout.split()
+    )
+    page = tmp_path / "page.html"
+    assert say("--by", "executions", *PAIR, "--format", "html", "--out", str(page)).exit_code == 0
+    assert '<a href="#cost-1">beam6g by executions</a>' in page.read_text()
+    assert "1.87k" in page.read_text()
+
+
+def test_the_page_shows_costs_beside_steps() -> None:
+    entries = [learner("a", 20, 2), learner("<b>", 30, 2)]
+    page = report.render(boards.of(entries), costs=costs.build(entries, "executions"))
+    assert page.count('id="cost-1-title"') == 1
+    assert '<th scope="row">&lt;b&gt;</th>' in page
+
+
+def test_costs_are_not_mixed_with_what_counts_steps() -> None:
+    for words in (("--rule", "times"), ("--across", "beam6g", "cartpole")):
+        result = CliRunner().invoke(build(), ["leaderboard", "--by", "shots", *words])
+        assert result.exit_code != 0
+        assert "which counts in environment steps" in str(result.exception) + result.output
+
+
+def test_an_object_shows_itself() -> None:
+    board = api.costs("beam6g", by="executions", runs="none", published=True, entries=["vqc-native qubits=6"])
+    assert "375M" in board._repr_html_()
+    assert board.as_dict()["refused"] == []
