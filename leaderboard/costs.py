@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed, nearest
 from qrlsuite.leaderboard import collect, tables
 from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_one_definition, ranking_of
@@ -342,11 +343,11 @@ class CostSection:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class CostBoard:
+@dataclass(frozen=True, eq=False, repr=False)
+class CostBoard(Shown):
     """The result of `build`: a section for each task, and lines about entries that were left out.
 
-    In a notebook, and printed by rich, it is a table per section.
+    It shows itself as a table per section.
     """
 
     sections: tuple[CostSection, ...]
@@ -357,9 +358,6 @@ class CostBoard:
             yield tables.cost_table(section)
         for line in self.refused:
             yield Text(f"left out: {line}")
-
-    def _repr_html_(self) -> str:
-        return tables.cost_html(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""

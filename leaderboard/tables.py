@@ -372,16 +372,6 @@ def _harmless(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
-def cost_html(board: CostBoard) -> str:
-    """Return a board by cost as HTML for a notebook."""
-    parts = []
-    for section in board.sections:
-        rows = [section.cells(row) for row in section.rows]
-        parts.append(html_table(section.columns(), rows, section.title, section.notes()))
-    parts += [f"<p>left out: {escape(line)}</p>" for line in board.refused]
-    return "".join(parts)
-
-
 def board_html(board: Leaderboard) -> str:
     """Return a board as HTML for a notebook: every section with its heading, table and notes."""
     parts = []

@@ -213,4 +213,5 @@ def test_costs_are_not_mixed_with_what_counts_steps() -> None:
 def test_an_object_shows_itself() -> None:
     board = api.costs("beam6g", by="executions", runs="none", published=True, entries=["vqc-native qubits=6"])
     assert "375M" in board._repr_html_()
+    assert "375M" in repr(board)
     assert board.as_dict()["refused"] == []

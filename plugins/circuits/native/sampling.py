@@ -142,7 +142,9 @@ class ShotSampler:
             drawn.append(codes)
         hit = np.flatnonzero(np.logical_or.reduce(drawn)) if drawn else np.empty(0, np.int64)
         columns = [
-            (codes[hit] >> bit) & 1 for codes, wires in zip(drawn, self._slots) for bit in range(2 * len(wires))
+            (codes[hit] >> bit) & 1
+            for codes, wires in zip(drawn, self._slots)
+            for bit in range(2 * len(wires))
         ]
         return hit, np.array(columns, np.uint8).reshape(len(columns), len(hit)).T
 
