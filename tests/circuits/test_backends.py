@@ -2,11 +2,15 @@
 
 import functools
 import importlib
+import importlib.util
 import pkgutil
+import sys
+import types
 
 import numpy as np
 import pytest
 import torch
+from qiskit.providers.fake_provider import GenericBackendV2
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import GATES, Circuit, ansatz, create_backend, expectations
@@ -564,8 +568,21 @@ def test_a_circuit_is_transpiled_for_a_device_and_takes_its_noise(shots):
     assert 1e-4 < error < (0.1 if shots is None else 0.25)
 
 
-def test_a_device_that_is_too_small_is_refused():
-    pytest.importorskip("qiskit_ibm_runtime")
+def test_a_snapshot_of_a_device_needs_its_package():
+    if importlib.util.find_spec("qiskit_ibm_runtime") is not None:
+        pytest.skip("qiskit-ibm-runtime is installed")
     device = {"estimator": "aer", "noise_model": "FakeManilaV2"}
-    with pytest.raises(OptionError, match="'FakeManilaV2' has 5 qubits, the circuit 6"):
+    with pytest.raises(OptionError, match=r"'FakeManilaV2' .*is missing; pip install qiskit-ibm-runtime"):
+        create_backend("qiskit", ansatz("cz", 2, 1), **device)
+
+
+def test_a_device_that_is_too_small_is_refused(monkeypatch):
+    devices = types.ModuleType("qiskit_ibm_runtime.fake_provider")  # in its place, a device of Qiskit's own
+    devices.FakeSmallV2 = lambda: GenericBackendV2(5, seed=0)
+    monkeypatch.setitem(sys.modules, "qiskit_ibm_runtime", types.ModuleType("qiskit_ibm_runtime"))
+    monkeypatch.setitem(sys.modules, devices.__name__, devices)
+    device = {"estimator": "aer", "noise_model": "FakeSmallV2"}
+    with pytest.raises(OptionError, match="'FakeSmallV2' has 5 qubits, the circuit 6"):
         create_backend("qiskit", ansatz("cz", 6, 1), **device)
+    with pytest.raises(OptionError, match="'FakeSmalV2' is unknown; did you mean 'FakeSmallV2'"):
+        create_backend("qiskit", ansatz("cz", 5, 1), **{**device, "noise_model": "FakeSmalV2"})
