@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long verify docs site dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-long verify docs site pictures dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -41,6 +41,10 @@ docs: install-dev
 site: docs
 	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board.html
 	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
+
+# Every picture of docs/images that shows published entries; docs/pictures.py lists all, with their commands.
+pictures: install-dev
+	$(BIN)/python docs/pictures.py
 
 # What a release publishes; and what a user gets of it, who has no clone.
 dist: $(BIN)/python

@@ -1,0 +1,182 @@
+"""How every picture of docs/images is made: `make pictures`.
+
+A picture of published entries carries a mark, a hash of these entries and of its command. Where entries have changed
+since, `tests/docs/test_pictures.py` says that it is stale. Pictures of runs that are not published are kept as they are;
+they are listed with the command that trains the runs and draws them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs" / "images"
+MARK = "qrlsuite-made-from"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A picture that a command draws from published entries; `--out` follows the command.
+
+    Attributes
+    ----------
+    entries:
+        Patterns of the folders, below leaderboard/entries, that it shows.
+    """
+
+    command: str
+    entries: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Screenshot:
+    """The page that a command writes of published entries, in a browser.
+
+    Attributes
+    ----------
+    width, height:
+        Of the picture, in pixels.
+    heading:
+        Where the picture begins; without one, at the top of the page.
+    """
+
+    command: str
+    entries: tuple[str, ...]
+    width: int
+    height: int
+    heading: str = ""
+
+
+@dataclass(frozen=True)
+class Unpublished:
+    """A picture of runs that are not published: the command trains them, draws it, and says where it lies."""
+
+    command: str
+
+
+Picture = Plot | Screenshot | Unpublished
+BOARD = "leaderboard --published --task beam6g --format html"
+PICTURES: dict[str, Picture] = {
+    "cartpole.png": Plot("plot curves --task cartpole --published", ("cartpole/*",)),
+    "curves.png": Plot(
+        "plot curves --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=16 lr=0.002' "
+        "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
+        ("beam6g/*",),
+    ),
+    "report-narrow.png": Screenshot(BOARD, ("beam6g/*",), 390, 1000),
+    "report-times.png": Screenshot(BOARD, ("beam6g/*",), 1160, 1104, "By mean time below threshold"),
+    "report-wide.png": Screenshot(BOARD, ("beam6g/*",), 1400, 1240),
+    "policies.png": Unpublished(
+        "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
+    ),
+    "study-ansatz.png": Unpublished("study run ansatz"),
+    "study-antennas.png": Unpublished("study run antennas"),
+    "study-degree.png": Unpublished("study run degree"),
+    "study-depth.png": Unpublished("study run ablation"),
+    "study-fig1.png": Unpublished("study run fig1"),
+    "study-fig6.png": Unpublished("study run fig6"),
+    "study-fig7.png": Unpublished("study run fig7"),
+    "study-matched.png": Unpublished("study run matched"),
+    "study-ppo.png": Unpublished("study run ppo"),
+}
+
+
+def made_from(picture: Plot | Screenshot) -> str:
+    """Return the mark of a picture: a hash of its command and of the published entries that it shows."""
+    digest = hashlib.sha256(repr(picture).encode())
+    published = ROOT / "leaderboard" / "entries"
+    for path in sorted(path for pattern in picture.entries for path in published.glob(f"{pattern}/*")):
+        digest.update(path.relative_to(published).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def mark_of(path: Path) -> str | None:
+    """Return the mark that a picture carries."""
+    with Image.open(path) as image:
+        return image.info.get(MARK)
+
+
+def main() -> None:
+    """Make every picture of published entries, and name the others."""
+    with browser() as chromium, tempfile.TemporaryDirectory() as folder:
+        for name, picture in PICTURES.items():
+            if isinstance(picture, Unpublished):
+                print(f"kept {name}: its runs are not published; qrlsuite {picture.command}")
+                continue
+            made = Path(folder, name)
+            if isinstance(picture, Plot):
+                _run(picture.command, made)
+            elif chromium is None:
+                print(f"kept {name}: no browser on the path ({', '.join(BROWSERS)}), or no playwright")
+                continue
+            else:
+                page = Path(folder, hashlib.sha256(picture.command.encode()).hexdigest() + ".html")
+                if not page.exists():
+                    _run(picture.command, page)
+                _photograph(chromium, page, picture, made)
+            _mark(made, made_from(picture), IMAGES / name)
+            print(f"made {name}: qrlsuite {picture.command}")
+
+
+def _run(command: str, out: Path) -> None:
+    """Run a command of the suite, which sees published entries and no runs of its user."""
+    words = [sys.executable, "-m", "qrlsuite", *shlex.split(command), "--out", str(out)]
+    subprocess.run([*words, "--runs", str(out.parent / "runs")], check=True, stdout=subprocess.DEVNULL)
+
+
+def _mark(made: Path, mark: str, place: Path) -> None:
+    info = PngInfo()
+    info.add_text(MARK, mark)
+    with Image.open(made) as image:
+        image.save(place, pnginfo=info, optimize=True)
+
+
+@contextlib.contextmanager
+def browser() -> Iterator[Any]:
+    """Start an installed browser; None where there is none."""
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        path = None
+    if path is None:
+        yield None
+        return
+    with sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+def _photograph(chromium: Any, page: Path, picture: Screenshot, out: Path) -> None:
+    tab = chromium.new_page(viewport={"width": picture.width, "height": 900})
+    tab.set_default_timeout(300_000)
+    tab.goto(page.as_uri())
+    top = 0.0
+    if picture.heading:
+        top = tab.get_by_role("heading", name=picture.heading).first.bounding_box()["y"] - 12
+    tab.screenshot(
+        path=str(out),
+        full_page=True,
+        clip={"x": 0, "y": top, "width": picture.width, "height": picture.height},
+    )
+    tab.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""No picture without a command, none of entries that have changed since, and none that no page shows."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def _load() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("docs_pictures", ROOT / "docs" / "pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+pictures = _load()
+PUBLISHED = {name: of for name, of in pictures.PICTURES.items() if not isinstance(of, pictures.Unpublished)}
+
+
+def test_every_picture_has_a_command_and_a_page() -> None:
+    assert {path.name for path in pictures.IMAGES.iterdir()} == set(pictures.PICTURES)
+    shown = [
+        re.findall(r"\((?:docs/)?images/([\w.-]+)\)", page.read_text())
+        for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))
+    ]
+    assert {name for names in shown for name in names} == set(pictures.PICTURES)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_picture_shows_the_entries_as_they_are_published_now(name: str) -> None:
+    assert pictures.mark_of(pictures.IMAGES / name) == pictures.made_from(PUBLISHED[name]), (
+        f"docs/images/{name} was made from other entries or by another command: run `make pictures`"
+    )
+
+
+@pytest.mark.parametrize("name", pictures.PICTURES)
+def test_a_command_is_one_that_the_suite_understands(name: str) -> None:
+    from qrlsuite.cli.app import application
+
+    words = shlex.split(pictures.PICTURES[name].command)
+    command = application()[0]
+    while hasattr(command, "get_command"):
+        command = command.get_command(None, words.pop(0))
+        assert command is not None, name
+    command.make_parser(command.context_class(command)).parse_args(words)  # raises at an unknown option
+
+
+def test_a_mark_follows_the_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = tmp_path / "leaderboard" / "entries" / "task" / "entry"
+    entry.mkdir(parents=True)
+    (entry / "seeds.parquet").write_bytes(b"old")
+    monkeypatch.setattr(pictures, "ROOT", tmp_path)
+    picture = pictures.Plot("plot curves", ("task/*",))
+    before = pictures.made_from(picture)
+    assert pictures.made_from(picture) == before
+    (entry / "seeds.parquet").write_bytes(b"new")
+    assert pictures.made_from(picture) != before
