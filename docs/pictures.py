@@ -1,7 +1,7 @@
 """How every picture of docs/images is made: `make pictures`.
 
 A picture of published entries carries a mark, a hash of these entries and of its command. Where entries have changed
-since, `tests/docs/test_pictures.py` says that it is stale. Pictures of runs that are not published are kept as they are;
+since, `tests/docs/test_pictures.py` says that it is stale. Pictures of runs that are not published stay as they are;
 they are listed with the command that trains the runs and draws them.
 """
 
@@ -80,7 +80,7 @@ PICTURES: dict[str, Picture] = {
     "report-narrow.png": Screenshot(BOARD, ("beam6g/*",), 390, 1000),
     "report-times.png": Screenshot(BOARD, ("beam6g/*",), 1160, 1104, "By mean time below threshold"),
     "report-wide.png": Screenshot(BOARD, ("beam6g/*",), 1400, 1240),
-    "policies.png": Unpublished(
+    "policies.png": Unpublished(  # after `study run fig7`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
     ),
     "study-ansatz.png": Unpublished("study run ansatz"),
@@ -143,7 +143,7 @@ def _mark(made: Path, mark: str, place: Path) -> None:
     info = PngInfo()
     info.add_text(MARK, mark)
     with Image.open(made) as image:
-        image.save(place, pnginfo=info, optimize=True)
+        image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(place, pnginfo=info, optimize=True)
 
 
 @contextlib.contextmanager

@@ -167,6 +167,12 @@ def test_a_narrow_page_shows_cards_and_sorts_them(opened: Open, page: str) -> No
     tab.locator("#board-0 .only-narrow select").select_option("score")
     scores = [float(value) for value in column(tab, "score")]
     assert scores == sorted(scores, reverse=True)
+    labels = tab.evaluate(
+        "[...document.querySelectorAll('#board-0-table tbody tr:first-child td:not(.tier, .steps)')]"
+        ".map(cell => getComputedStyle(cell, '::before').content)"
+    )
+    assert '"Settings"' in labels
+    assert "none" not in labels  # a number on a card is named
 
 
 def test_print_shows_everything_in_light_colors(opened: Open, page: str) -> None:
