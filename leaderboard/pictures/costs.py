@@ -17,7 +17,8 @@ from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 
-AXES = {"steps": "environment steps", "executions": "circuit executions", "shots": "shots"}
+Unit = Literal["steps", "executions", "shots"]
+AXES: dict[Unit, str] = {"steps": "environment steps", "executions": "circuit executions", "shots": "shots"}
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,9 @@ class CostsOptions:
     """Settings of the picture."""
 
     units: Annotated[
-        list[Literal["steps", "executions", "shots"]],
+        list[Unit],
         Field(min_length=1, description="what sample complexity is counted in, a panel each"),
-    ] = Field(default_factory=lambda: ["steps", "executions", "shots"])
+    ] = Field(default_factory=lambda: list(AXES))
     epsilons: Annotated[
         list[float] | None,
         Field(min_length=1, max_length=1, description="one; by default the reference cell's"),
