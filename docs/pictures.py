@@ -86,6 +86,8 @@ PICTURES: dict[str, Picture] = {
     "study-ansatz.png": Unpublished("study run ansatz"),
     "study-antennas.png": Unpublished("study run antennas"),
     "study-degree.png": Unpublished("study run degree"),
+    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
+    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
     "study-depth.png": Unpublished("study run ablation"),
     "study-fig1.png": Unpublished("study run fig1"),
     "study-fig6.png": Unpublished("study run fig6"),
