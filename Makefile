@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long verify docs site pictures dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-long verify docs tutorials site pictures dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -36,6 +36,17 @@ verify: install
 docs: install-dev
 	$(BIN)/pip install --quiet --no-deps --upgrade --target $(VENV)/wheel .
 	QRLSUITE_DOCS_PACKAGE=$(VENV)/wheel NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Executes docs/tutorials in a kernel and stores them with their output; what a tutorial trains and installs is left in a
+# folder of the virtual environment.
+tutorials: install-dev
+	rm -rf $(VENV)/tutorials
+	mkdir -p $(VENV)/tutorials
+	cp docs/tutorials/*.ipynb $(VENV)/tutorials
+	cd $(VENV)/tutorials && PYTHONPATH=$(abspath $(VENV))/tutorials/site PIP_TARGET=$(abspath $(VENV))/tutorials/site \
+	  PIP_NO_BUILD_ISOLATION=0 PIP_NO_DEPS=1 \
+	  $(abspath $(BIN))/jupyter execute --inplace --NotebookClient.record_timing=False *.ipynb
+	cp $(VENV)/tutorials/*.ipynb docs/tutorials
 
 # The documentation, and the leaderboard of published entries beside it, in one folder whose links are all checked.
 site: docs

@@ -1,7 +1,7 @@
 """Every hook of qrlsuite. A plugin implements the ones it needs; this file is the manual.
 
 A plugin is a module (or object) listed as an entry point in the group `qrlsuite` of its distribution, which also
-says which versions of the suite it works with::
+says which versions of the suite it works with:
 
     [project]
     dependencies = ["qrlsuite>=0.1,<0.2"]
@@ -35,7 +35,7 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 def register(register: Callable[[specs.Spec], None]) -> None:
     """Register anything: the type of a spec says what it is.
 
-    This one hook serves for all of the `register_KIND` hooks below, whose manuals say what each kind needs::
+    This one hook serves for all of the `register_KIND` hooks below, whose manuals say what each kind needs:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import AnsatzSpec, TaskSpec
@@ -52,7 +52,7 @@ def register_environments(register: Callable[[specs.EnvironmentSpec], None]) -> 
     """Register environments: a task file then names one under `[environment]`.
 
     `options` is a pydantic dataclass whose fields are the keyword arguments of the `gymnasium.Env` at `entry_point`.
-    Faster lanes (`vector`), reference policies and pictures are optional: see `qrlsuite.specs.EnvironmentSpec`::
+    Faster lanes (`vector`), reference policies and pictures are optional: see `qrlsuite.specs.EnvironmentSpec`:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import EnvironmentSpec
@@ -76,7 +76,7 @@ def register_models(register: Callable[[specs.ModelSpec], None]) -> None:
     """Register function approximators: they appear as `qrlsuite run --model NAME`.
 
     `build(obs_dim, out_dim, options, generator)` returns an ordinary `torch.nn.Module` for one agent,
-    (B, obs_dim) -> (B, out_dim), and draws from `generator` alone: see `qrlsuite.specs.ModelSpec`::
+    (B, obs_dim) -> (B, out_dim), and draws from `generator` alone: see `qrlsuite.specs.ModelSpec`:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import ModelSpec
@@ -100,7 +100,7 @@ def register_algorithms(register: Callable[[specs.AlgorithmSpec], None]) -> None
     """Register learning algorithms: they appear as `qrlsuite run --algorithm NAME`.
 
     `factory(envs, build_model, options, streams, device)` returns an object with the methods of
-    `qrlsuite.algorithm.Algorithm`, which trains one agent for every seed at once::
+    `qrlsuite.algorithm.Algorithm`, which trains one agent for every seed at once:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import AlgorithmSpec
@@ -122,7 +122,7 @@ def register_algorithms(register: Callable[[specs.AlgorithmSpec], None]) -> None
 def register_tasks(register: Callable[[specs.TaskSpec], None]) -> None:
     """Register benchmark tasks: they appear as `qrlsuite run --task NAME`.
 
-    `path` names the task's TOML file, and name and summary are those in the file::
+    `path` names the task's TOML file, and name and summary are those in the file:
 
         from pathlib import Path
         from qrlsuite import hookimpl
@@ -139,7 +139,7 @@ def register_tasks(register: Callable[[specs.TaskSpec], None]) -> None:
 def register_studies(register: Callable[[specs.StudySpec], None]) -> None:
     """Register studies, a list of entries and their pictures: they appear as `qrlsuite study run NAME`.
 
-    `path` names the study's TOML file::
+    `path` names the study's TOML file:
 
         from pathlib import Path
         from qrlsuite import hookimpl
@@ -156,7 +156,7 @@ def register_studies(register: Callable[[specs.StudySpec], None]) -> None:
 def register_ansatzes(register: Callable[[specs.AnsatzSpec], None]) -> None:
     """Register circuit families: they appear as `--set ansatz=NAME` of every `vqc-*` model.
 
-    `build(qubits, layers, options)` returns a `qrlsuite.circuit.Circuit`, a description that every backend runs::
+    `build(qubits, layers, options)` returns a `qrlsuite.circuit.Circuit`, a description that every backend runs:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import AnsatzSpec
@@ -179,7 +179,7 @@ def register_circuit_backends(register: Callable[[specs.CircuitBackendSpec], Non
     """Register simulators or hardware that compute expectation values of a `qrlsuite.circuit.Circuit`.
 
     `factory(circuit, options)` returns a callable of inputs and parameters, differentiable by torch: see
-    `qrlsuite.circuit.api.CircuitBackend`. They appear as `qrlsuite.circuit.expectations(..., backend=NAME)`::
+    `qrlsuite.circuit.api.CircuitBackend`. They appear as `qrlsuite.circuit.expectations(..., backend=NAME)`:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import CircuitBackendSpec
@@ -205,7 +205,7 @@ def register_significance_tests(register: Callable[[specs.SignificanceTestSpec],
     a `name`, a `promise` (one sentence: which error probability it controls, and which it does not), and is
     called with two `qrlsuite.statistics.Evidence` objects, already at equal numbers of runs and one horizon. It
     returns an array (epsilons, deltas) of +1 where the first needs significantly fewer samples, -1 where it
-    needs more and 0 elsewhere, with `rule(a, b) == -rule(b, a)`::
+    needs more and 0 elsewhere, with `rule(a, b) == -rule(b, a)`:
 
         class Half:
             name = "half"
@@ -229,7 +229,7 @@ def register_engines(register: Callable[[specs.EngineSpec], None]) -> None:
     """Register places where groups of seeds run: they appear as `qrlsuite run --engine NAME`.
 
     `factory(options)` returns an object with the methods of `qrlsuite.engine.api.Engine`; it decides only where
-    `python -m qrlsuite.engine.worker` runs, and all results are files::
+    `python -m qrlsuite.engine.worker` runs, and all results are files:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import EngineSpec
@@ -252,7 +252,7 @@ def register_trackers(register: Callable[[specs.TrackerSpec], None]) -> None:
     """Register trackers that watch a run when they are asked for: `qrlsuite run --track NAME`.
 
     `factory(target)` returns an object with any of the methods `run_started`, `epoch_finished` and `run_finished`,
-    as the hooks of these names; `target` is what the user wrote after `--track NAME=`, or None::
+    as the hooks of these names; `target` is what the user wrote after `--track NAME=`, or None:
 
         from qrlsuite import hookimpl
         from qrlsuite.specs import TrackerSpec
@@ -273,7 +273,7 @@ def register_trackers(register: Callable[[specs.TrackerSpec], None]) -> None:
 def register_commands(app: typer.Typer) -> None:
     """Add commands to the `qrlsuite` command line.
 
-    `app` is a `typer.Typer`. A name that is taken already is refused::
+    `app` is a `typer.Typer`. A name that is taken already is refused:
 
         import typer
         from qrlsuite import hookimpl
@@ -300,7 +300,7 @@ def run_started(run: Mapping[str, Any]) -> None:
     they are equal to those of the first. A tracker that raises is reported once and left out; it never stops a run.
 
     This hook watches every run. A tracker that is only to watch when asked for is registered with
-    `register_trackers`::
+    `register_trackers`:
 
         from pathlib import Path
         from qrlsuite import hookimpl
@@ -318,7 +318,7 @@ def epoch_finished(run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
 
     It has `epoch`, the validation `scores` (a list of numbers), and the algorithm's metrics (`loss`, ...),
     `train_return` and `train_score`: numbers, or None where there is no value. `run` is as in `run_started`,
-    without `epochs` and `history`::
+    without `epochs` and `history`:
 
         from pathlib import Path
         from qrlsuite import hookimpl
@@ -335,7 +335,7 @@ def epoch_finished(run: Mapping[str, Any], record: Mapping[str, Any]) -> None:
 def run_finished(run: Mapping[str, Any]) -> None:
     """Observe a seed's run reaching its last epoch; its results are complete on disk.
 
-    `run` is as in `run_started`, without `history`::
+    `run` is as in `run_started`, without `history`:
 
         from pathlib import Path
         from qrlsuite import hookimpl

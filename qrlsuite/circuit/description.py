@@ -11,7 +11,7 @@ chosen qubits (default: every), or products of them.
 
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
-An ansatz is a function that writes such a circuit::
+An ansatz is a function that writes such a circuit:
 
     def ry_ring(qubits, layers, options):
         circuit = Circuit(qubits)

@@ -1,13 +1,13 @@
 """Conformance checks: what a plugin author runs before shipping, and what the suite runs on its own plugins.
 
-In pytest, one line::
+In pytest, one line:
 
     from qrlsuite.testing import assert_conforms
 
     def test_it_conforms():
         assert_conforms("ansatz", "my-ansatz")
 
-or, one finding after another::
+or, one finding after another:
 
     for finding in check_model("my-model", settings={"width": 8}):
         print(finding.rule, finding.ok, finding.message)

@@ -29,8 +29,8 @@ NAMES = [row["name"] for row in hooks()]
 def example(hook: str, folder: Path) -> types.ModuleType:
     """The module that the hook's manual shows."""
     manual = inspect.getdoc(getattr(hookspecs, hook)) or ""
-    code = manual.partition("::\n")[2]
-    lines = [line for line in code.splitlines() if not line.strip() or line.startswith("    ")]
+    code = manual.partition(":\n\n    ")[2]
+    lines = [line for line in f"    {code}".splitlines() if not line.strip() or line.startswith("    ")]
     module = types.ModuleType(f"example_{hook}")
     module.__file__ = str(folder / "plugin.py")
     names = {"hookimpl": hookspecs.hookimpl, "SignificanceTestSpec": registry.specs.SignificanceTestSpec}

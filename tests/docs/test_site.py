@@ -57,6 +57,18 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
         assert not [address for address in loaded if re.match(r"(?:https?:)?//", address)], page
 
 
+def test_tutorials_are_pages_with_their_output(site: Path) -> None:
+    notebooks = list((ROOT / "docs" / "tutorials").glob("*.ipynb"))
+    assert len(notebooks) == 3
+    for notebook in notebooks:
+        text = (site / "tutorials" / f"{notebook.stem}.html").read_text()
+        assert '<div class="output">' in text
+        assert 'src="data:image/png;base64,' in text
+        assert f'href="{notebook.name}"' in text, "to download"
+        assert (site / "tutorials" / notebook.name).read_bytes() == notebook.read_bytes()
+    assert 'href="tutorials/start.html"' in (site / "start.html").read_text(), "links lead to pages"
+
+
 @pytest.mark.parametrize(
     ("page", "names"),
     [

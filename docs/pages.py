@@ -1,0 +1,77 @@
+"""Makes a page of every notebook with its stored output: nothing is executed (a hook of mkdocs)."""
+
+from __future__ import annotations
+
+import shutil
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+
+class Notebook(File):
+    """A notebook that mkdocs takes for a page in Markdown, so that links to it and in it are checked and translated."""
+
+    def is_documentation_page(self) -> bool:
+        """Return that it is a page."""
+        return True
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Let notebooks be pages."""
+    for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
+        files.remove(file)
+        files.append(
+            Notebook(
+                file.src_uri,
+                file.src_dir,
+                config.site_dir,
+                config.use_directory_urls,
+            )
+        )
+    return files
+
+
+def on_page_read_source(page: Page, config: MkDocsConfig) -> str | None:
+    """Return a notebook as Markdown; None for other pages."""
+    if not isinstance(page.file, Notebook):
+        return None
+    cells = nbformat.read(page.file.abs_src_path, as_version=4).cells
+    download = (
+        f'<p><a href="{Path(page.file.src_uri).name}" download>Download this page as a notebook</a></p>'
+    )
+    return "\n\n".join([*(block for cell in cells for block in _blocks(cell)), download])
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Put the notebooks beside their pages."""
+    for notebook in Path(config.docs_dir).rglob("*.ipynb"):
+        shutil.copy(
+            notebook,
+            config.site_dir / notebook.relative_to(config.docs_dir),
+        )
+
+
+def _blocks(cell: Any) -> list[str]:
+    if cell.cell_type != "code":
+        return [cell.source]
+    printed = "".join(output.text for output in cell.outputs if output.output_type == "stream")
+    shown = [_shown(output.data, cell.source) for output in cell.outputs if output.output_type != "stream"]
+    return [
+        f"```python\n{cell.source}\n```",
+        *([_shown({"text/plain": printed}, "")] if printed else []),
+        *shown,
+    ]
+
+
+def _shown(data: Any, source: str) -> str:
+    """Return an output as HTML."""
+    if "image/png" in data:
+        alt = escape(source.splitlines()[-1])
+        return f'<p><img alt="{alt}" src="data:image/png;base64,{data["image/png"].strip()}"></p>'
+    html = data.get("text/html") or f"<pre>{escape(data['text/plain'])}</pre>"
+    return f'<div class="output">{html}</div>'
