@@ -47,7 +47,7 @@ class WandB:
 
     def __init__(self, target: str | None = None) -> None:
         self.target = None if target is None else Path(target).expanduser().absolute()
-        self.mode = os.environ.get("WANDB_MODE", "offline")
+        self.mode: Any = os.environ.get("WANDB_MODE", "offline")
         if self.mode == "online":
             if not wandb.login(prompt=False):
                 raise QrlSuiteError("WANDB_MODE=online, but nobody is logged in: type `wandb login` first")
