@@ -83,16 +83,26 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig7`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
     ),
-    "study-ansatz.png": Unpublished("study run ansatz"),
     "study-antennas.png": Unpublished("study run antennas"),
-    "study-degree.png": Unpublished("study run degree"),
     "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
-    "study-depth.png": Unpublished("study run ablation"),
-    "study-fig1.png": Unpublished("study run fig1"),
-    "study-fig6.png": Unpublished("study run fig6"),
-    "study-fig7.png": Unpublished("study run fig7"),
-    "study-matched.png": Unpublished("study run matched"),
+    "study-fig1.png": Plot(
+        "plot surface --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=64' "
+        "--entry 'vqc-native qubits=10'",
+        ("beam6g/*",),
+    ),
+    "study-fig6.png": Plot(
+        "plot bars --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' "
+        "--entry 'vqc-native qubits=10'",
+        ("beam6g/*",),
+    ),
+    "study-fig7.png": Plot(
+        "plot scaling --task beam6g --published --set 'epsilons=[0.15]' --set 'deltas=[0.75]' "
+        "--entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' --entry 'mlp width=128' "
+        "--entry 'mlp width=256' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=8' "
+        "--entry 'vqc-native qubits=10'",
+        ("beam6g/*",),
+    ),
     "study-ppo.png": Unpublished("study run ppo"),
 }
 

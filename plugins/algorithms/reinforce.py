@@ -9,7 +9,7 @@ completed in an epoch:
            architecture ("value"), which learns by 1/n sum_t (V(s_t) - G_t)^2 in the same step
 
 One Adam step per epoch, or per `epochs_per_update` epochs. The paper names the algorithm only ('vanilla policy
-gradient', its appendix on CartPole) and gives no settings; the defaults are ours.
+gradient', its section 6.4 on CartPole) and gives no settings; the defaults are ours.
 
 How it meets a fixed number of steps per epoch:
 - An episode that is unfinished when the epoch ends carries over, and its steps are learned from in the epoch in which

@@ -1,8 +1,8 @@
 """The random placements a2-0 .. a5-4, five for each number of antennas from 2 to 5.
 
-The paper's own instances were never published; these are ours, made by the paper's rule (appendix, section
-"Antenna configuration"): positions uniform in the field, all drawn again until every pair is further apart
-than 1.5; both components of an orientation uniform in [-1, 1], then normalized. Rounded to 6 decimals, so
+The paper refers to its repository for its own instances, which we do not know; these are ours, made by the paper's
+rule (appendix A.2, "Antenna configuration"): positions uniform in the field, all drawn again until every pair is
+further apart than 1.5; both components of an orientation uniform in [-1, 1], then normalized. Rounded to 6 decimals, so
 that the numbers in a task file are the definition. Print them for a task file with
 
     python -m qrlsuite.plugins.environments.beam6g.placements

@@ -1,0 +1,135 @@
+"""The table of the paper's statements in docs/studies.md says what the published entries say.
+
+When entries are published or replaced, the failure prints the rows as they should be.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from qrlsuite import api, registry
+from qrlsuite.leaderboard.published import PUBLISHED, read
+from qrlsuite.statistics import Comparison, Direction, Verdict
+
+if TYPE_CHECKING:
+    from qrlsuite.leaderboard.times import TimeRanking
+
+PAGE = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
+TABLE = PAGE.partition("\n## The paper's statements\n")[2].partition("\n## ")[0]
+ROWS = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in TABLE.splitlines()
+    if line.startswith("| ")
+][1:]
+PAIR = re.compile(r"(?P<task>\w+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`")
+RETUNED = " lr=0.002"
+
+# What the paper expects of the first entry of a pair: that it needs fewer steps than the second, as many, or no fewer.
+PAPER = {
+    "ddqn mlp width=64 / ddqn mlp width=16": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn mlp width=16": "fewer",
+    "ddqn vqc-native qubits=8 / ddqn mlp width=16": "fewer",
+    "ddqn vqc-native qubits=6 / ddqn mlp width=16": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn mlp width=32": "as many",
+    "ddqn mlp width=64 / ddqn mlp width=32": "fewer",
+    "ddqn mlp width=128 / ddqn mlp width=64": "no fewer",
+    "ddqn mlp width=256 / ddqn mlp width=64": "no fewer",
+    "ddqn vqc-native qubits=8 / ddqn vqc-native qubits=6": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=8": "fewer",
+    "ddqn mlp width=64 / ddqn vqc-native qubits=10": "fewer",
+    "ddqn mlp width=128 / ddqn vqc-native qubits=10": "no fewer",
+    "ddqn mlp width=16 lr=0.002 / ddqn mlp width=16": "no fewer",
+    "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
+}
+
+
+@pytest.fixture(scope="module")
+def boards() -> dict[str, TimeRanking]:
+    """The published boards by mean times, by task."""
+    names = sorted({match["task"] for row in ROWS if (match := PAIR.match(row[4]))})
+    return {name: api.board(name, published=True, runs="none").sections[0].times for name in names}
+
+
+def decided(board: TimeRanking, first: str, second: str) -> tuple[Direction, float]:
+    """Return who needs fewer steps, from the first entry's side, and Holm's p."""
+    labels = [row.entry.label for row in board.rows]
+    i, j = (board.order[labels.index(label)] for label in (first, second))
+    return board.board.directions[i][j], float(board.board.adjusted[i, j])
+
+
+def verdict(board: TimeRanking, first: str, second: str, cells: Comparison) -> str:
+    """Return our verdict on the paper's statement, by rule `times` with Holm's correction."""
+    direction, _ = decided(board, first, second)
+    paper = PAPER[f"{first} / {second}"]
+    if direction is Direction.NOT_TOLD_APART:
+        return "not told apart"
+    if {"fewer": Direction.FEWER, "no fewer": Direction.MORE}.get(paper) is not direction:
+        return "does not hold"
+    if cells.count(Verdict.LOSS if paper == "fewer" else Verdict.WIN):
+        return "holds by `times`, not by the paper's rule"
+    retuned = second + RETUNED
+    exists = any(row.entry.label == retuned for row in board.rows)
+    if exists and decided(board, first, retuned)[0] is not direction:
+        return "holds at the released rates only"
+    return "holds"
+
+
+def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
+    written, computed, pairs = [], [], set()
+    for row in ROWS:
+        if match := PAIR.match(row[4]):
+            task, first, second = match["task"], match["first"], match["second"]
+            board = boards[task]
+            cells = api.compare(first, second, task=task, published=True, runs="none")
+            total = sum(len(line) for line in cells.verdicts)
+            evidence = (
+                f"{match[0]}: fewer in {cells.count(Verdict.WIN)} cells, more in {cells.count(Verdict.LOSS)} "
+                f"of {total}; p {decided(board, first, second)[1]:.4f}"
+            )
+            seeds = " and ".join(
+                str(next(len(each.entry.seeds) for each in board.rows if each.entry.label == label))
+                for label in (first, second)
+            )
+            held = f".05 for {board.n_pairs} pair" + "s" * (board.n_pairs > 1)
+            pairs.add(f"{first} / {second}")
+            written.append(row[2:])
+            computed.append([verdict(board, first, second, cells), seeds, evidence, held])
+    assert pairs == set(PAPER)
+    changed = [" | ".join(now) for then, now in zip(written, computed) if then != now]
+    assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
+
+
+def test_the_cut_of_cartpole() -> None:
+    first, second = "reinforce vqc-native qubits=4 layers=1", "reinforce mlp width=16 depth=1"
+    cut = api.compare(first, second, task="cartpole", published=True, runs="none").verdicts[0]
+    won, lost = cut.count(Verdict.WIN), cut.count(Verdict.LOSS)
+    assert won + lost < len(cut), "every cell is significant: the statement about epsilon 0.05 does not hold"
+    assert f"fewer in {won} cells, more in {lost} of {len(cut)} " in TABLE
+
+
+def test_scores_at_the_end() -> None:
+    small, large, circuit = (
+        np.median(api.load(label, task="beam6g", published=True, runs="none").curves[:, -1])
+        for label in ("ddqn mlp width=16", "ddqn mlp width=64", "ddqn vqc-native qubits=10")
+    )
+    assert f"ends at {small:.3f} of the optimum" in TABLE
+    assert f"end at {large:.3f} and {circuit:.3f} of the optimum" in TABLE
+
+
+def test_rows_without_published_entries() -> None:
+    """A row may say that an entry is not published for as long as it is not."""
+    published = [
+        f"{folder.parent.name}/{read(folder).entry_curves().label}"
+        for folder in sorted(PUBLISHED.glob("*/*/"))
+    ]
+    absent = [label for row in ROWS for label in re.findall(r"no `([^`]+)`", row[4])]
+    assert absent
+    for label in absent:
+        assert registry.task(label.partition("/")[0])
+    assert not [label for label in absent if label in published], "published now: these rows can be decided"
