@@ -56,7 +56,9 @@ def test_pull_requests_get_no_secret_and_write_nothing() -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_the_demo_is_four_commands(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_is_four_commands(
+    fails: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """They exist with their options; where no epoch of both models was finished, the picture has what there is."""
     lines: list[list[str]] = []
 
@@ -73,6 +75,9 @@ def test_the_demo_is_four_commands(fails: bool, monkeypatch: pytest.MonkeyPatch)
     assert [words[0] for words in lines] == ["run", "run", *["plot"] * (1 + fails), "leaderboard"]
     assert not any(parse(words) for words in lines)
     assert all(words[-2:] == ["--runs", "elsewhere"] for words in lines)
+    said = capsys.readouterr().err
+    assert ("no such entry\nshowing what there is; to train on, type" in said) == fails
+    assert "demo --runs elsewhere\n" in said or not fails
 
 
 def test_make_starts_the_demo() -> None:

@@ -35,7 +35,9 @@ def demo(
     picture = ("plot", "curves", "--task", "beam6g")
     try:
         _do(*picture, *(word for model in MODELS for word in ("--entry", model)), runs=runs)
-    except QrlSuiteError:  # within its time a busy machine may not have finished an epoch of both
+    except QrlSuiteError as error:  # within its time a busy machine may not have finished an epoch of both
+        again = command("demo", runs=runs)
+        typer.echo(f"{error}\nshowing what there is; to train on, type {again}", err=True)
         _do(*picture, runs=runs)
     _do("leaderboard", "--task", "beam6g", runs=runs)
 
