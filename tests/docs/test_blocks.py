@@ -85,6 +85,7 @@ def test_the_readmes_plugin_is_a_package(tmp_path: Path) -> None:
     (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
     (project,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", text, re.DOTALL)
     assert len([line for line in code.splitlines() if line.strip()]) <= 22, "twenty lines, give or take"
+    (tmp_path / "runs").mkdir()  # of commands that were typed here
     (tmp_path / "my_ansatz.py").write_text(code)
     (tmp_path / "pyproject.toml").write_text(project)
     site = str(tmp_path / "site")
