@@ -84,8 +84,8 @@ PICTURES: dict[str, Picture] = {
         "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
     ),
     "study-antennas.png": Unpublished("study run antennas"),
-    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
-    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
+    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
+    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
     "study-fig1.png": Plot(
         "plot surface --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=64' "
         "--entry 'vqc-native qubits=10'",
@@ -111,7 +111,7 @@ def made_from(picture: Plot | Screenshot) -> str:
     """Return the mark of a picture: a hash of its command and of the published entries that it shows."""
     digest = hashlib.sha256(repr(picture).encode())
     published = ROOT / "leaderboard" / "entries"
-    for path in sorted(path for pattern in picture.entries for path in published.glob(f"{pattern}/*")):
+    for path in sorted(path for pattern in picture.entries for path in published.glob(f"{pattern}/[!.]*")):
         digest.update(path.relative_to(published).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -415,6 +415,8 @@ def build(
         If there is no such unit, or `alpha` is not between 0 and 1.
     """
     check_probability(alpha, "alpha")
+    if by == "steps":
+        raise OptionError("by = 'steps': the board of `api.board` is by steps")
     if by not in UNITS:
         raise OptionError(f"by = '{by}': choose among steps, {', '.join(UNITS)}{nearest(by, UNITS)}")
     good, problems = of_one_definition(entries)

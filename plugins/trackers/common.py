@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from qrlsuite.errors import StoreError
+from qrlsuite.results.store import write_atomically
 
 
 def scalars(record: Mapping[str, Any]) -> dict[str, float]:
@@ -36,11 +40,19 @@ def identity(run: Mapping[str, Any]) -> str:
     """Return the 8 characters under which a tracker knows this run, resumed or not: `tracking-id` in its folder.
 
     They are drawn when the run is first tracked. Results that are deleted and trained again are another run.
+
+    Raises
+    ------
+    StoreError
+        If the file holds something else: it becomes part of names of folders.
     """
     path = Path(run["folder"], "tracking-id")
     if not path.exists():
-        path.write_text(secrets.token_hex(4))
-    return path.read_text()
+        write_atomically(path, secrets.token_hex(4).encode())
+    name = path.read_bytes()
+    if not re.fullmatch(rb"[0-9a-f]{8}", name):
+        raise StoreError(f"{path} does not hold the 8 characters of a tracked run: delete it for a new one")
+    return name.decode()
 
 
 def folder(target: Path | None, run: Mapping[str, Any], name: str) -> Path:

@@ -45,7 +45,8 @@ class MLflow:
     """
 
     def __init__(self, target: str | None = None) -> None:
-        self.target = target or os.environ.get("MLFLOW_TRACKING_URI")
+        self.folder = Path(target).expanduser() if target and "://" not in target else None
+        self.server = None if self.folder else target or os.environ.get("MLFLOW_TRACKING_URI")
         self._clients: dict[str, MlflowClient] = {}
         self._runs: dict[str, tuple[MlflowClient, str]] = {}
         self._logged: dict[str, set[int]] = {}
@@ -85,10 +86,9 @@ class MLflow:
         client.set_terminated(run_id)
 
     def _client(self, run: Mapping[str, Any]) -> MlflowClient:
-        uri = self.target
-        if uri is None or "://" not in uri:
-            results = Path(run["folder"]).parents[2]  # <results>/<task>/<entry>/<seed>
-            folder = results if uri is None else Path(uri).expanduser()
+        uri = self.server
+        if uri is None:
+            folder = self.folder or Path(run["folder"]).parents[2]  # <results>/<task>/<entry>/<seed>
             folder.mkdir(parents=True, exist_ok=True)
             path = folder.absolute() / "mlflow.db"
             if not path.exists():
@@ -109,7 +109,9 @@ def _make_database(path: Path) -> None:
     event.listen(Engine, "connect", _without_sync)
     try:
         MlflowClient(tracking_uri=f"sqlite:///{begun}").search_experiments()
-        with contextlib.suppress(FileExistsError):  # another worker was first
+        with contextlib.suppress(
+            OSError
+        ):  # another worker was first, or there are no hard links: MLflow makes it
             os.link(begun, path)
     finally:
         event.remove(Engine, "connect", _without_sync)

@@ -63,8 +63,7 @@ class WandB:
         if run["folder"] in self._runs:  # it was stopped, and goes on in the same process
             self._runs.pop(run["folder"]).finish()
         name = common.identity(run)
-        for old in parent.glob(f"wandb/offline-run-*-{name}"):
-            shutil.rmtree(old)
+        replaced = list(parent.glob(f"wandb/offline-run-*-{name}"))
         online = self.mode == "online"
         handle = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "qrlsuite"),
@@ -82,6 +81,8 @@ class WandB:
             ),
         )
         self._runs[run["folder"]] = handle
+        for old in replaced:
+            shutil.rmtree(old)
         for record in run["history"]:
             self._log(handle, record)
 

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import studies
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
@@ -28,6 +30,7 @@ from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check
 from qrlsuite.studies.study import parse
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
+from tests.leaderboard import boards
 
 STUDY = """
 format_version = 1
@@ -503,10 +506,20 @@ def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
     assert (wide["complete"], wide["entries"], wide["pairs"]) == (1, 1, 0)
     assert (widths["complete"], widths["entries"], widths["finished"], widths["seeds"]) == (2, 3, 40, 60)
     assert widths["pairs"] == 1
-    assert 0 <= widths["decided"] <= 1
+    assert widths["decided"] == 0, "two networks that have hardly learned"
     said = say("status", "--seeds", "20", *words).stdout
-    assert re.search(r"widths +2 of 3 +40 of 60 +[01] of 1", said)
+    assert re.search(r"widths +2 of 3 +40 of 60 +0 of 1", said)
     assert "left, each entry once: " in said
+
+
+def test_which_pairs_count() -> None:
+    entries = boards.graded(4)
+    ranking = boards.of(entries).sections[0].times
+    assert studies.decided_pairs(entries) == (ranking.n_decided, 6)
+    assert ranking.n_decided > 0
+    planned = replace(entries[0], plan="abc")
+    few = replace(entries[1], curves=entries[1].curves[:19], seeds=entries[1].seeds[:19], runs={})
+    assert studies.decided_pairs([planned, few, *entries[2:]])[1] == 1, "of the last two"
 
 
 def test_listing() -> None:

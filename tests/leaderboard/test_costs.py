@@ -156,6 +156,8 @@ def test_few_seeds_and_short_entries() -> None:
 
 
 def test_bad_units() -> None:
+    with pytest.raises(OptionError, match=r"the board of `api\.board` is by steps"):
+        costs.build([], "steps")
     with pytest.raises(
         OptionError, match="choose among steps, executions, shots, core-hours; did you mean 'shots'"
     ):

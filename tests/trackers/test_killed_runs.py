@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.plugins.trackers import common
 from qrlsuite.results.store import EntryStore
 from tests.commands import start_worker
 from tests.conftest import Hold, most_epochs
@@ -79,10 +80,9 @@ def test_nothing_is_sent_over_the_network(name: str, tmp_path: Path) -> None:
     ) as proxy:  # whatever wants to reach a host connects to it first
         proxy.setblocking(False)
         address = f"http://127.0.0.1:{proxy.getsockname()[1]}"
-        clean = {
-            word: value for word, value in os.environ.items() if not word.startswith(("WANDB_", "MLFLOW_"))
-        }
-        env = {**clean, "HTTP_PROXY": address, "HTTPS_PROXY": address, "ALL_PROXY": address}
+        # nothing else: both send less where they find that they are tested
+        kept = {name: os.environ[name] for name in ("PATH", "HOME", "PYTHONPATH") if name in os.environ}
+        env = {**kept, "HTTP_PROXY": address, "HTTPS_PROXY": address, "ALL_PROXY": address}
         subprocess.run([sys.executable, "-c", TRACKED, name], env=env, cwd=tmp_path, check=True)
         with pytest.raises(BlockingIOError):
             proxy.accept()
@@ -172,3 +172,11 @@ def test_wandb_asks_nobody_to_log_in(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
     with pytest.raises(QrlSuiteError, match="nobody is logged in: type `wandb login` first"):
         WandB()
+
+
+@pytest.mark.parametrize("content", ["", "/../../x", "0123456g", "0123456\n"])
+def test_a_name_that_is_none_is_refused(content: str, tmp_path: Path) -> None:
+    """It becomes part of a pattern of folders that are deleted, and of a filter."""
+    (tmp_path / "tracking-id").write_text(content)
+    with pytest.raises(StoreError, match="tracking-id does not hold the 8 characters"):
+        common.identity({"folder": str(tmp_path)})

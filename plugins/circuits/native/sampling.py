@@ -100,7 +100,7 @@ class ShotSampler:
         if self.options.shots is not None:
             trajectories = min(trajectories, self.options.shots)
         rows = self.simulator.workspace(angles.dtype).record.nbytes // self.simulator.lanes[angles.dtype]
-        size = max(1, PART_BYTES // (rows * trajectories))
+        size = max(1, PART_BYTES // (rows * (trajectories + self.noisy)))  # noisy: and one without an error
         parts = [self._part(some, trajectories, source) for some in torch.split(angles, size, dim=1)]
         return torch.cat(parts)
 

@@ -223,18 +223,22 @@ def run(
     for study, members in chosen:
         if len(chosen) > 1 and not json_output:
             typer.echo(f"\nstudy {study.name}: {study.file.summary}")
+        items, trained, submitted = items_of(members), session.trained, len(session.submitted)
         try:
-            left_over |= {item.plan.store.path: item for item in session.run(items_of(members))}
+            left = session.run(items)
         except KeyboardInterrupt:
             if not json_output:
                 _say(studies.write(study, members, runs, format_))
             raise typer.Exit(130) from None
+        paths = {item.plan.store.path for item in items}
+        left_over = {path: item for path, item in left_over.items() if path not in paths}
+        left_over |= {item.plan.store.path: item for item in left}
         drawn = studies.write(study, members, runs, format_)
         if not json_output:
             _say(drawn)
             continue
         content = runner.Overview(study, items_of(members), execution.workers).as_dict()
-        content |= {"trained": session.trained, "submitted": session.submitted}
+        content |= {"trained": session.trained - trained, "submitted": session.submitted[submitted:]}
         results.append(content | {"pictures": [each.as_dict() for each in drawn]})
     if json_output:
         typer.echo(json.dumps(results if name == ALL else results[0]))
@@ -316,15 +320,13 @@ def _chosen(
         return [_members(name, settings, models, only)]
     chosen, refusals = [], []
     for each in registry.load().names("studies"):
+        _members(each)  # a study that is broken by itself is no reason to go on without it
         try:
-            study, members = _members(each, settings, models, only)
+            chosen.append(_members(each, settings, models, only))
         except OptionError as error:
             refusals.append(error)
-            continue
-        if members:
-            chosen.append((study, members))
     if not chosen:
-        raise refusals[0] if refusals else OptionError("no study that is registered trains anything")
+        raise refusals[0] if refusals else OptionError("no study is registered")
     return chosen
 
 
