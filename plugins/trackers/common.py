@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from qrlsuite.errors import StoreError
-from qrlsuite.results.store import write_atomically
 
 
 def scalars(record: Mapping[str, Any]) -> dict[str, float]:
@@ -48,7 +47,9 @@ def identity(run: Mapping[str, Any]) -> str:
     """
     path = Path(run["folder"], "tracking-id")
     if not path.exists():
-        write_atomically(path, secrets.token_hex(4).encode())
+        begun = path.with_name(".tracking-id")
+        begun.write_text(secrets.token_hex(4))
+        begun.replace(path)  # a kill leaves a whole name, or none
     name = path.read_bytes()
     if not re.fullmatch(rb"[0-9a-f]{8}", name):
         raise StoreError(f"{path} does not hold the 8 characters of a tracked run: delete it for a new one")
