@@ -83,7 +83,9 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig7`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
     ),
-    "study-antennas.png": Unpublished("study run antennas"),
+    "study-antennas.png": Unpublished(
+        "study run antennas --seeds 10 --only mlp --only a2 --only a3"  # the circuit on ten of twenty placements
+    ),
     "study-deploy-errors.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
     "study-fig1.png": Plot(
@@ -103,7 +105,7 @@ PICTURES: dict[str, Picture] = {
         "--entry 'vqc-native qubits=10'",
         ("beam6g/*",),
     ),
-    "study-ppo.png": Unpublished("study run ppo"),
+    "study-ppo.png": Unpublished("study run ppo --seeds 10"),
 }
 
 

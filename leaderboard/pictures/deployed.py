@@ -36,8 +36,8 @@ class DeployedOptions:
 def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figure:
     """Draw the mean score of an entry's agents against the values, with what each agent earns as dots.
 
-    Agents as they were trained are a horizontal line: dashed for circuits, which exact values let act, dotted for
-    networks. On a task without a known maximum the picture shows returns.
+    Agents that act as they were trained are a horizontal line: dashed for circuits, dotted for networks. On a task
+    without a known maximum the picture shows returns.
 
     Parameters
     ----------
@@ -67,7 +67,9 @@ def draw(lines: Sequence[Line], values: Sequence[str], **settings: Any) -> Figur
         if not line.deployed:
             axes.axhline(reference, color=look.color, ls=":", lw=1.6, label=f"{name} ({reference:.3f})")
             continue
-        axes.axhline(reference, color=look.color, ls="--", lw=1.2, label=f"{name}, exact ({reference:.3f})")
+        axes.axhline(
+            reference, color=look.color, ls="--", lw=1.2, label=f"{name}, as trained ({reference:.3f})"
+        )
         shift = 0.12 * (drawn - (circuits - 1) / 2)
         drawn += 1
         of_agents = np.stack([_of_agents(each, scored) for each in line.deployed])  # (K, agents)

@@ -109,9 +109,8 @@ def _make_database(path: Path) -> None:
     event.listen(Engine, "connect", _without_sync)
     try:
         MlflowClient(tracking_uri=f"sqlite:///{begun}").search_experiments()
-        with contextlib.suppress(
-            OSError
-        ):  # another worker was first, or there are no hard links: MLflow makes it
+        # another worker was first; or there are no hard links here, and MLflow makes it in its place
+        with contextlib.suppress(OSError):
             os.link(begun, path)
     finally:
         event.remove(Engine, "connect", _without_sync)

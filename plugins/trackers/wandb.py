@@ -48,6 +48,9 @@ class WandB:
     def __init__(self, target: str | None = None) -> None:
         self.target = None if target is None else Path(target).expanduser().absolute()
         self.mode: Any = os.environ.get("WANDB_MODE", "offline")
+        if os.environ.get("WANDB_SERVICE", "").split("-")[1:2] != [str(os.getpid())]:
+            # the service of the process that started this one: that may end first, or be on another machine
+            os.environ.pop("WANDB_SERVICE", None)
         if self.mode == "online":
             if not wandb.login(prompt=False):
                 raise QrlSuiteError("WANDB_MODE=online, but nobody is logged in: type `wandb login` first")

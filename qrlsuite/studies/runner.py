@@ -21,7 +21,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
-from qrlsuite.results.text import duration, duration_range, hours_range
+from qrlsuite.results.text import counted, duration, duration_range, hours_range
 from qrlsuite.studies.study import Member, Study
 
 
@@ -119,13 +119,7 @@ class Overview(Shown):
         if self.items and not lacking:
             yield Text("everything is there")
         elif self.items:
-            low, high = _total(lacking)
-            unknown = sum(item.seconds is None for item in lacking)
-            more = f", and {unknown} entries of unknown cost" if unknown else ""
-            yield Text(
-                f"left: {duration_range(low / self.workers, high / self.workers)} with {self.workers} "
-                f"worker{'s' * (self.workers != 1)} ({hours_range(low / 3600, high / 3600)} core-hours{more})"
-            )
+            yield Text(f"left: {_left(lacking, self.workers)}")
             for basis in dict.fromkeys(item.estimate.basis for item in lacking):
                 yield Text(f"  {basis}: {BASES[basis]}")
         if file.core_hours is not None:
@@ -159,6 +153,17 @@ def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:
     return sum(low for low, _ in ranges), sum(high for _, high in ranges)
 
 
+def _left(items: Sequence[PendingEntry], workers: int) -> str:
+    """Write what items take: by the clock with a number of workers, in core-hours, and how many are of unknown cost."""
+    low, high = _total(items)
+    unknown = sum(item.seconds is None for item in items)
+    more = f", and {counted(unknown, 'entry')} of unknown cost" if unknown else ""
+    return (
+        f"{duration_range(low / workers, high / workers)} with {counted(workers, 'worker')} "
+        f"({hours_range(low / 3600, high / 3600)} core-hours{more})"
+    )
+
+
 @dataclass(frozen=True, repr=False)
 class Status(Shown):
     """A table of studies: what is trained of each, how many of its pairs are decided, and what the rest takes.
@@ -190,6 +195,7 @@ class Status(Shown):
                 for study, items, (decided, pairs) in self.rows
             ],
             "core_hours_range": [seconds / 3600 for seconds in _total(self._once())],
+            "complete_estimate": all(item.seconds is not None for item in self._once()),
             "workers": self.workers,
         }
 
@@ -213,11 +219,7 @@ class Status(Shown):
                 _hours_left(items),
             )
         yield table
-        low, high = _total(self._once())
-        yield Text(
-            f"left, each entry once: {duration_range(low / self.workers, high / self.workers)} with {self.workers} "
-            f"worker{'s' * (self.workers != 1)} ({hours_range(low / 3600, high / 3600)} core-hours)"
-        )
+        yield Text(f"left, each entry once: {_left(self._once(), self.workers)}")
         yield Text("pairs: of entries with 20 seeds or more, by mean time below threshold at an error of 5%")
 
 

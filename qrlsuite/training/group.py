@@ -113,8 +113,8 @@ class GroupFiles:
                 "provenance": _with_origin(folder.record() or {}, origin),
             }
             folder.write_record(record)
-            told = {**record, "folder": str(folder.path), "history": folder.epochs()}
-            self.events.send("run_started", run=told)
+            history = folder.epochs() if self.events.heard("run_started") else []
+            self.events.send("run_started", run={**record, "folder": str(folder.path), "history": history})
 
     def add_origin(self, origin: Mapping[str, Any]) -> None:
         """Note in `run.json` of every seed where else it is trained."""

@@ -107,6 +107,10 @@ class EventSink:
             raise PluginError(f"{type(tracker).__name__} has none of the methods {', '.join(EVENTS)}")
         self._asked[name] = tracker
 
+    def heard(self, event: str) -> bool:
+        """Whether any tracker may listen to an event: what it is told takes time to read."""
+        return bool(self._asked) or bool(getattr(self.known.manager.hook, event).get_hookimpls())
+
     def send(self, event: str, **content: Any) -> None:
         """Tell every tracker of an event, each on its own."""
         for name, call in self._listeners(event, content):

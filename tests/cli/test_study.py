@@ -20,7 +20,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import studies
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
@@ -473,13 +473,26 @@ def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("two_studies")
+def test_each_of_all_studies_says_what_was_trained_for_it(tmp_path: Path) -> None:
+    words = ("--engine", "here", "--seeds", "2", "--epochs", "1", "--runs", str(tmp_path / "runs"))
+    found = json.loads(say("run", "all", "--json", *words).stdout)
+    assert [(each["name"], each["trained"]) for each in found] == [("without-circuit", 2), ("widths", 4)]
+
+
+@pytest.mark.usefixtures("two_studies")
 def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
     words = ("--only", "vqc", "--runs", str(tmp_path / "runs"))
     assert {step["label"] for step in answer("run", "all", "--dry-run", *words)["steps"]} == {
         "ddqn vqc-native qubits=2 layers=1"
     }
+    said = say("run", "all", "--dry-run", *words).stderr
+    assert said == "left out: --only vqc: study 'without-circuit' has no such entry\n"
     with pytest.raises(OptionError, match="has no such entry"):
         say("run", "all", "--dry-run", "--only", "nothing")
+    broken = tmp_path / "widths.toml"
+    broken.write_text(broken.read_text().replace('kind = "scaling"', 'kind = "scalin"'))
+    with pytest.raises(QrlSuiteError, match="scalin"):  # it is no study without such an entry
+        say("run", "all", "--dry-run", *words)
 
 
 @pytest.mark.usefixtures("two_studies")
@@ -509,7 +522,7 @@ def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
     assert widths["decided"] == 0, "two networks that have hardly learned"
     said = say("status", "--seeds", "20", *words).stdout
     assert re.search(r"widths +2 of 3 +40 of 60 +0 of 1", said)
-    assert "left, each entry once: " in said
+    assert re.search(r"left, each entry once: .*, and 1 entry of unknown cost", said)
 
 
 def test_which_pairs_count() -> None:

@@ -144,7 +144,8 @@ def test_a_folder_that_cannot_be_written_stops_no_run(
 
 def test_the_end_of_the_service_of_wandb_stops_no_run(train: Train, hold: Hold) -> None:
     entry = train("runs", [0], epochs=1)
-    env = {**hold.environment, "QRLSUITE_TRACK": "wandb"}
+    other = f"3-{os.getpid()}-unix-/gone"  # as a notebook leaves it that has runs of its own
+    env = {**hold.environment, "QRLSUITE_TRACK": "wandb", "WANDB_SERVICE": other}
     process = start_worker(str(entry), "--seeds", "0:1", "--epochs", "4", env=env)
     hold.wait(process)
     [service] = _children(process.pid, "wandb-core")

@@ -155,7 +155,8 @@ def status(
     speeds = speed.known(runs)
     rows = []
     for name in names or registry.load().names("studies"):
-        study, members = _members(name)
+        study = _load(name)
+        members = study.members()
         items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
         rows.append((study, items, studies.decided_pairs(studies.read(runs, members).values())))
     overview = runner.Status(rows, execution.workers)
@@ -210,29 +211,27 @@ def run(
     def items_of(members: Sequence[Member]) -> list[runner.PendingEntry]:
         return runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
 
-    chosen.sort(key=lambda pair: runner.work_left(items_of(pair[1])))
-    every = items_of([member for _, members in chosen for member in members])
+    if len(chosen) > 1:
+        chosen.sort(key=lambda pair: runner.work_left(items_of(pair[1])))
+    everyone = [member for _, members in chosen for member in members]
+    every = items_of(everyone)
     if limit is not None:
         runner.check_budget(every, limit, execution.workers)
     if dry_run:
         _dry_run(name, runner.dry_run(every, limit, execution.workers), json_output)
         return
     session = runner.Session(runs, execution, speeds, limit, quiet=json_output)
-    left_over: dict[Path, runner.PendingEntry] = {}
     results = []
     for study, members in chosen:
         if len(chosen) > 1 and not json_output:
             typer.echo(f"\nstudy {study.name}: {study.file.summary}")
-        items, trained, submitted = items_of(members), session.trained, len(session.submitted)
+        trained, submitted = session.trained, len(session.submitted)
         try:
-            left = session.run(items)
+            session.run(items_of(members))
         except KeyboardInterrupt:
             if not json_output:
                 _say(studies.write(study, members, runs, format_))
             raise typer.Exit(130) from None
-        paths = {item.plan.store.path for item in items}
-        left_over = {path: item for path, item in left_over.items() if path not in paths}
-        left_over |= {item.plan.store.path: item for item in left}
         drawn = studies.write(study, members, runs, format_)
         if not json_output:
             _say(drawn)
@@ -245,10 +244,10 @@ def run(
         return
     for line in session.submitted:
         typer.echo(line)
+    left_over = runner.cheapest_first(items_of(everyone)) if limit is not None else []
     if left_over and not session.submitted:
         unfinished = ", ".join(
-            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})"
-            for item in list(left_over.values())[:4]
+            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})" for item in left_over[:4]
         )
         more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
         typer.echo(f"the budget is used up; left: {unfinished}{more}. The same command continues.")
@@ -287,46 +286,56 @@ def _check_format(format_: str) -> None:
         raise OptionError(f"--format {format_}{nearest(format_, ['png', 'pdf', 'svg'])}")
 
 
+def _load(name: str) -> Study:
+    """Load a study whose pictures exist."""
+    study = load(name)
+    studies.check(study)
+    return study
+
+
 def _members(
-    name: str,
-    settings: list[str] | None = None,
-    models: list[str] | None = None,
-    only: list[str] | None = None,
+    name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
 ) -> tuple[Study, list[Member]]:
     """Load a study and resolve its entries."""
-    parsed = [options.parse_setting(word) for word in settings or []]
+    study = _load(name)
+    return study, runner.select(study, *_changes(settings, models), only or [])
+
+
+def _changes(
+    settings: list[str] | None, models: list[str] | None
+) -> tuple[list[options.Setting], dict[str, str]]:
+    """Parse what is changed in every entry: options, and models by name."""
     mapped = {}
     for word in models or []:
         old, equals, new = (part.strip() for part in word.partition("="))
         if not (old and equals and new):
             raise OptionError(f"--model-map {word}: write MODEL=MODEL, for example vqc-native=vqc-pennylane")
         mapped[old] = new
-    loaded = load(name)
-    studies.check(loaded)
-    return loaded, runner.select(loaded, parsed, mapped, only or [])
+    return [options.parse_setting(word) for word in settings or []], mapped
 
 
 def _chosen(
     name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
 ) -> list[tuple[Study, list[Member]]]:
-    """Load one study, or all that are registered: of these, those that have the options and entries that are wanted.
+    """Load one study, or all that are registered and have the options and entries that are wanted.
 
     Raises
     ------
     QrlSuiteError
-        If there is none.
+        If there is none, or one is broken by itself.
     """
     if name != ALL:
         return [_members(name, settings, models, only)]
-    chosen, refusals = [], []
-    for each in registry.load().names("studies"):
-        _members(each)  # a study that is broken by itself is no reason to go on without it
+    changes, chosen, refusals = _changes(settings, models), [], []
+    for study in map(_load, registry.load().names("studies")):
         try:
-            chosen.append(_members(each, settings, models, only))
+            chosen.append((study, runner.select(study, *changes, only or [])))
         except OptionError as error:
             refusals.append(error)
-    if not chosen:
-        raise refusals[0] if refusals else OptionError("no study is registered")
+    if refusals and not chosen:
+        raise refusals[0]
+    for refusal in refusals:
+        typer.echo(f"left out: {refusal}", err=True)
     return chosen
 
 
