@@ -31,18 +31,29 @@ from types import SimpleNamespace
 from typing import IO, Any
 
 PRELOADED = (
+    "matplotlib.backends.backend_agg",
     "matplotlib.figure",
+    "pyarrow.compute",
+    "qrlsuite.api",
     "qrlsuite.cli",
     "qrlsuite.engine.local",
     "qrlsuite.engine.worker",
     "qrlsuite.leaderboard",
     "qrlsuite.plugins.circuits.native.cpu",
+    "qrlsuite.plugins.circuits.native.sweeps",
     "qrlsuite.training.group",
+    "rich.progress",
+    "rich.table",
     "scipy.interpolate",
     "torch",
 )
-if importlib.util.find_spec("distributed") is not None:
-    PRELOADED += ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
+WHERE_INSTALLED = {
+    "distributed": ("distributed.cli.dask_scheduler", "distributed.cli.dask_worker"),
+    "pandas": ("pandas", "pyarrow.pandas_compat"),  # which pyarrow imports before it makes its first array
+}
+for _package, _modules in WHERE_INSTALLED.items():
+    if importlib.util.find_spec(_package) is not None:
+        PRELOADED += _modules
 PENNYLANE, QISKIT = "qrlsuite.plugins.circuits.pennylane", "qrlsuite.plugins.circuits.qiskit"
 LOADED_FOR = {"vqc-pennylane": (PENNYLANE,), "check": (PENNYLANE, QISKIT), "pytest": (PENNYLANE, QISKIT)}
 """What is imported before the first command with this word, for it and all that follow."""
@@ -192,6 +203,7 @@ def serve(control: int) -> None:
     """Fork a command for every request, until the other end of the socket is closed."""
     for name in PRELOADED:
         importlib.import_module(name)
+    importlib.import_module("numba").njit(lambda: 0)()  # the first compiled function takes longest
     requests = socket.socket(fileno=control)
     running: list[Fork] = []
     while True:

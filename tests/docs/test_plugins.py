@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import hookspecs, registry, scaffold
-from qrlsuite.testing import check
 from tests.testing.test_builtins import RULES
 
 ROOT = Path(__file__).parents[2]
@@ -42,14 +41,6 @@ def test_no_block_is_left_out() -> None:
 @pytest.mark.parametrize("hook", HOOKS)
 def test_every_hook_is_on_the_page(hook: str) -> None:
     assert f"`{hook}`" in PAGE
-
-
-def test_the_rules_of_small_checks_are_on_the_page() -> None:
-    for kind, name in (("tracker", "tensorboard"), ("engine", "local")):
-        rules = [finding.rule for finding in check(kind, name)]
-        (row,) = re.findall(rf"^\| {kind} \| (.*) \|$", PAGE, re.MULTILINE)
-        own = re.findall(r"`([^`]+)`", row)
-        assert rules[-len(own) :] == own
 
 
 @pytest.mark.parametrize("kind", RULES)
