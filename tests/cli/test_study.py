@@ -142,19 +142,19 @@ STUDIES = (
     "deploy",
     "shots",
 )
-SIZES = {"qubits = [": "qubits = [2, 3]", "layers = [": "layers = [1, 2]", "width = [": "width = [4, 8]"}
+SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
 """Grids of sizes, and what they become."""
 QUOTED = r'"[^"]*"'
 LONG_LIST = re.compile(rf"\[\s*(?:{QUOTED},\s*){{9,}}(?:{QUOTED})?\s*\]")
 """Ten names and more, of tasks; every tenth is kept."""
-REDUCED = {"interactions": 80, "environments": 4, "validation_episodes": 4, "steps": 20}
+REDUCED = {"interactions": 16, "environments": 4, "validation_episodes": 2, "steps": 4}
 
 
 def reduced(name: str, folder: Path) -> str:
     """Write a study of the suite with small models, and the same tasks at a protocol of moments; returns its path."""
     text = Path(registry.study(name).path).read_text()
-    for beginning, grid in SIZES.items():
-        text = re.sub(rf"{re.escape(beginning)}[^]]*\]", grid, text)
+    for size, grid in SIZES.items():
+        text = re.sub(rf"\b{size} = \[[^]]*\]", f"{size} = {grid}", text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
     text = re.sub(r"\b(episodes|trajectories|shots) = \d+", r"\1 = 5", text)
     text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::10])}]", text)
