@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -131,8 +132,13 @@ def test_what_comes_next_works_as_it_is_printed(task: str, tmp_path: Path) -> No
         ]
         assert [shlex.split(line)[0] for line in lines] == [program, program]
         printed.append([shlex.split(line)[1:] for line in lines])
-        for line in lines if program != "qrlsuite" else lines[:1]:
-            subprocess.run(line, shell=True, check=True, env=env, cwd=tmp_path, capture_output=True)
+        for line in lines:
+            assert shutil.which(shlex.split(line)[0], path=path), "the shell finds the command"
+            typed = subprocess.run(
+                f"printf '%s\\0' {line}", shell=True, check=True, capture_output=True, text=True
+            )
+            done = qrlsuite(*typed.stdout.split("\0")[1:-1], env=env, cwd=tmp_path)
+            assert done.returncode == 0, done.stderr
     assert printed[0] == printed[1]
     assert list(folder.glob("*.png"))
 

@@ -7,6 +7,8 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+import pytest
+
 import qrlsuite
 from tests.core.test_hooks import install, suite
 
@@ -32,7 +34,17 @@ def shadow(site: Path, *requires: str, python: str = ">=3.11") -> None:
     (info / "entry_points.txt").write_text(real.read_text("entry_points.txt") or "")
 
 
-def test_this_installation(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "required",
+    [
+        pytest.param(("numpy>=1.26", "torch>=2.4"), id="little"),
+        pytest.param((), marks=pytest.mark.long, id="all"),
+    ],
+)
+def test_this_installation(tmp_path: Path, required: tuple[str, ...]) -> None:
+    """All that is required takes five seconds longer to import than the little that a simulator needs anyway."""
+    if required:
+        shadow(tmp_path, *required)
     for seed in range(3):
         (tmp_path / "runs" / "tiny" / "entry" / f"seed-{seed:04d}").mkdir(parents=True)
     (tmp_path / "runs" / "tiny" / "entry" / "entry.json").write_text("{}")
@@ -51,6 +63,8 @@ def test_this_installation(tmp_path: Path) -> None:
         ", slurm" if find_spec("submitit") else "slurm (pip install 'qrlsuite[slurm]')"
     )
     assert "runs, 1 entries, 3 seeds" in facts["runs"]
+    if not required:
+        assert f"qiskit {metadata.version('qiskit')}" in facts["packages"]
     assert sorted(tmp_path.rglob("*")) == before, "it leaves nothing behind"
 
 

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -16,18 +15,9 @@ from qrlsuite.cli import main
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.scaffold import Kind
 from tests.commands import Command, start
-from tests.conftest import HANGS, installed
+from tests.conftest import HANGS, install_from_source, installed
 
 ROOT = Path(__file__).parents[2]
-BUILD = """
-import os, sys
-from setuptools import build_meta
-wheels, *folders = map(os.path.abspath, sys.argv[1:])
-for folder in folders:
-    os.chdir(folder)
-    build_meta.build_wheel(wheels)
-"""
-"""Builds wheels as pip does, all of them in one process."""
 
 
 def qrlsuite(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -52,11 +42,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("packages")
     for kind in Kind:
         scaffold.write(scaffold.package(f"acme-{kind}", kind), folder)
-    (folder / "wheels").mkdir()
-    run(sys.executable, "-c", BUILD, "wheels", *(f"acme-{kind}" for kind in Kind), cwd=folder)
-    for wheel in (folder / "wheels").iterdir():
-        with zipfile.ZipFile(wheel) as archive:
-            archive.extractall(folder / "site")
+    install_from_source(folder / "site", *(folder / f"acme-{kind}" for kind in Kind))
     return folder
 
 

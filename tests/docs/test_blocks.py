@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +11,8 @@ from typing import Any
 import pytest
 
 from qrlsuite.specs import AnsatzSpec
-from tests.conftest import HANGS
+from tests.commands import qrlsuite
+from tests.conftest import install_from_source, installed
 
 pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
@@ -88,29 +86,7 @@ def test_the_readmes_plugin_is_a_package(tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()  # of commands that were typed here
     (tmp_path / "my_ansatz.py").write_text(code)
     (tmp_path / "pyproject.toml").write_text(project)
-    site = str(tmp_path / "site")
-    install = [
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-index",
-        "--target",
-        site,
-        ".",
-    ]
-    env = {**os.environ, "PYTHONPATH": site, "QRLSUITE_LOAD_PLUGINS": "my-ansatz"}
-    check = "from qrlsuite.testing import assert_conforms; assert_conforms('ansatz', 'ry-ring')"
-    for words in (install, ["-W", "error", "-P", "-c", check]):
-        done = subprocess.run(
-            [sys.executable, *words],
-            cwd=tmp_path,
-            env=env,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=HANGS,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
+    site = tmp_path / "site"
+    install_from_source(site, tmp_path)
+    checked = qrlsuite("check", "ansatz:ry-ring", env=installed(site), cwd=tmp_path)
+    assert checked.returncode == 0, checked.stdout + checked.stderr

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.cli.commands import demo
+from tests.commands import qrlsuite
 from tests.core.test_docs import parse
 
 ROOT = Path(__file__).parents[2]
@@ -96,6 +97,5 @@ def test_make_starts_the_demo() -> None:
 )
 def test_shells_complete_commands_options_and_names(line: str, expected: str) -> None:
     env = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_QRLSUITE_COMPLETE": "complete_bash"}
-    words = [sys.executable, "-m", "qrlsuite"]
-    done = subprocess.run(words, env={**os.environ, **env}, capture_output=True, text=True, timeout=60)
+    done = qrlsuite(env={**os.environ, **env})
     assert done.stdout.split() == [expected], done.stderr
