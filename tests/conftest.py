@@ -43,13 +43,13 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 LONGEST = (
-    "third_party/test_stranger.py",
     "testing/test_builtins.py",
-    "circuits/test_native.py",
     "cli/test_new.py",
-    "core/test_api.py",
     "cli/test_cli.py",
     "cli/test_study.py",
+    "engine/test_dask.py",
+    "trackers/test_killed_runs.py",
+    "leaderboard/test_report_page.py",
 )
 """Begun first, for a file is one process's: the last one would be waited for by an idle core."""
 

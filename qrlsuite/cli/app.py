@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -77,6 +78,7 @@ BUILT_IN = {
 }
 
 
+@functools.cache
 def load(command: LazyCommand) -> Any:
     """Import a built-in command and return it as Typer builds it."""
     target = resolve(command.reference)

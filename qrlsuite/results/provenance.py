@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import subprocess
@@ -73,8 +74,9 @@ def processor() -> str:
     return name or platform.processor() or "unknown"
 
 
+@functools.cache
 def _commit() -> str | None:
-    """Return the git commit of the suite's own working copy, None for an installed release."""
+    """Return the git commit of the suite's own working copy, as of the first call; None for an installed release."""
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None

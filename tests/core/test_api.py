@@ -18,7 +18,6 @@ from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
 from qrlsuite.results.seeds import read_seeds
 from tests.commands import qrlsuite as command
 from tests.conftest import results
-from tests.core.test_dependencies import ALL
 
 OPTIONS = {"width": 4, "model.depth": 1}
 
@@ -209,24 +208,6 @@ def test_a_bar_is_shown_on_a_terminal_only() -> None:
     shown.update(5, "training", "half")
     shown.stop()
     assert not shown.shown
-
-
-def test_names_stay_what_they_are_once_every_module_is_imported() -> None:
-    """A function of the same name as a submodule would be replaced by it, and be no function any longer."""
-    names = [name for name in sorted(ALL) if ".templates." not in name and not name.endswith("__main__")]
-    program = (
-        "import importlib, types, qrlsuite;"
-        f"[importlib.import_module(name) for name in {names}];"
-        "assert isinstance(qrlsuite.__version__, str);"
-        "functions = set(qrlsuite.__all__) - {'__version__', 'api'};"
-        "wrong = [name for name in functions if isinstance(getattr(qrlsuite, name), types.ModuleType)];"
-        "wrong += [name for name in functions if not callable(getattr(qrlsuite, name))];"
-        "assert not wrong, wrong;"
-        "assert all(getattr(qrlsuite, name) is getattr(qrlsuite.api, name) for name in qrlsuite.api.__all__);"
-        "assert isinstance(qrlsuite.training, types.ModuleType);"
-        "assert isinstance(qrlsuite.tuning, types.ModuleType)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_importing_the_package_imports_no_library() -> None:

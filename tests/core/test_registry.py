@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 import types
@@ -12,10 +13,12 @@ from typing import Any
 
 import pytest
 
+import qrlsuite
 from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
 from tests.conftest import installed
+from tests.core.test_dependencies import ALL
 
 MODEL: dict[str, Any] = {"summary": "One", "family": "classical", "options": "a:B", "build": "a:C"}
 
@@ -200,6 +203,20 @@ def test_every_registered_reference_resolves(kind: str, name: str) -> None:
         reference = getattr(spec, field, None)
         if reference is not None:
             assert callable(specs.resolve(reference))
+
+
+def test_names_stay_what_they_are_once_every_module_is_imported() -> None:
+    """A function of the same name as a submodule would be replaced by it, and be no function any longer."""
+    for name in sorted(ALL):
+        if ".templates." not in name and not name.endswith("__main__"):
+            importlib.import_module(name)
+    assert isinstance(qrlsuite.__version__, str)
+    functions = set(qrlsuite.__all__) - {"__version__", "api"}
+    assert not [name for name in functions if isinstance(getattr(qrlsuite, name), types.ModuleType)]
+    assert all(callable(getattr(qrlsuite, name)) for name in functions)
+    assert all(getattr(qrlsuite, name) is getattr(qrlsuite.api, name) for name in qrlsuite.api.__all__)
+    assert isinstance(qrlsuite.training, types.ModuleType)
+    assert isinstance(qrlsuite.tuning, types.ModuleType)
 
 
 @pytest.mark.parametrize(

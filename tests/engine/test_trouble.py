@@ -25,10 +25,10 @@ from tests.engine.stress import finished
 
 
 @pytest.fixture
-def words(tmp_path: Path) -> list[str]:
-    task = tmp_path / "tiny.toml"
-    task.write_text(TINY)
-    return ["run", "--task", str(task), "--model", "mlp", "--set", "width=16", "--seeds", "2"]
+def words(tiny_task: str) -> list[str]:
+    short = TINY.replace("interactions = 60", "interactions = 20").replace("[180]", "[60]")
+    Path(tiny_task).write_text(short)
+    return ["run", "--task", tiny_task, "--model", "mlp", "--set", "width=16", "--seeds", "2"]
 
 
 def remount(disk: Path, option: str) -> None:

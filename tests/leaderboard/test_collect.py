@@ -124,7 +124,7 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output + str(done.exception)
         return done.output, (tmp_path / "p.svg").read_text()
 
-    for kind in ("bars", "surface", "tiers"):
+    for kind in ("bars", "tiers"):
         output, picture = plot(kind, "--published")
         assert "left out: ddqn mlp width=16: ends at 2000 steps; --horizon 2000 shows it" in output
         assert "all cut to" not in picture

@@ -18,6 +18,8 @@ import pytest
 from tests.commands import Command, qrlsuite
 from tests.conftest import HANGS
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 SUITE = ("pyproject.toml", "README.md", "LICENSE", "qrlsuite", "plugins", "tasks", "leaderboard")
 TINY = ("--seeds", "1", "--epochs", "1", "--workers", "1")
