@@ -230,7 +230,7 @@ def test_python_decides_as_the_command_does() -> None:
 
 def test_a_killed_worker_changes_no_byte(hold: Hold, tmp_path: Path) -> None:
     Path("tiny.toml").write_text(TINY)
-    write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2,3", "--reason", "a test")
+    write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2", "--reason", "a test")
     words = ("decide", "run", "widths.toml", "--workers", "1", "--json", "--runs")
     process = start(*words, "killed", env=hold.environment)
     hold.wait(process)
@@ -244,7 +244,7 @@ def test_a_killed_worker_changes_no_byte(hold: Hold, tmp_path: Path) -> None:
     hash_ = answer("show", "widths.toml", "--runs", "killed")["hash"]
     for one in Path("killed/decisions/widths/tiny").iterdir():
         other = Path("straight/decisions/widths/tiny") / one.name
-        for seed in (10000, 10001, 10002):
+        for seed in (10000, 10001):
             assert results(one, seed) == results(other, seed)
             assert json.loads((one / f"seed-{seed}" / "run.json").read_text())["plan"] == hash_
 

@@ -513,7 +513,7 @@ def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("two_studies")
 def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
-    words = ("--engine", "here", "--epochs", "10", "--runs", str(tmp_path / "runs"))
+    words = ("--engine", "here", "--epochs", "3", "--runs", str(tmp_path / "runs"))
     say("run", "widths", "--only", "mlp", "--seeds", "20", *words)
     wide, widths = answer("status", "without-circuit", "widths", "--seeds", "20", *words)["studies"]
     assert (wide["complete"], wide["entries"], wide["pairs"]) == (1, 1, 0)
