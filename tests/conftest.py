@@ -199,9 +199,9 @@ class Hold:
         self.environment = installed(self.site)
         self._seen = 0
 
-    def wait(self, *processes: subprocess.Popen[str] | Command) -> None:
-        """Return when one more worker of these commands is held."""
-        while len(list(self.site.glob("held-*"))) <= self._seen:
+    def wait(self, *processes: subprocess.Popen[str] | Command, workers: int = 1) -> None:
+        """Return when so many more workers are held: all of them, where they are then to be stopped."""
+        while len(list(self.site.glob("held-*"))) < self._seen + workers:
             assert all(process.poll() is None for process in processes), "it ended before a worker was held"
             time.sleep(0.02)
         self._seen = len(list(self.site.glob("held-*")))

@@ -74,7 +74,7 @@ def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, ho
     straight = next((tmp_path / "straight" / "tiny").iterdir())
     stopped = tmp_path / "stopped" / "tiny" / straight.name
     process = start(*words("stopped"), env=hold.environment)
-    hold.wait(process)
+    hold.wait(process, workers=2)
     os.kill(process.pid, signal.SIGINT)
     _, message = process.communicate(timeout=HANGS)
     assert process.returncode == 130
