@@ -24,6 +24,7 @@ from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
+    TOO_FEW,
     Board,
     Comparison,
     LearningCurves,
@@ -497,7 +498,7 @@ def untiered_reason(row: Row) -> str:
     if row.not_reached:
         return "not reached: at the cap in every cell, and not ranked among each other"
     if len(row.entry.seeds) < MIN_RUNS:
-        return f"undecided: fewer than {MIN_RUNS} seeds"
+        return TOO_FEW
     return "undecided: nothing to compare with"
 
 

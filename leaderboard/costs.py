@@ -26,7 +26,15 @@ from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
-from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    TOO_FEW,
+    Direction,
+    LearningCurves,
+    MeanTime,
+    TimesBoard,
+    times_board,
+)
 from qrlsuite.statistics.times import check_probability
 
 CELLS = 1000
@@ -309,7 +317,7 @@ class CostSection:
         if any(row.complexity.unsettled for row in self.rows if self.priced(row)):
             lines.append(">= : still below delta at the last epoch; S_hat is at least this")
         if any(row.index is not None and len(row.entry.seeds) < MIN_RUNS for row in self.rows):
-            lines.append(f"undecided: fewer than {MIN_RUNS} seeds")
+            lines.append(TOO_FEW)
         return lines
 
     @property

@@ -13,7 +13,16 @@ from typing import Any
 
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    TOO_FEW,
+    Direction,
+    Grid,
+    LearningCurves,
+    MeanTime,
+    TimesBoard,
+    times_board,
+)
 
 ALPHA = 0.05
 
@@ -168,7 +177,7 @@ class TimeRanking:
         if any(row.few for row in self.rows):
             lines.append("! fewer than 50 seeds against another number: errors are likelier than alpha says")
         if any(row.ranks is None for row in self.rows):
-            lines.append(f"undecided: fewer than {MIN_RUNS} seeds")
+            lines.append(TOO_FEW)
         return lines
 
     def as_dict(self) -> dict[str, Any]:

@@ -46,10 +46,12 @@ LONGEST = (
     "testing/test_builtins.py",
     "cli/test_new.py",
     "cli/test_cli.py",
-    "cli/test_study.py",
+    "leaderboard/test_report_page.py",
     "engine/test_dask.py",
     "trackers/test_killed_runs.py",
-    "leaderboard/test_report_page.py",
+    "cli/test_study.py",
+    "docs/test_use.py",
+    "engine/test_command.py",
 )
 """Begun first, for a file is one process's: the last one would be waited for by an idle core."""
 

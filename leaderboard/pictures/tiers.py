@@ -17,7 +17,7 @@ from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import Board, outperformance
+from qrlsuite.statistics import TOO_FEW, Board, outperformance
 
 LOOKS: dict[str, dict[str, Any]] = {
     "win": {"facecolor": style.COLORS[0], "edgecolor": "white"},
@@ -64,7 +64,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         "win": "the row outperforms the column",
         "loss": "the reverse",
         "neither": "neither",
-        "undecided": "undecided: fewer than 20 seeds",
+        "undecided": TOO_FEW,
     }
     handles = [Patch(**LOOKS[state], lw=0, label=text) for state, text in texts.items() if state in states]
     title = f"{style.heading(entries)}: significant outperformance, up to {steps_text(horizon)} steps"

@@ -18,7 +18,7 @@ from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.report import entries, planned, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
-from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.statistics import MIN_RUNS, TOO_FEW
 from qrlsuite.studies.decided import DecisionOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
@@ -74,6 +74,7 @@ def render(
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,
+            too_few=TOO_FEW,
             rule=board.rule,
             promise=clean(board.promise, LONGEST_REASON),
             paper=PAPER,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.times import TimeRanking, TimeRow, p_text
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import Direction
+from qrlsuite.statistics import TOO_FEW, Direction
 
 STYLES = {Direction.FEWER: "win", Direction.MORE: "loss", Direction.TRADE_OFF: "both"}
 LINKS = {"/": "start", "|": "through", "\\": "end", "": ""}
@@ -77,7 +77,7 @@ def _cell(ranking: TimeRanking, rows: tuple[TimeRowView, ...], one: int, other: 
         return "", "self", ""
     direction = board.directions[i][j]
     if direction is Direction.UNDECIDED:
-        return "?", "tie", "undecided: fewer than 20 seeds"
+        return "?", "tie", TOO_FEW
     names = f"{rows[one].entry.label} against {rows[other].entry.label}"
     title = f"{names}: {direction}, adjusted p = {board.adjusted[i, j]:.4g}"
     if board.few[i, j]:

@@ -24,6 +24,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.results.store import FORMAT_VERSION, EntryStore, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
+FILE = "checkpoint.safetensors"  # in the group's folder
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def save(store: EntryStore, seeds: Sequence[int], epoch: int, arrays: Mapping[st
         "epoch": str(epoch),
         "seeds": json.dumps([int(seed) for seed in seeds]),
     }
-    path = store.groups / group_id(seeds) / "checkpoint.safetensors"
+    path = store.groups / group_id(seeds) / FILE
     content = encode({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata=metadata)
     write_atomically(path, content)
     header = Header(path, epoch, tuple(int(seed) for seed in seeds))
@@ -92,7 +93,7 @@ def headers(store: EntryStore) -> list[Header]:
     if not store.groups.is_dir():
         return []
     headers_found = []
-    for path in sorted(store.groups.glob("*/checkpoint.safetensors")):
+    for path in sorted(store.groups.glob(f"*/{FILE}")):
         try:
             with path.open("rb") as file:
                 length = int.from_bytes(file.read(8), "little")

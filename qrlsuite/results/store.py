@@ -220,6 +220,7 @@ class SeedStore:
         self.lines = path / "epochs.jsonl"
         self.table = path / "epochs.parquet"
         self.timings = path / "timings.jsonl"
+        self.agent = path / "final.safetensors"
 
     def record(self) -> dict[str, Any] | None:
         """Return `run.json`, or None where the run never began.

@@ -25,6 +25,10 @@ from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray, exac
 Weights = NDArray[np.float32]
 EpochDraws = NDArray[np.int32]
 
+RESAMPLES = 1000
+"""How often runs are redrawn, unless a caller says otherwise."""
+PERCENTILES = (5.0, 95.0)
+"""Ends of an interval of S_hat, where it is shown and where verdicts compare it."""
 BLOCK = 2048  # resamples at a time: a block of counts stays in the cache
 BYTE = 255  # the most that a byte can count
 _TILE = 2**18  # rows x columns x depth up to which OpenBLAS multiplies float32 matrices on one thread
@@ -36,8 +40,8 @@ def bootstrap_interval(
     curves: ArrayLike,
     grid: Grid,
     steps_per_epoch: int,
-    n_resamples: int = 1000,
-    percentiles: tuple[float, float] = (5, 95),
+    n_resamples: int = RESAMPLES,
+    percentiles: tuple[float, float] = PERCENTILES,
     seed: int = 0,
     n_runs: int | None = None,
 ) -> FloatArray:
@@ -79,7 +83,7 @@ def bootstrap_draws(
     curves: ArrayLike,
     grid: Grid,
     steps_per_epoch: int,
-    n_resamples: int = 1000,
+    n_resamples: int = RESAMPLES,
     seed: int = 0,
     n_runs: int | None = None,
 ) -> IntArray:
@@ -132,7 +136,7 @@ def check_percentiles(percentiles: tuple[float, float]) -> tuple[float, float]:
 
 
 def draw_epochs(
-    curves: Curve, grid: Grid, n_resamples: int = 1000, seed: int = 0, n_runs: int | None = None
+    curves: Curve, grid: Grid, n_resamples: int = RESAMPLES, seed: int = 0, n_runs: int | None = None
 ) -> EpochDraws:
     """Return, shape (E, D, R), the epochs below delta of every resample of checked curves (N, T).
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.statistics.bootstrap import PERCENTILES
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.estimator import at_cap, complexity
 from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid
@@ -28,6 +29,7 @@ from qrlsuite.statistics.significance import (
 )
 
 MIN_RUNS = 20
+TOO_FEW = f"undecided: fewer than {MIN_RUNS} seeds"
 """Below this number of runs every verdict is undecided."""
 
 
@@ -158,7 +160,7 @@ def in_words(outcome: Outcome, wins: int, losses: int, capped: int, cells: int) 
     fewer, more = "significantly fewer", "significantly more"
     match outcome:
         case Outcome.UNDECIDED:
-            return f"{outcome}: fewer than {MIN_RUNS} seeds"
+            return TOO_FEW
         case Outcome.NOT_REACHED:
             return f"{outcome}: both are at the cap in all {cells} cells"
         case Outcome.OUTPERFORMS:
@@ -179,7 +181,7 @@ def never_reached(entry: LearningCurves, grid: Grid) -> bool:
 
 def shown_percentiles(rule: SignificanceRule) -> tuple[float, float]:
     """Return the percentiles of the intervals that are shown beside a rule's verdicts."""
-    return rule.percentiles if isinstance(rule, IntervalRule) else (5, 95)
+    return rule.percentiles if isinstance(rule, IntervalRule) else PERCENTILES
 
 
 def compare(

@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.bootstrap import (
+    PERCENTILES,
+    RESAMPLES,
     central_epochs,
     check_percentiles,
     draw_epochs,
@@ -54,7 +56,7 @@ class Resampling:
         If one of them is not an integer in its range.
     """
 
-    n_resamples: int = 1000
+    n_resamples: int = RESAMPLES
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -159,7 +161,7 @@ class Evidence:
             central_epochs(self.entry.values, self.grid, self.epoch_draws, self.n_runs) * self.steps_per_epoch
         )
 
-    def interval(self, percentiles: tuple[float, float] = (5, 95)) -> FloatArray:
+    def interval(self, percentiles: tuple[float, float] = PERCENTILES) -> FloatArray:
         """Return the percentile interval in steps, widened to contain `point`, shape (E, D, 2)."""
         key = check_percentiles(percentiles)
         if key not in self._intervals:
@@ -220,7 +222,7 @@ class IntervalRule:
         Lower and upper percentile of both intervals.
     """
 
-    percentiles: tuple[float, float] = (5, 95)
+    percentiles: tuple[float, float] = PERCENTILES
 
     def __post_init__(self) -> None:
         check_percentiles(self.percentiles)

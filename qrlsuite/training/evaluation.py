@@ -143,7 +143,7 @@ def parameters(folder: SeedStore) -> dict[str, NDArray[Any]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    path = folder.path / "final.safetensors"
+    path = folder.agent
     try:
         arrays: dict[str, NDArray[Any]] = load(path.read_bytes())
     except FileNotFoundError:
@@ -174,9 +174,7 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     for seed, arrays in zip(seeds, stored):
         problem = _misfit({name: value[0] for name, value in state.items()}, arrays)
         if problem:
-            raise StoreError(
-                f"{store.seed(seed).path / 'final.safetensors'} does not fit the entry's model: {problem}"
-            )
+            raise StoreError(f"{store.seed(seed).agent} does not fit the entry's model: {problem}")
     with torch.no_grad():
         for name, value in state.items():
             together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))

@@ -174,7 +174,7 @@ class GroupFiles:
         for s, seed in enumerate(self.seeds):
             folder = self.store.seed(seed)
             agent = {name: np.ascontiguousarray(array[s]) for name, array in policy.items()}
-            store.write_atomically(folder.path / "final.safetensors", encode(agent))
+            store.write_atomically(folder.agent, encode(agent))
             folder.compact()
             record = {
                 **(folder.record() or self._seed_record(seed)),
