@@ -327,9 +327,11 @@ def test_seeds_of_others_are_refused(refused: Refused) -> None:
     say("run", "widths.toml", "--engine", "scripted")
     own = EntryStore(next(Path("runs/decisions/widths/tiny").iterdir()))
     record = json.loads((own.seed(10004).path / "run.json").read_text())
-    (own.seed(10004).path / "run.json").write_text(json.dumps({**record, "plan": "0" * 16}))
-    assert "seed 10004 of 'mlp width=" in (message := refused("status", "widths.toml"))
-    assert "was not trained by plan" in message
+    planless = {key: value for key, value in record.items() if key != "plan"}
+    for stranger in ({**record, "plan": "0" * 16}, planless):
+        (own.seed(10004).path / "run.json").write_text(json.dumps(stranger))
+        assert "seed 10004 of 'mlp width=" in (message := refused("status", "widths.toml"))
+        assert "was not trained by plan" in message
 
 
 def test_curves_that_changed_after_a_look_are_refused(refused: Refused) -> None:

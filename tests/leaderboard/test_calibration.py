@@ -10,6 +10,7 @@ import pytest
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import calibration
+from qrlsuite.leaderboard.calibration import CalibrationResult
 from qrlsuite.leaderboard.findings import summary, tables
 from qrlsuite.statistics import (
     DecisionPlan,
@@ -101,6 +102,20 @@ def test_decision_plans_are_played_where_times_is_measured() -> None:
         "50% slower",
     ]
     assert "seeds on average, not 100, where an entry takes 50% longer" in summary(found, "times", 3)
+
+
+def test_the_table_of_decision_plans_holds_each_rate_in_its_column() -> None:
+    common = ("decisions", "a", "times", (100, 100), 8)
+    plans = [
+        CalibrationResult(*common, winner=0.25, entries=3, equal=0.5, mean_seeds=60),
+        CalibrationResult(*common, winner=0.75, factor=1.5, wrong=0.125, equal=0.0, mean_seeds=40),
+    ]
+    [(_, (head, *rows))] = tables(plans, GRID.size, 3)
+    assert head == ["entry", "against", "differ", "wrong", "equal", "seeds"]
+    assert [[row[1], row[2].split()[0], *row[3:]] for row in rows] == [
+        ["3 equals", "25.0", "", "50.0%", "60"],
+        ["50% slower", "75.0", "12.5%", "0.0%", "40"],
+    ]
 
 
 def test_tables_state_the_spread_over_entries_and_no_error_of_splits() -> None:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -196,6 +197,18 @@ def test_the_board_in_every_format(tmp_path: Any) -> None:
     assert say("--by", "executions", *PAIR, "--format", "html", "--out", str(page)).exit_code == 0
     assert '<a href="#cost-1">beam6g by executions</a>' in page.read_text()
     assert "1.87k" in page.read_text()
+
+
+def test_what_is_left_out_is_said_on_stderr_and_the_table_stays_a_table(tmp_path: Path) -> None:
+    damaged = tmp_path / "beam6g" / "ddqn-mlp-00000000"
+    damaged.mkdir(parents=True)
+    (damaged / "entry.json").write_text("{")
+    words = ("--by", "executions", "--horizon", "20000", "--format", "csv")
+    result = say(*words, "--runs", str(tmp_path))
+    assert "left out: " in result.stderr
+    assert str(damaged) in result.stderr
+    assert result.stdout.startswith("task,")
+    assert "left out" not in result.stdout
 
 
 def test_the_page_shows_costs_beside_steps() -> None:

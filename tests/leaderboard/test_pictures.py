@@ -22,6 +22,8 @@ from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pictures import cells
+from qrlsuite.statistics import Grid
 
 FILE = tasks.load("beam6g").file
 
@@ -169,6 +171,19 @@ def test_scaling_orders_by_size_with_a_panel_per_model() -> None:
     assert list(line.get_xdata()) == [6, 8, 10]
     assert list(line.get_ydata()) == [60_000, 50_000, 40_000]
     assert "387 + 8" in texts(figure)
+
+
+def test_scaling_bars_reach_from_the_5th_to_the_95th_percentile() -> None:
+    entries = [noisy(f"ddqn mlp width={n}", level=level) for n, level in ((16, 0.9), (64, 0.95))]
+    entries = [replace(e, identity={"model_options": {"width": n}}) for e, n in zip(entries, (16, 64))]
+    grid = Grid.relative([0.2], [0.5])
+    axes = pictures.draw("scaling", entries, epsilons=[0.2], deltas=[0.5]).axes[0]
+    for entry, drawn in zip(entries, axes.containers, strict=True):
+        [(_, low), (_, high)] = drawn.lines[2][0].get_segments()[0]
+        measured = cells.measure(entry, grid, 200_000)
+        expected, point = measured.intervals[0, 0].tolist(), measured.points[0, 0]
+        assert [low, high] == pytest.approx(expected)
+        assert high - point != pytest.approx(point - low), "else swapped ends would not show"
 
 
 def test_scaling_draws_depth_for_each_width_but_no_line_of_chance_pairs() -> None:
