@@ -171,6 +171,11 @@ class TextLink(GoodLink):
         return [Answer(each.key, str(each.content)) for each in super().receive(seconds)]  # type: ignore[arg-type]
 
 
+class CutLink(GoodLink):
+    def receive(self, seconds: float) -> list[Answer]:
+        return [Answer(each.key, each.content[:-1]) for each in super().receive(seconds)]
+
+
 class EchoLink(GoodLink):
     def receive(self, seconds: float) -> list[Answer]:
         tasks = dict(self.tasks)
@@ -190,6 +195,10 @@ class RepeatingLink(GoodLink):
 
 class TextRemote(GoodRemote):
     link = TextLink
+
+
+class CutRemote(GoodRemote):
+    link = CutLink
 
 
 class EchoRemote(GoodRemote):
@@ -267,6 +276,7 @@ BROKEN = [
     ("engines", "workers", Broken(engine("Idle"), r"workers\(None\) returned 0, and must return how many")),
     ("engines", "methods", Broken(engine("ShortConnect"), r"connect\(workers, versions\) cannot be called")),
     ("engines", "answers", Broken(engine("TextRemote"), r"in the place of bytes")),
+    ("engines", "answers", Broken(engine("CutRemote"), r"answer to task 'first' is not what `advance` returned")),
     ("engines", "answers", Broken(engine("EchoRemote"), r"are answers mixed up, or not made by qrlsuite.training")),
     ("engines", "answers", Broken(engine("MixingRemote"), r"answer to task 'first' is .*'token': 'third'")),
     ("engines", "once", Broken(engine("RepeatingRemote"), r"answers came to first, first, second, second, third")),
