@@ -24,7 +24,6 @@ from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
-    TOO_FEW,
     Board,
     Comparison,
     LearningCurves,
@@ -36,6 +35,7 @@ from qrlsuite.statistics import (
     sample_complexity,
     unsettled,
 )
+from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.statistics.times import check_probability
 
 

@@ -26,7 +26,7 @@ def collect(
 
     Parameters
     ----------
-    shipped:
+    published:
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
         both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
         own copy gets less far towards the task's shortest horizon, both are shown.
@@ -72,7 +72,7 @@ def select(
     ----------
     tasks, names:
         The tasks and the entries (see `find`) to read; all where empty. Entries that were read stand as they are.
-    shipped:
+    published:
         As for `collect`.
     horizon:
         Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
@@ -158,7 +158,7 @@ def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] 
 
     Parameters
     ----------
-    shipped:
+    published:
         Look among the published entries that come with the suite, too.
     tasks:
         Look among the entries of these tasks only; of all where empty.

@@ -28,13 +28,13 @@ from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
-    TOO_FEW,
     Direction,
     LearningCurves,
     MeanTime,
     TimesBoard,
     times_board,
 )
+from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.statistics.times import check_probability
 
 CELLS = 1000

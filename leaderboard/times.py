@@ -15,7 +15,6 @@ from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
-    TOO_FEW,
     Direction,
     Grid,
     LearningCurves,
@@ -23,6 +22,7 @@ from qrlsuite.statistics import (
     TimesBoard,
     times_board,
 )
+from qrlsuite.statistics.compare import TOO_FEW
 
 ALPHA = 0.05
 

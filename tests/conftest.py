@@ -31,6 +31,10 @@ for variable in [name for name in os.environ if name.startswith("QRLSUITE_") and
 os.environ["PATH"] = (
     f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # as in an active environment
 )
+# else every run builds hypothesis's table of characters anew
+os.environ.setdefault(
+    "HYPOTHESIS_STORAGE_DIRECTORY", str(Path(__file__).parents[1] / ".pytest_cache" / "hypothesis")
+)
 os.environ["QRLSUITE_LOAD_PLUGINS"] = ""  # whatever is installed; tests name the packages that they install
 
 

@@ -17,7 +17,8 @@ from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import TOO_FEW, Board, outperformance
+from qrlsuite.statistics import Board, outperformance
+from qrlsuite.statistics.compare import TOO_FEW
 
 LOOKS: dict[str, dict[str, Any]] = {
     "win": {"facecolor": style.COLORS[0], "edgecolor": "white"},

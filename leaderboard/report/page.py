@@ -18,7 +18,8 @@ from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.report import entries, planned, sections
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
-from qrlsuite.statistics import MIN_RUNS, TOO_FEW
+from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.studies.decided import DecisionOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.times import TimeRanking, TimeRow, p_text
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import TOO_FEW, Direction
+from qrlsuite.statistics import Direction
+from qrlsuite.statistics.compare import TOO_FEW
 
 STYLES = {Direction.FEWER: "win", Direction.MORE: "loss", Direction.TRADE_OFF: "both"}
 LINKS = {"/": "start", "|": "through", "\\": "end", "": ""}

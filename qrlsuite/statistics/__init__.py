@@ -37,7 +37,7 @@ from qrlsuite.statistics.calibration import (
     slower,
     split_halves,
 )
-from qrlsuite.statistics.compare import MIN_RUNS, TOO_FEW, Comparison, Outcome, Verdict, compare
+from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.estimator import (
     at_cap,
@@ -70,7 +70,6 @@ from qrlsuite.statistics.times import MeanTime, mean_time, times_below
 
 __all__ = [
     "MIN_RUNS",
-    "TOO_FEW",
     "AcrossTasks",
     "Board",
     "Comparison",

@@ -142,6 +142,8 @@ STUDIES = (
     "deploy",
     "shots",
 )
+ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz")
+"""Studies whose pictures are of kinds that others have, too."""
 SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
 """Grids of sizes, and what they become."""
 QUOTED = r'"[^"]*"'
@@ -179,7 +181,9 @@ def test_no_study_is_left_out() -> None:
     assert set(STUDIES) == built_in
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in STUDIES]
+)
 def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
     seeds = 6 if name == "few-runs" else 2  # its picture compares 5 with more
     words = [reduced(name, tmp_path), "--seeds", str(seeds), "--epochs", "2"]

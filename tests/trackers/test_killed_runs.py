@@ -73,6 +73,7 @@ tracker.run_finished(run)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_nothing_is_sent_over_the_network(name: str, tmp_path: Path) -> None:
     with socket.create_server(
