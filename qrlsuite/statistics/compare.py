@@ -29,8 +29,8 @@ from qrlsuite.statistics.significance import (
 )
 
 MIN_RUNS = 20
-TOO_FEW = f"undecided: fewer than {MIN_RUNS} seeds"
 """Below this number of runs every verdict is undecided."""
+TOO_FEW = f"undecided: fewer than {MIN_RUNS} seeds"
 
 
 class Verdict(StrEnum):
