@@ -17,7 +17,7 @@ test: install-dev
 	mkdir -p $(VENV)/package/qrlsuite
 	ln -sfn $(CURDIR)/qrlsuite/* $(CURDIR)/plugins $(CURDIR)/leaderboard $(CURDIR)/tasks $(VENV)/package/qrlsuite
 	cd $(VENV) && MYPYPATH=package bin/mypy --config-file $(CURDIR)/pyproject.toml -p qrlsuite
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=15
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15
 
 # What is long by nature, before a release: CONTRIBUTING.md says what, and when it last passed.
 test-long: install-dev

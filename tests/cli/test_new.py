@@ -46,6 +46,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_new_packages_pass_their_own_tests(packages: Path) -> None:
     words = ["-q", "-W", "error", "--import-mode=importlib", "-p", "no:cacheprovider"]
     words += [f"acme-{kind}" for kind in Kind]

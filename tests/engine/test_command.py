@@ -86,6 +86,7 @@ def test_the_documented_templates_hand_the_command_on(program: str, tmp_path: Pa
     assert json.loads((tmp_path / "got").read_text()) == words
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_started_again_and_ctrl_c_reaches_one_that_no_process_leads_to(
     train: Callable[..., Path], tiny_task: str, tmp_path: Path, hold: Hold
 ) -> None:

@@ -23,7 +23,6 @@ from tests.trackers.test_tensorboard import read as read_tensorboard
 
 Train = Callable[..., Path]
 Curves = dict[str, list[tuple[int, float]]]
-TRACKERS = ("tensorboard", "wandb", "mlflow")
 
 
 def read_wandb(folder: Path) -> Curves:
@@ -94,11 +93,14 @@ def test_nothing_is_sent_over_the_network(name: str, tmp_path: Path) -> None:
     )
 
 
-def test_a_killed_run_goes_on_as_the_same_run(train: Train) -> None:
+@pytest.mark.parametrize(
+    "others", [("wandb",), pytest.param(("wandb", "mlflow"), marks=pytest.mark.long)], ids="-".join
+)
+def test_a_killed_run_goes_on_as_the_same_run(others: tuple[str, ...], train: Train) -> None:
     entry = train("runs", [0, 1], epochs=1)  # without trackers: they are given its epoch when it goes on
     env = {
         **{name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "MLFLOW_"))},
-        "QRLSUITE_TRACK": "\n".join(TRACKERS),
+        "QRLSUITE_TRACK": "\n".join(["tensorboard", *others]),
         "QRLSUITE_CHECKPOINT_SECONDS": "0",
     }
     words = (str(entry), "--seeds", "0:2", "--epochs")
@@ -117,7 +119,7 @@ def test_a_killed_run_goes_on_as_the_same_run(train: Train) -> None:
     for seed, name in enumerate(ids):
         folder = entry / f"seed-000{seed}"
         assert (folder / "tracking-id").read_text() == name
-        curves = {"wandb": read_wandb(folder), "mlflow": read_mlflow(folder)}
+        curves = {name: {"wandb": read_wandb, "mlflow": read_mlflow}[name](folder) for name in others}
         expected = EntryStore(entry).seed(seed).read().curve
         for tracked in curves.values():
             assert [step for step, _ in tracked["validation/score"]] == list(range(1, epochs + 1))
