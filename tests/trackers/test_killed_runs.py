@@ -163,9 +163,9 @@ def test_the_end_of_the_service_of_wandb_stops_no_run(train: Train, hold: Hold) 
 
 def _children(parent: int, name: str) -> list[int]:
     """Return the processes that a process started and that run a program of this name."""
-    command = ["ps", "-e", "-o", "pid=,ppid=,args="]
+    command = ["ps", "-ww", "-e", "-o", "pid=,ppid=,comm="]  # ww: whole names, however narrow the terminal is
     rows = [line.split(None, 2) for line in subprocess.check_output(command, text=True).splitlines()]
-    return [int(pid) for pid, ppid, words in rows if int(ppid) == parent and name in words.split()[0]]
+    return [int(pid) for pid, ppid, program in rows if int(ppid) == parent and Path(program).name == name]
 
 
 def test_wandb_asks_nobody_to_log_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
