@@ -11,6 +11,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import qrlsuite
+
 if TYPE_CHECKING:
     import torch
 
@@ -27,14 +29,9 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
     device:
         What the models are trained on; the processor by default.
     """
-    versions = {}
-    for name in dict.fromkeys([*PACKAGES, *distributions]):
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
+    versions = {name: version(name) for name in [*PACKAGES, *distributions]}
     return {
-        "versions": versions,
+        "versions": {name: number for name, number in versions.items() if number is not None},
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": processor(),
@@ -43,6 +40,19 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
         "threads": 1,
         "commit": _commit(),
     }
+
+
+def version(distribution: str) -> str | None:
+    """Return the version of a distribution, None if it is not installed; of this suite, that of the code that runs.
+
+    What an editable installation says of itself is as old as the installation.
+    """
+    if distribution == "qrlsuite":
+        return qrlsuite.__version__
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def device_kind(made_with: Mapping[str, Any]) -> str:

@@ -25,7 +25,6 @@ import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +32,7 @@ import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field
 
+import qrlsuite
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import StoreError, TaskError
 from qrlsuite.experiment.entry import Entry
@@ -285,7 +285,7 @@ def calibration() -> float:
     """
     standard = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     path = Path(os.environ.get("QRLSUITE_CACHE") or standard).expanduser() / CALIBRATION_FILE
-    key = f"{provenance.processor()}, qrlsuite {metadata.version('qrlsuite')}"
+    key = f"{provenance.processor()}, qrlsuite {qrlsuite.__version__}"
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -38,7 +38,6 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -87,13 +86,8 @@ def unpack(content: bytes) -> tuple[dict[str, Any], Arrays]:
 
 def versions(distributions: Sequence[str]) -> dict[str, str | None]:
     """Return the installed versions of distributions, None for one that is missing, and Python's `major.minor`."""
-    found: dict[str, str | None] = {"python": ".".join(platform.python_version_tuple()[:2])}
-    for name in distributions:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python, **{name: provenance.version(name) for name in distributions}}
 
 
 def differing(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:

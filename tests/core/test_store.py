@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import qrlsuite
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
-from qrlsuite.results import checkpoint, store
+from qrlsuite.results import checkpoint, provenance, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
 from tests.conftest import results
@@ -238,6 +240,14 @@ def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[.
     seed.timings.write_text('{"train": 2.0, "validate": 1.0, "cpu": -1}\n', encoding="utf-8")
     with pytest.raises(StoreError, match="cpu = -1 is not a number of seconds"):
         seed.seconds()
+
+
+def test_the_recorded_version_is_that_of_the_code_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: "0.0.1")  # an editable installation from before
+    assert provenance.collect(["tomli-w"])["versions"] == {
+        **dict.fromkeys([*provenance.PACKAGES, "tomli-w"], "0.0.1"),
+        "qrlsuite": qrlsuite.__version__,
+    }
 
 
 def test_the_record_of_a_seed_says_what_was_trained(train: Callable[..., Path]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import api
+from qrlsuite import __version__, api
 from qrlsuite.engine import execution
 from qrlsuite.engine.dask import DaskEngine, DaskOptions
 from qrlsuite.engine.status import survey
@@ -184,11 +184,13 @@ def test_what_the_engine_starts_itself_listens_here_only() -> None:
 
 
 def shadow(folder: Path, distribution: str, version: str) -> dict[str, str]:
-    """Return the environment of a process that finds another version of a distribution installed."""
+    """Return the environment of a process that finds another version of a distribution."""
     site = folder / f"{distribution}-{version}"
     info = site / f"{distribution}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
+    if distribution == "qrlsuite":  # its version is that of its code
+        (site / "sitecustomize.py").write_text(f"import qrlsuite\n\nqrlsuite.__version__ = {version!r}\n")
     return {"PYTHONPATH": str(site)}
 
 
@@ -219,7 +221,7 @@ def test_workers_of_another_version_or_without_the_suite_are_left_out_by_name(
         cluster.add(shadow(tmp_path, "qrlsuite", "0.0.9"))
         cluster.wait(2)
         refused = only_line(qrlsuite(*words(task, tmp_path / "runs", cluster.address, 2), env=environment()))
-        old = f"qrlsuite 0.0.9 instead of {metadata.version('qrlsuite')}"
+        old = f"qrlsuite 0.0.9 instead of {__version__}"
         named = re.findall(
             r"tcp://127\.0\.0\.1:\d+ has (.*?)(?=, tcp|;)", refused.partition("can be used: ")[2]
         )
@@ -238,7 +240,7 @@ def test_workers_of_another_version_or_without_the_suite_are_left_out_by_name(
             assert bare.poll() is None, "nothing was sent to it that it cannot read"
             (origin,) = (EntryStore(entry).seed(seed).record() or {})["provenance"]
             assert origin["host"] == os.uname().nodename
-            assert origin["versions"]["qrlsuite"] == metadata.version("qrlsuite")
+            assert origin["versions"]["qrlsuite"] == __version__
     finally:
         bare.kill()
         bare.wait()
