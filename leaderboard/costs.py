@@ -26,14 +26,7 @@ from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
-from qrlsuite.statistics import (
-    MIN_RUNS,
-    Direction,
-    LearningCurves,
-    MeanTime,
-    TimesBoard,
-    times_board,
-)
+from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.statistics.times import check_probability
 

@@ -13,15 +13,7 @@ from typing import Any
 
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import (
-    MIN_RUNS,
-    Direction,
-    Grid,
-    LearningCurves,
-    MeanTime,
-    TimesBoard,
-    times_board,
-)
+from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
 
 ALPHA = 0.05
