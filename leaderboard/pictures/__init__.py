@@ -12,9 +12,10 @@ import io
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qrlsuite.errors import UnknownNameError, nearest
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.specs import resolve
 
@@ -94,6 +95,20 @@ def draw(kind: str, entries: Sequence[EntryCurves] = (), **settings: Any) -> Fig
         raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, KINDS)}")
     figure: Figure = resolve(f"{KINDS[kind].module}:draw")(entries, **settings)
     return figure
+
+
+def format_of(path: Path | None, option: str = "--out") -> str:
+    """Return the format that a file's ending names; png without a file.
+
+    Raises
+    ------
+    OptionError
+        If it names none; the message begins with the option that gave the file.
+    """
+    format_ = "png" if path is None else path.suffix.removeprefix(".").lower()
+    if format_ not in FORMATS:
+        raise OptionError(f"{option} {path}: the file's ending must be .png, .pdf or .svg")
+    return format_
 
 
 def encode(figure: Figure, format_: str) -> bytes:

@@ -23,8 +23,10 @@ from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import TaskError
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
+from qrlsuite.leaderboard.pictures import decided as drawing
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
+from qrlsuite.studies import decided
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 
@@ -496,6 +498,25 @@ def test_a_plan_may_ask_about_some_pairs_only() -> None:
     assert "(2 pairs, pocock spending)" in shown
     screen = say("status", "widths.toml").stdout
     assert screen.index("Does width help?") < screen.index("wide / narrow") < screen.index("Is 16 too much?")
+
+
+def test_the_picture_has_a_row_for_each_pair_below_its_question(refused: Refused) -> None:
+    plan = ask()
+    assert "widths has taken no look yet: there is nothing to draw" in refused("plot", plan)
+    answer("run", plan, "--engine", "scripted")
+    assert say("plot", plan, "--out", "pairs.svg").stdout == "wrote pairs.svg\n"
+    assert Path("pairs.svg").read_bytes().startswith(b"<?xml")
+    outcome = decided.read(Path(plan), Path("runs"))
+    figure = drawing.draw(outcome)
+    [axes] = figure.axes
+    rows = [label.get_text() for label in axes.get_yticklabels()]
+    assert rows == ["Does width help?", "wide / narrow", "Is 16 too much?", "mlp width=8 / wide"]
+    lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
+    for row, pair in zip((1, 3), outcome.pairs):
+        assert lines[row].get_xdata() == pytest.approx([1 + end for end in pair.interval])
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.texts] == ["A needs fewer steps", "equal within the margin"]
+    assert {text.get_text() for text in axes.texts} == {"20", "40"}
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from qrlsuite.cli.training import (
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard import pictures, plans
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted, hours_range
@@ -39,6 +39,13 @@ app = typer.Typer(
 
 PlanArgument = Annotated[
     Path, typer.Argument(metavar="PLAN.toml", help="A plan that `qrlsuite decide new` wrote.")
+]
+
+StartedArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PLAN.toml", help="A plan, or a folder in which `qrlsuite decide export` published one."
+    ),
 ]
 
 
@@ -179,12 +186,7 @@ def run(
 
 @app.command()
 def status(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PLAN.toml", help="A plan, or a folder in which `qrlsuite decide export` published one."
-        ),
-    ],
+    path: StartedArgument,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -192,11 +194,33 @@ def status(
 
     Example: qrlsuite decide status width.toml
     """
-    outcome = plans.read(path) if path.is_dir() else decided.read(path, runs)
+    outcome = _outcome(path, runs)
     if json_output:
         typer.echo(json.dumps(outcome.as_dict()))
     else:
         _show_status(outcome)
+
+
+@app.command()
+def plot(
+    path: StartedArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("--out", help="png, pdf or svg; default: NAME-decided.png, in the current folder."),
+    ] = None,
+    runs: RunsOption = Path("runs"),
+) -> None:
+    """Draw every pair below its question: which entry needs fewer steps, by how much, and with which interval.
+
+    Example: qrlsuite decide plot width.toml --out width.pdf
+    """
+    format_ = pictures.format_of(output)
+    outcome = _outcome(path, runs)
+    from qrlsuite.leaderboard.pictures import decided as drawing  # matplotlib
+
+    target = output or Path(f"{outcome.study.file.name}-decided.png")
+    write_atomically(target, pictures.encode(drawing.draw(outcome), format_))
+    typer.echo(f"wrote {target}")
 
 
 @app.command()
@@ -230,6 +254,10 @@ def end(path: PlanArgument, runs: RunsOption = Path("runs")) -> None:
     study = _study(path, runs)
     study.end()
     typer.echo(f"ended; what was decided stays: {command('decide', 'status', str(path), runs=runs)}")
+
+
+def _outcome(path: Path, runs: Path) -> DecisionOutcome:
+    return plans.read(path) if path.is_dir() else decided.read(path, runs)
 
 
 def _study(path: Path, runs: Path) -> DecisionStudy:

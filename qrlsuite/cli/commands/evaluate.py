@@ -82,9 +82,7 @@ def evaluate(
 
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
-    format_ = "" if out is None else out.suffix.removeprefix(".").lower()
-    if out is not None and format_ not in ("png", "pdf", "svg"):
-        raise OptionError(f"--out {out}: the file's ending must be .png, .pdf or .svg")
+    format_ = pictures.format_of(out)
     evaluations = evaluation.evaluate(
         runs,
         entries,

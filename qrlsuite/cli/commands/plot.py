@@ -76,9 +76,7 @@ def plot(
     if list_settings:
         _print_settings(kind, settings_of(kind, task or []), json_output)
         return
-    format_ = output.suffix.removeprefix(".").lower() if output is not None else "png"
-    if format_ not in pictures.FORMATS:
-        raise OptionError(f"--out {output}: the file's ending must be .png, .pdf or .svg")
+    format_ = pictures.format_of(output)
     picture_settings, environment_settings = _split(settings or [])
     drawn = compose(
         kind,

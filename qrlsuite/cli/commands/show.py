@@ -148,9 +148,7 @@ def _draw(
     name: str, qubits: int, layers: int, settings: list[str], figure: Path | None, content: dict[str, Any]
 ) -> str:
     """Draw an ansatz as text (and to a file), and add its resources to the content."""
-    format_ = "" if figure is None else figure.suffix.removeprefix(".").lower()
-    if figure is not None and format_ not in pictures.FORMATS:
-        raise OptionError(f"--figure {figure}: the file's ending must be .png, .pdf or .svg")
+    format_ = pictures.format_of(figure, "--figure")
     drawn = _circuit(name, qubits, layers, settings)
     counted = dataclasses.asdict(drawing.resources(drawn))
     content["resources"] = {}
