@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -20,9 +20,10 @@ from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
-from qrlsuite.results.text import counted, hours_range, hours_text
+from qrlsuite.results.text import counted, hours_range, hours_text, steps_text
 from qrlsuite.statistics.planning import runs_at_difference
 from qrlsuite.statistics.sequential import Decision, PairDecision
+from qrlsuite.statistics.times import MeanTime, mean_time
 from qrlsuite.studies import decisions
 from qrlsuite.studies.decisions import DecisionStudy
 
@@ -61,6 +62,21 @@ class DecisionOutcome(Shown):
         """Whether every pair is decided or its last look was taken."""
         return self.decision.finished
 
+    def mean_times(self) -> dict[str, MeanTime]:
+        """Return M of each entry, its mean time below threshold, over the seeds of its last look.
+
+        Entries that no look has reached are absent.
+        """
+        looked = dict.fromkeys(self.study.entries, 0)
+        for pair in self.pairs:
+            for name in (pair.first, pair.second):
+                looked[name] = max(looked[name], pair.n_runs)
+        return {
+            name: mean_time(replace(curves, values=curves.values[: looked[name]]), self.study.grid)
+            for name, curves in self.study.curves().items()
+            if looked[name]
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
         study, decision = self.study, self.decision
@@ -69,6 +85,7 @@ class DecisionOutcome(Shown):
         used = {name: len(study.seeds(name)) for name in study.entries}
         closed = [name for name in study.entries if name not in decision.wanted]
         saved = {name: protocol[name] - used[name] for name in closed if used[name]}
+        times = self.mean_times()
         return {
             "plan": study.file.name,
             "hash": study.file.hash,
@@ -87,6 +104,8 @@ class DecisionOutcome(Shown):
                     "entry": entry.name,
                     "seeds": used[name],
                     "core_hours": study.hours(name),
+                    "mean_time": times[name].mean if name in times else None,
+                    "mean_time_interval": list(times[name].interval) if name in times else None,
                     "wanted": decision.wanted.get(name),
                     "missing": missing.get(name, 0),
                 }
@@ -117,6 +136,11 @@ class DecisionOutcome(Shown):
                 "B against A: how much longer B is below the thresholds, with a repeated confidence interval that "
                 f"holds at every look ({100 * (1 - study.file.alpha):g} percent for all pairs together). An early stop "
                 "overstates the difference."
+            )
+            yield _entries_table(facts["entries"])
+            yield Text(
+                "M (95%): environment steps that a run of the entry spends below threshold, mean over seeds and the "
+                "task's thresholds, at its last look"
             )
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
@@ -344,5 +368,19 @@ def _table(study: DecisionStudy, pairs: Sequence[tuple[PairDecision, Mapping[str
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(study, facts["needs"]),
         )
+        table.add_row(*(Text(cell) for cell in cells))
+    return table
+
+
+def _entries_table(entries: Sequence[Mapping[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in ("entry", "seeds", "M (95%)", "core-hours"):
+        table.add_column(column, overflow="fold")
+    for facts in entries:
+        time = ""
+        if facts["mean_time"] is not None:
+            low, high = map(steps_text, facts["mean_time_interval"])
+            time = f"{steps_text(facts['mean_time'])} ({low} to {high})"
+        cells = (facts["name"], str(facts["seeds"]), time, hours_text(facts["core_hours"]))
         table.add_row(*(Text(cell) for cell in cells))
     return table

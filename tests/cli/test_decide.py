@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -496,7 +497,14 @@ def test_a_plan_may_ask_about_some_pairs_only() -> None:
     assert "widths: 2 questions, 2 pairs" in shown
     assert "Does width help? wide / narrow" in shown
     assert "(2 pairs, pocock spending)" in shown
+    times = {entry["name"]: entry["mean_time"] for entry in found["entries"]}
+    expected = {  # 60 steps an epoch, all below the thresholds until the epoch that reaches them
+        name: 60 * (np.mean([STARTS[width](seed) for seed in range(10000, 10000 + seeds)]) - 1)
+        for name, width, seeds in (("wide", "width=16", 40), ("narrow", "width=4", 20))
+    }
+    assert {name: times[name] for name in expected} == pytest.approx(expected)
     screen = say("status", "widths.toml").stdout
+    assert re.search(r"wide +40 +", screen)
     assert screen.index("Does width help?") < screen.index("wide / narrow") < screen.index("Is 16 too much?")
 
 
