@@ -115,13 +115,14 @@ class LocalEngine:
         outcome = EngineOutcome()
         for job in jobs:
             job.progress.clear()
-        pause = 0.01  # grows, so that a short run is seen to end at once
+        pause = 0.01  # grows until another job begins, so that a short run is seen to end at once
         try:
             while waiting or self._running:
                 while waiting and len(self._running) < several[0].workers:
                     job = waiting.popleft()
                     self._running.append(job)
                     _start(job, jobs[job])
+                    pause = 0.01
                 time.sleep(pause)
                 pause = min(1.5 * pause, 0.2)
                 for job in list(self._running):
