@@ -57,6 +57,8 @@ def test_an_option_of_the_ansatz_is_set_by_name(word: str) -> None:
     assert entry("qubits=2", *words).label == table.label
     both = entry("ansatz=ising", "ansatz_options={ lr = 2.0 }", word)
     assert both.model_options.ansatz_options == {"lr": 2.0, "coupling": "zz"}
+    before = entry("ansatz=ising", "ansatz_options={ coupling = 'xx' }", word)
+    assert before.model_options.ansatz_options == {"coupling": "zz"}, "the option's own setting is nearer"
 
 
 def test_an_option_that_the_model_hands_on_stays_the_models() -> None:

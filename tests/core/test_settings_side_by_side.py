@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 import torch
 from pydantic import Field
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 from qrlsuite import population
 from qrlsuite.engine import execution, local, worker
 from qrlsuite.engine.display import Bar
-from qrlsuite.errors import PluginError
+from qrlsuite.errors import PluginError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Tuned, parse_setting
 from qrlsuite.plugins.models.mlp import MLPOptions
@@ -113,6 +114,15 @@ def test_killed_between_the_saves_of_two_entries_they_end_the_same(
         for seed in (0, 1):
             assert results(one.path, seed) == results(other.path, seed)
             assert read_lines(one.seed(seed).timings)[0]["group"] == 6
+
+
+def test_checkpoints_of_different_versions_are_not_joined(tiny_task: str, tmp_path: Path) -> None:
+    folders = stores(tmp_path, entries(tiny_task))
+    together(folders, [0, 1], 1)
+    epoch, arrays = checkpoint.load(folders[1], [0, 1])
+    checkpoint.save(folders[1], [0, 1], epoch, {**arrays, "models.new": np.zeros((2, 1), np.float32)})
+    with pytest.raises(StoreError, match="these entries are at different epochs, or of different versions"):
+        together(folders, [0, 1], 2)
 
 
 def test_each_entry_has_its_own_progress_and_claim(tiny_task: str, tmp_path: Path) -> None:
