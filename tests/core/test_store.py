@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import qrlsuite
+from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint, provenance, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
@@ -273,3 +275,13 @@ def test_the_record_of_a_seed_says_what_was_trained(train: Callable[..., Path]) 
     assert record["algorithm_options"]["lr"] == 0.0005
     weights = 3 * 16 + 16 + 16 * 16 + 16 + 16 * 3 + 3
     assert record["parameters"] == {"classical": weights, "quantum": 0, "networks": 1}
+
+
+def test_an_entry_shows_once_what_made_all_its_seeds(train: Callable[..., Path]) -> None:
+    entry = train("runs", [0, 1, 2], epochs=1)
+    options = ["show", entry.name, "--runs", str(entry.parents[1]), "--json"]
+    shown = json.loads(CliRunner().invoke(build(), options, catch_exceptions=False).stdout)
+    record = store.EntryStore(entry).record()
+    assert (shown["label"], shown["seeds"]) == (record["label"], 3)
+    [origin] = shown["provenance"]
+    assert origin["versions"]["qrlsuite"] == qrlsuite.__version__
