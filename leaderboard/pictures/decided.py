@@ -89,14 +89,20 @@ def draw(outcome: DecisionOutcome) -> Figure:
         f"gray: equal within {100 * margin:g} percent",
         "right: seeds of each entry at the pair's last look",
         "an early stop overstates the difference",
+        f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, decision.pairs)) else "",
     )
     return figure
 
 
+def _cut(pair: PairDecision) -> bool:
+    return bool(pair.p) and not all(WIDEST[0] <= 1 + end <= WIDEST[1] for end in pair.interval)
+
+
 def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
     """Draw a pair and return the ends of what was drawn, as ratios."""
-    if not pair.p or not all(map(math.isfinite, (pair.difference, *pair.interval))):
-        axes.annotate("no look yet" if not pair.p else "at the cap", (1, height), fontsize=8, va="center")
+    if not pair.p or math.isnan(pair.difference):
+        text = "both mean times are 0" if pair.p else "no look yet"
+        axes.annotate(text, (1, height), fontsize=8, va="center")
         return []
     ratio, low, high = (min(max(1 + end, WIDEST[0]), WIDEST[1]) for end in (pair.difference, *pair.interval))
     _, color, marker = LOOKS[pair.decided]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import re
 import signal
@@ -525,6 +526,17 @@ def test_the_picture_has_a_row_for_each_pair_below_its_question(refused: Refused
     [legend] = figure.legends
     assert [text.get_text() for text in legend.texts] == ["A needs fewer steps", "equal within the margin"]
     assert {text.get_text() for text in axes.texts} == {"20", "40"}
+    assert "cut at a factor of 10" not in figure.get_supxlabel()
+    first, second = outcome.pairs
+    unbounded = (
+        replace(first, interval=(-1.0, math.inf)),
+        replace(second, difference=math.nan, interval=(-1.0, math.inf)),
+    )
+    figure = drawing.draw(replace(outcome, decision=replace(outcome.decision, pairs=unbounded)))
+    [axes] = figure.axes
+    assert next(list(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2) == [0.1, 10]
+    assert {text.get_text() for text in axes.texts} == {"20", "both mean times are 0"}
+    assert "cut at a factor of 10" in figure.get_supxlabel()
 
 
 @pytest.mark.parametrize(
