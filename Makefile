@@ -53,9 +53,11 @@ site: docs
 	$(BIN)/qrlsuite leaderboard --published --runs $(VENV)/no-runs --format html --out site/board.html
 	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
 
-# Every picture of docs/images that shows published entries; docs/pictures.py lists all, with their commands.
+# Every picture of docs/images that shows published entries (docs/pictures.py lists all, with their commands), and the
+# tables of published plans.
 pictures: install-dev
 	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/tables.py
 
 # What a release publishes; and what a user gets of it, who has no clone.
 dist: $(BIN)/python
