@@ -1,8 +1,9 @@
-"""Every pair of a decision plan: how much longer B is below the thresholds than A, with interval and verdict."""
+"""A decision plan: its pairs, with intervals and verdicts, or its entries by mean time below threshold."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
@@ -10,6 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import style
+from qrlsuite.results.text import steps_text
 from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.studies import decided
 from qrlsuite.studies.decided import DecisionOutcome
@@ -67,23 +69,17 @@ def draw(outcome: DecisionOutcome) -> Figure:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: decided.percent(ratio - 1)))
     axes.set_xlabel("pair A / B: how much longer B is below the thresholds than A")
-    axes.set_ylim(len(rows) - 0.4, -0.7)
-    axes.set_yticks(range(len(rows)), [style.plain(name, 90) for name in names], fontsize=8.5)
+    _name_rows(axes, names)
     for tick, row in zip(axes.get_yticklabels(), rows):
         if not isinstance(row, PairDecision):
             tick.set_fontweight("bold")
-    axes.tick_params(axis="y", length=0)
-    style.tidy(axes)
-    axes.grid(False, axis="y")
     for each, (label, color, marker) in LOOKS.items():
         if any(pair.decided is each for pair in decision.pairs):
             axes.plot([], [], marker, color=color, label=label, ls="none")
-    figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
-    task = next(iter(study.entries.values())).task.name
-    figure.suptitle(style.plain(f"{task}: {study.file.name}"), x=0.01, ha="left", fontsize="medium")
     confidence = 100 * (1 - study.file.alpha)
-    style.footnotes(
+    _finish(
         figure,
+        outcome,
         f"repeated confidence intervals: they hold at every look, {confidence:g} percent for all "
         f"{len(decision.pairs)} pairs together",
         f"gray: equal within {100 * margin:g} percent",
@@ -92,6 +88,66 @@ def draw(outcome: DecisionOutcome) -> Figure:
         f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, decision.pairs)) else "",
     )
     return figure
+
+
+def draw_entries(outcome: DecisionOutcome) -> Figure:
+    """Draw a row for each entry that a look has reached: its mean time below threshold M, the shortest first.
+
+    Raises
+    ------
+    OptionError
+        If the plan has taken no look yet.
+    """
+    study, times, looked = outcome.study, outcome.mean_times(), outcome.looked
+    if not times:
+        raise OptionError(f"{study.file.name} has taken no look yet: there is nothing to draw")
+    names = sorted(times, key=lambda name: times[name].mean)
+    figure = Figure(figsize=(8.0, 1.4 + 0.21 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    models = list(dict.fromkeys(entry.model.name for entry in study.entries.values()))
+    for height, name in enumerate(names):
+        look = style.style(models.index(study.entries[name].model.name))
+        axes.plot(times[name].interval, [height, height], color=look.color, lw=1.6)
+        axes.plot(times[name].mean, height, look.marker, color=look.color, ms=5)
+        _at_right(axes, height, f"{looked[name]}")
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: steps_text(steps)))
+    axes.set_xlabel("M: environment steps of a run below threshold")
+    _name_rows(axes, names)
+    for model in models:
+        look = style.style(models.index(model))
+        axes.plot([], [], look.marker, color=look.color, label=style.plain(model), ls="none")
+    _finish(
+        figure,
+        outcome,
+        "M: mean over seeds and the task's thresholds, with 95 percent intervals of each entry alone",
+        "right: seeds at the entry's last look",
+        "an early stop can over- or understate M; verdicts compare pairs at equal seeds",
+    )
+    return figure
+
+
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Write the rows' names, the first at the top."""
+    axes.set_ylim(len(names) - 0.4, -0.7)
+    axes.set_yticks(range(len(names)), [style.plain(name, 90) for name in names], fontsize=8.5)
+    axes.tick_params(axis="y", length=0)
+    style.tidy(axes)
+    axes.grid(False, axis="y")
+
+
+def _at_right(axes: Axes, height: int, text: str) -> None:
+    axes.annotate(
+        text, (1.005, height), xycoords=("axes fraction", "data"), fontsize=8, va="center", color="#505050"
+    )
+
+
+def _finish(figure: Figure, outcome: DecisionOutcome, *footnotes: str) -> None:
+    """Add legend, title and remarks."""
+    figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
+    task = next(iter(outcome.study.entries.values())).task.name
+    figure.suptitle(style.plain(f"{task}: {outcome.study.file.name}"), x=0.01, ha="left", fontsize="medium")
+    style.footnotes(figure, *footnotes)
 
 
 def _cut(pair: PairDecision) -> bool:
@@ -108,12 +164,5 @@ def _row(axes: Axes, height: int, pair: PairDecision) -> list[float]:
     _, color, marker = LOOKS[pair.decided]
     axes.plot([low, high], [height, height], color=color, lw=1.6)
     axes.plot([ratio], [height], marker, color=color, ms=5.5)
-    axes.annotate(
-        f"{pair.n_runs}",
-        (1.005, height),
-        xycoords=("axes fraction", "data"),
-        fontsize=8,
-        va="center",
-        color="#505050",
-    )
+    _at_right(axes, height, f"{pair.n_runs}")
     return [low, high]

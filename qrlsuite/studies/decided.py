@@ -62,15 +62,21 @@ class DecisionOutcome(Shown):
         """Whether every pair is decided or its last look was taken."""
         return self.decision.finished
 
+    @property
+    def looked(self) -> dict[str, int]:
+        """Seeds of each entry at its last look; 0 where no look has reached it."""
+        seeds = dict.fromkeys(self.study.entries, 0)
+        for pair in self.pairs:
+            for name in (pair.first, pair.second):
+                seeds[name] = max(seeds[name], pair.n_runs)
+        return seeds
+
     def mean_times(self) -> dict[str, MeanTime]:
         """Return M of each entry, its mean time below threshold, over the seeds of its last look.
 
         Entries that no look has reached are absent.
         """
-        looked = dict.fromkeys(self.study.entries, 0)
-        for pair in self.pairs:
-            for name in (pair.first, pair.second):
-                looked[name] = max(looked[name], pair.n_runs)
+        looked = self.looked
         return {
             name: mean_time(replace(curves, values=curves.values[: looked[name]]), self.study.grid)
             for name, curves in self.study.curves().items()

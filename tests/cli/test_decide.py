@@ -539,6 +539,23 @@ def test_the_picture_has_a_row_for_each_pair_below_its_question(refused: Refused
     assert "cut at a factor of 10" in figure.get_supxlabel()
 
 
+def test_the_picture_of_entries_has_the_shortest_mean_time_first(refused: Refused) -> None:
+    plan = ask()
+    assert "nothing to draw" in refused("plot", plan, "--entries")
+    answer("run", plan, "--engine", "scripted")
+    assert say("plot", plan, "--entries", "--out", "entries.svg").stdout == "wrote entries.svg\n"
+    outcome = decided.read(Path(plan), Path("runs"))
+    [axes] = drawing.draw_entries(outcome).axes
+    times = outcome.mean_times()
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    assert names[-1] == "narrow"
+    assert names == sorted(times, key=lambda name: times[name].mean)
+    lines = {line.get_ydata()[0]: line for line in axes.lines if len(line.get_xdata()) == 2}
+    for row, name in enumerate(names):
+        assert lines[row].get_xdata() == pytest.approx(times[name].interval)
+    assert [text.get_text() for text in axes.texts] == ["40", "40", "20"]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

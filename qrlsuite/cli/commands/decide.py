@@ -206,20 +206,27 @@ def plot(
     path: StartedArgument,
     output: Annotated[
         Path | None,
-        typer.Option("--out", help="png, pdf or svg; default: NAME-decided.png, in the current folder."),
+        typer.Option(
+            "--out",
+            help="png, pdf or svg; default: NAME-pairs.png or NAME-entries.png, in the current folder.",
+        ),
     ] = None,
+    entries: Annotated[
+        bool, typer.Option("--entries", help="Draw each entry's mean time below threshold instead.")
+    ] = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Draw every pair below its question: which entry needs fewer steps, by how much, and with which interval.
 
-    Example: qrlsuite decide plot width.toml --out width.pdf
+    Examples: qrlsuite decide plot width.toml --out width.pdf; qrlsuite decide plot width.toml --entries
     """
     format_ = pictures.format_of(output)
     outcome = _outcome(path, runs)
     from qrlsuite.leaderboard.pictures import decided as drawing  # matplotlib
 
-    target = output or Path(f"{outcome.study.file.name}-decided.png")
-    write_atomically(target, pictures.encode(drawing.draw(outcome), format_))
+    draw = drawing.draw_entries if entries else drawing.draw
+    target = output or Path(f"{outcome.study.file.name}-{'entries' if entries else 'pairs'}.png")
+    write_atomically(target, pictures.encode(draw(outcome), format_))
     typer.echo(f"wrote {target}")
 
 
