@@ -74,9 +74,9 @@ def shifted_angles(angles: Tensor, controlled: Sequence[bool]) -> tuple[Tensor, 
     shift = angles.new_tensor([shift for rule in rules for shift, _ in rule])
     coefficient = angles.new_tensor([c for rule in rules for _, c in rule])
     K = len(index)
-    stacked = angles[:, None].repeat(1, K, 1)
-    stacked[index, torch.arange(K)] += shift[:, None]
-    return stacked.reshape(count, K * lanes), ShiftPlan(index, coefficient, count)
+    stacked = angles.T.repeat(K, 1, 1)  # an evaluation's angles side by side, as simulators read them
+    stacked[torch.arange(K), :, index] += shift[:, None]
+    return stacked.reshape(K * lanes, count).T, ShiftPlan(index, coefficient, count)
 
 
 def vector_jacobian(values: Tensor, grad: Tensor, plan: ShiftPlan) -> Tensor:

@@ -14,6 +14,7 @@ from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
+from qrlsuite.plugins.circuits.native import draws
 from tests.circuits.test_backends import assert_close, draw, evaluate
 
 NOISE = {"noise_model": "depolarizing", "noise_rate": 0.1, "readout_error": 0.03}
@@ -27,6 +28,34 @@ def test_counts_of_one_qubit_follow_the_binomial_law():
     counts = np.bincount(np.rint(5 * (1 + values) / 2).astype(int), minlength=6)
     expected = 4000 * stats.binom.pmf(np.arange(6), 5, np.cos(0.55) ** 2)
     assert stats.chisquare(counts, expected).pvalue > 0.001
+
+
+@pytest.mark.parametrize(
+    ("shots", "p"),
+    [(1, 0.3), (19, 0.5), (50, 0.21), (1000, 0.93), (1000, 0.009), (10_000, 0.3), (10_000_000, 1e-6)],
+)
+def test_counts_follow_the_binomial_law_whichever_way_they_are_drawn(shots, p):
+    rows, first = 40_000, np.array([[1 - p - 0.001, p, 0.001]])  # the second outcome: after another was drawn
+    counts = np.empty((rows, 3), np.int64)
+    draws.multinomial(np.full(rows, shots), np.repeat(first, rows, axis=0), np.random.default_rng(5), counts)
+    assert counts.min() >= 0
+    assert set(counts.sum(axis=1)) == {shots}
+    law = stats.binom(shots, p)
+    cuts = np.unique(law.ppf(np.linspace(0.02, 0.98, 25)))
+    cuts = cuts[cuts < shots]  # below each: what is at most as large
+    observed = np.bincount(np.searchsorted(cuts, counts[:, 1]), minlength=len(cuts) + 1)
+    expected = rows * np.diff(law.cdf(cuts), prepend=0, append=1)
+    assert stats.chisquare(observed, expected).pvalue > 0.001
+
+
+def test_counts_of_outcomes_that_are_certain_or_impossible():
+    probabilities = np.array([[0.0, 1.0, 0.0], [2.0, 0.0, 2.0], [0.0, 0.0, 0.5]])  # sums need not be 1
+    counts = np.empty((3, 3), np.int64)
+    draws.multinomial(np.array([7, 1000, 0]), probabilities, np.random.default_rng(1), counts)
+    assert counts[0].tolist() == [0, 7, 0]
+    assert counts[1, 1] == 0
+    assert 400 < counts[1, 0] < 600
+    assert counts[2].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

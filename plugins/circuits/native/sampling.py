@@ -28,7 +28,7 @@ from qrlsuite.circuit.description import Angle, Circuit
 from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.circuit.shifts import Rule, measured, random_signs, shift_rule, spsa_rule, stream
-from qrlsuite.plugins.circuits.native import dense
+from qrlsuite.plugins.circuits.native import dense, draws
 from qrlsuite.plugins.circuits.native.cpu import NUMPY, Simulator
 from qrlsuite.plugins.circuits.native.program import Program
 from qrlsuite.plugins.circuits.options import NativeOptions
@@ -149,7 +149,10 @@ class ShotSampler:
         return hit, np.array(columns, np.uint8).reshape(len(columns), len(hit)).T
 
     def _probabilities(self, x: Tensor) -> list[NDArray[np.float64]]:
-        """Return the probabilities of each component's outcomes, (lanes, 2^qubits), of angles (1, lanes, A)."""
+        """Return the probabilities of each component's outcomes, (lanes, 2^qubits), of angles (1, lanes, A).
+
+        Their sums are 1 up to rounding.
+        """
         simulator, kind = self.simulator, NUMPY[x.dtype]
         width, lanes = simulator.lanes[x.dtype], x.shape[1]
         work = simulator.workspace(x.dtype)
@@ -160,10 +163,9 @@ class ShotSampler:
         simulator.kernels.forward(simulator.tables, given, flat, records, 1, work.scratch, values)
         result = []
         for qubits, first, *_ in self._components:
-            amplitudes = records[:, 2 * first : 2 * (first + (1 << qubits))].astype(np.float64)
-            squares = np.square(amplitudes).reshape(len(records), -1, 2, width).sum(2)
-            flat_lanes = squares.transpose(0, 2, 1).reshape(len(records) * width, -1)[:lanes]
-            result.append(self._read(flat_lanes / flat_lanes.sum(1, keepdims=True), qubits))
+            found = np.empty((lanes, 1 << qubits))
+            draws.probabilities(records, first, found)
+            result.append(self._read(found, qubits))
         return result
 
     def _read(self, probabilities: NDArray[np.float64], qubits: int) -> NDArray[np.float64]:
@@ -189,10 +191,12 @@ class ShotSampler:
         share = np.full(trajectories, shots // trajectories)
         share[: shots % trajectories] += 1
         of_run = np.bincount(place.ravel(), np.tile(share, lanes), len(probabilities)).astype(np.int64)
-        counts = source.multinomial(of_run, probabilities)
+        counts = np.empty(probabilities.shape, np.int64)
+        draws.multinomial(of_run, probabilities, source, counts)
         totals = counts[:lanes]
-        lane, trajectory = np.nonzero(place >= lanes)
-        np.add.at(totals, lane, counts[place[lane, trajectory]])
+        if len(counts) > lanes:
+            lane, trajectory = np.nonzero(place >= lanes)
+            np.add.at(totals, lane, counts[place[lane, trajectory]])
         return totals / shots
 
 

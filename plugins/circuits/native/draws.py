@@ -1,0 +1,125 @@
+"""Outcomes of final states: their probabilities, and counts drawn from the multinomial law.
+
+NumPy's own `multinomial` sets its rejection sampler up anew for each binomial draw, which takes longer than all else
+that a shifted circuit of few qubits needs. The method here has a cheap setup.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.plugins.circuits.native.cache import inlined, kernel
+
+SMALL = 10.0
+"""Below this mean a binomial draw counts up from 0."""
+
+_STIRLING = np.array(
+    [
+        math.lgamma(k + 1) - (k + 0.5) * math.log(k + 1) + k + 1 - 0.5 * math.log(2 * math.pi)
+        for k in range(10)
+    ]
+)
+
+
+@inlined
+def _stirling(k: Any) -> Any:
+    """Return what Stirling's formula for log(k!), around k + 1, lacks."""
+    if k < 10:
+        return _STIRLING[int(k)]
+    square = 1.0 / ((k + 1.0) * (k + 1.0))
+    return (1.0 / 12 - (1.0 / 360 - square / 1260) * square) / (k + 1.0)
+
+
+@inlined
+def _counted(n: int, p: float, source: Any) -> int:
+    """Draw from the binomial law by adding up its probabilities; for a mean n p that is small."""
+    odds, left = p / (1.0 - p), source.random()
+    term = math.exp(n * math.log1p(-p))
+    k = 0
+    while left > term and k < n:
+        left -= term
+        k += 1
+        term *= odds * (n - k + 1) / k
+    return k
+
+
+@inlined
+def _rejected(n: int, p: float, source: Any) -> int:
+    """Draw from the binomial law by transformed rejection; for n p of `SMALL` or more, and p up to a half.
+
+    Algorithm BTRS of Hoermann 1993, J. Stat. Comput. Simul. 46, 101.
+    """
+    spread = math.sqrt(n * p * (1.0 - p))
+    b = 1.15 + 2.53 * spread
+    a = -0.0873 + 0.0248 * b + 0.01 * p
+    middle = n * p + 0.5
+    inner = 0.92 - 4.2 / b
+    while True:
+        u, v = source.random() - 0.5, source.random()
+        edge = 0.5 - abs(u)
+        k = math.floor((2.0 * a / edge + b) * u + middle)
+        if edge >= 0.07 and v <= inner:
+            return int(k)
+        if k < 0.0 or k > n:
+            continue
+        scale = (2.83 + 5.1 / b) * spread
+        odds, mode = p / (1.0 - p), math.floor((n + 1) * p)
+        bound = (
+            (mode + 0.5) * math.log((mode + 1.0) / (odds * (n - mode + 1.0)))
+            + (n + 1.0) * math.log((n - mode + 1.0) / (n - k + 1.0))
+            + (k + 0.5) * math.log(odds * (n - k + 1.0) / (k + 1.0))
+            + _stirling(mode)
+            + _stirling(n - mode)
+            - _stirling(k)
+            - _stirling(n - k)
+        )
+        if math.log(v * scale / (a / (edge * edge) + b)) <= bound:
+            return int(k)
+
+
+@inlined
+def _binomial(n: int, p: float, source: Any) -> int:
+    """Draw the number of successes among n trials of probability p."""
+    rare = min(p, 1.0 - p)
+    if n == 0 or rare <= 0.0:
+        k = 0
+    elif n * rare < SMALL:
+        k = _counted(n, rare, source)
+    else:
+        k = _rejected(n, rare, source)
+    return k if p <= 0.5 else n - k
+
+
+@kernel
+def probabilities(records: Any, first: int, out: Any) -> None:
+    """Write the squares of a component's amplitudes, out (L, 2^n), from chunks of states (C, rows, V).
+
+    `first` is the component's first amplitude.
+    """
+    lanes = records.shape[2]
+    for row in range(out.shape[0]):
+        chunk, v = row // lanes, row % lanes
+        for i in range(out.shape[1]):
+            re, im = records[chunk, 2 * (first + i), v], records[chunk, 2 * (first + i) + 1, v]
+            out[row, i] = np.float64(re) * re + np.float64(im) * im
+
+
+@kernel
+def multinomial(shots: Any, probabilities: Any, source: Any, counts: Any) -> None:
+    """Draw counts (R, K) of K outcomes in shots (R,), from probabilities (R, K) and a NumPy generator.
+
+    A row's probabilities are divided by their sum.
+    """
+    for row in range(probabilities.shape[0]):
+        left, total = shots[row], 0.0
+        for k in range(probabilities.shape[1]):
+            total += probabilities[row, k]
+        for k in range(probabilities.shape[1] - 1):
+            p = probabilities[row, k]
+            counts[row, k] = _binomial(left, min(1.0, p / total), source) if left and total > 0.0 else 0
+            left -= counts[row, k]
+            total -= p
+        counts[row, -1] = left
