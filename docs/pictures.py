@@ -1,4 +1,4 @@
-"""How every picture of docs/images is made: `make pictures`.
+"""How every picture of docs/images is made: `make pictures`, in the root of the repository.
 
 A picture of published entries carries a mark, a hash of these entries and of its command. Where entries have changed
 since, `tests/docs/test_pictures.py` says that it is stale. Pictures of runs that are not published stay as they are;
@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ class Plot:
     Attributes
     ----------
     entries:
-        Patterns of the folders, below leaderboard/entries, that it shows.
+        Patterns of the folders, below leaderboard/, that it shows.
     """
 
     command: str
@@ -70,16 +70,20 @@ class Unpublished:
 
 Picture = Plot | Screenshot | Unpublished
 BOARD = "leaderboard --published --task beam6g --format html"
+PLAN = "leaderboard/plans/quantum-or-not"
+PLAN_FILES = ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
 PICTURES: dict[str, Picture] = {
-    "cartpole.png": Plot("plot curves --task cartpole --published", ("cartpole/*",)),
+    "cartpole.png": Plot("plot curves --task cartpole --published", ("entries/cartpole/*",)),
     "curves.png": Plot(
         "plot curves --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=16 lr=0.002' "
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
-        ("beam6g/*",),
+        ("entries/beam6g/*",),
     ),
-    "report-narrow.png": Screenshot(BOARD, ("beam6g/*",), 390, 1000),
-    "report-times.png": Screenshot(BOARD, ("beam6g/*",), 1160, 1104, "By mean time below threshold"),
-    "report-wide.png": Screenshot(BOARD, ("beam6g/*",), 1400, 1240),
+    "quantum-or-not-entries.png": Plot(f"decide plot {PLAN} --entries", PLAN_FILES),
+    "quantum-or-not-pairs.png": Plot(f"decide plot {PLAN}", PLAN_FILES),
+    "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
+    "report-times.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1104, "By mean time below threshold"),
+    "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1240),
     "policies.png": Unpublished(  # after `study run fig7`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
     ),
@@ -91,19 +95,19 @@ PICTURES: dict[str, Picture] = {
     "study-fig1.png": Plot(
         "plot surface --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=64' "
         "--entry 'vqc-native qubits=10'",
-        ("beam6g/*",),
+        ("entries/beam6g/*",),
     ),
     "study-fig6.png": Plot(
         "plot bars --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' "
         "--entry 'vqc-native qubits=10'",
-        ("beam6g/*",),
+        ("entries/beam6g/*",),
     ),
     "study-fig7.png": Plot(
         "plot scaling --task beam6g --published --set 'epsilons=[0.15]' --set 'deltas=[0.75]' "
         "--entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' --entry 'mlp width=128' "
         "--entry 'mlp width=256' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=8' "
         "--entry 'vqc-native qubits=10'",
-        ("beam6g/*",),
+        ("entries/beam6g/*",),
     ),
     "study-ppo.png": Unpublished("study run ppo --seeds 10"),
 }
@@ -112,10 +116,11 @@ PICTURES: dict[str, Picture] = {
 def made_from(picture: Plot | Screenshot) -> str:
     """Return the mark of a picture: a hash of its command and of the published entries that it shows."""
     digest = hashlib.sha256(repr(picture).encode())
-    published = ROOT / "leaderboard" / "entries"
+    published = ROOT / "leaderboard"
     for path in sorted(path for pattern in picture.entries for path in published.glob(f"{pattern}/[!.]*")):
-        digest.update(path.relative_to(published).as_posix().encode())
-        digest.update(path.read_bytes())
+        if path.is_file():
+            digest.update(path.relative_to(published).as_posix().encode())
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -125,10 +130,11 @@ def mark_of(path: Path) -> str | None:
         return image.info.get(MARK)
 
 
-def main() -> None:
-    """Make every picture of published entries, and name the others."""
+def main(chosen: Sequence[str]) -> None:
+    """Make the chosen pictures of published entries, by default all, and name the others."""
     with browser() as chromium, tempfile.TemporaryDirectory() as folder:
-        for name, picture in PICTURES.items():
+        for name in chosen or PICTURES:
+            picture = PICTURES[name]
             if isinstance(picture, Unpublished):
                 print(f"kept {name}: its runs are not published; qrlsuite {picture.command}")
                 continue
@@ -193,4 +199,4 @@ def _photograph(chromium: Any, page: Path, picture: Screenshot, out: Path) -> No
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

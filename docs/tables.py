@@ -3,6 +3,8 @@
 A comment names the plan and the kind of the table that follows it:
 
     <!-- table: quantum-or-not verdicts -->
+
+A number behind it leaves only so many questions.
 """
 
 from __future__ import annotations
@@ -13,18 +15,19 @@ from functools import cache
 from pathlib import Path
 
 from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard.plans import PublishedDecision
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.studies.decided import DecisionOutcome, by_question, difference_text, versus
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "docs" / "quantum-or-not.md",)
-TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+) -->\n\n(?:\|.*\n)*")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "quantum-or-not.md")
+TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*")
 
 Rows = Iterator[Sequence[str]]
 
 
-def settings(outcome: DecisionOutcome) -> Rows:
+def settings(outcome: DecisionOutcome, questions: int | None) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     yield "entry", "parameters", "settings", "trials", "M"
     for planned in outcome.study.file.entries:
@@ -41,27 +44,36 @@ def settings(outcome: DecisionOutcome) -> Rows:
         yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(tuning.value or 0.0)
 
 
-def verdicts(outcome: DecisionOutcome) -> Rows:
+def verdicts(outcome: DecisionOutcome, questions: int | None) -> Rows:
     """Every pair below its question."""
     yield "pair A / B", "verdict", "seeds", "B against A", "interval"
-    for question, pairs in by_question(outcome.study, outcome.pairs):
+    for question, pairs in by_question(outcome.study, outcome.pairs)[:questions]:
         yield f"**{question}**", "", "", "", ""
         for pair in pairs:
             seeds = str(pair.n_runs) if pair.n_runs else ""
             yield versus(pair), pair.verdict, seeds, *difference_text(pair)
 
 
-def entries(outcome: DecisionOutcome) -> Rows:
+def entries(outcome: DecisionOutcome, questions: int | None) -> Rows:
     """Mean times and costs of the entries that a look has reached."""
-    yield "entry", "seeds", "M (95%)", "core-hours"
+    assert isinstance(outcome.study, PublishedDecision)
+    yield "entry", "seeds", "M (95%)", "core-hours", "circuits per seed"
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
             low, high = map(steps_text, entry["mean_time_interval"])
             took = f"{steps_text(entry['mean_time'])} ({low} to {high})"
-            yield entry["name"], str(entry["seeds"]), took, hours_text(entry["core_hours"])
+            executed = outcome.study.executions(entry["name"])
+            circuits = f"{executed / 1e6:.1f} million" if executed else ""
+            yield (
+                entry["name"],
+                str(outcome.looked[entry["name"]]),
+                took,
+                hours_text(entry["core_hours"]),
+                circuits,
+            )
 
 
-KINDS: dict[str, Callable[[DecisionOutcome], Rows]] = {
+KINDS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
@@ -78,13 +90,14 @@ def filled(text: str) -> str:
     """Return a page with every table as the published plans now give it."""
 
     def table(found: re.Match[str]) -> str:
-        plan, kind = found.groups()
-        header, *rows = KINDS[kind](published(plan))
+        plan, kind, questions = found.groups()
+        header, *rows = KINDS[kind](published(plan), int(questions) if questions else None)
         lines = [header, ["---"] * len(header), *rows]
         body = "\n".join(
             "|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines
         )
-        return f"{plan} {kind} -->\n\n{body.replace(' --- ', '---')}\n"
+        asked = found[0].partition(" -->")[0]
+        return f"{asked} -->\n\n{body.replace(' --- ', '---')}\n"
 
     return TABLE.sub(table, text)
 

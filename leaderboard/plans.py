@@ -76,6 +76,10 @@ class PublishedDecision(DecisionStudy):
         """Return the core-hours that an entry's seeds have taken."""
         return float(self._published[name].hours.sum()) if name in self._published else 0.0
 
+    def executions(self, name: str) -> float:
+        """Return the circuit executions of an entry's seeds, mean per seed; 0 where it has none."""
+        return float(self._published[name].executions.mean()) if name in self._published else 0.0
+
     def curves(self) -> dict[str, LearningCurves]:
         """Return the learning curves of the published seeds; entries without any are absent."""
         curves = {}

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 TICKS = (0.1, 0.2, 0.333, 0.5, 0.667, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 """Ratios of mean times that the axis may name."""
 WIDEST = (TICKS[0], TICKS[-1])
+TUNED = ", tuned"
+"""What the name of an entry has more than that of the same model before tuning."""
 GRAY = "#8c8c8c"
 LOOKS: dict[Decided | None, tuple[str, str, str]] = {
     Decided.FIRST: ("A needs fewer steps", style.COLORS[0], "o"),
@@ -65,7 +67,7 @@ def draw(outcome: DecisionOutcome) -> Figure:
     axes.axvline(1, color="#404040", lw=0.8)
     axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(FixedLocator([tick for tick in TICKS if low <= tick <= high]))
+    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: decided.percent(ratio - 1)))
     axes.set_xlabel("pair A / B: how much longer B is below the thresholds than A")
@@ -82,6 +84,7 @@ def draw(outcome: DecisionOutcome) -> Figure:
         outcome,
         f"repeated confidence intervals: they hold at every look, {confidence:g} percent for all "
         f"{len(decision.pairs)} pairs together",
+        "a verdict is decided at any threshold, the interval is that of their mean",
         f"gray: equal within {100 * margin:g} percent",
         "right: seeds of each entry at the pair's last look",
         "an early stop overstates the difference",
@@ -91,7 +94,9 @@ def draw(outcome: DecisionOutcome) -> Figure:
 
 
 def draw_entries(outcome: DecisionOutcome) -> Figure:
-    """Draw a row for each entry that a look has reached: its mean time below threshold M, the shortest first.
+    """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
+
+    An entry called `X, tuned` shares the row of the plan's entry X.
 
     Raises
     ------
@@ -101,19 +106,27 @@ def draw_entries(outcome: DecisionOutcome) -> Figure:
     study, times, looked = outcome.study, outcome.mean_times(), outcome.looked
     if not times:
         raise OptionError(f"{study.file.name} has taken no look yet: there is nothing to draw")
-    names = sorted(times, key=lambda name: times[name].mean)
-    figure = Figure(figsize=(8.0, 1.4 + 0.21 * len(names)), layout="constrained")
+    rows: dict[str, list[str]] = {}
+    for name in sorted(times, key=lambda name: times[name].mean):
+        base = name.removesuffix(TUNED)
+        rows.setdefault(base if base in times else name, []).append(name)
+    figure = Figure(figsize=(8.0, 1.5 + 0.26 * len(rows)), layout="constrained")
     axes = figure.subplots()
     models = list(dict.fromkeys(entry.model.name for entry in study.entries.values()))
-    for height, name in enumerate(names):
-        look = style.style(models.index(study.entries[name].model.name))
-        axes.plot(times[name].interval, [height, height], color=look.color, lw=1.6)
-        axes.plot(times[name].mean, height, look.marker, color=look.color, ms=5)
-        _at_right(axes, height, f"{looked[name]}")
+    tuned = {name for name, planned in zip(study.entries, study.file.entries) if planned.tuning is not None}
+    for height, (row, names) in enumerate(rows.items()):
+        for name in names:
+            look = style.style(models.index(study.entries[name].model.name))
+            place = height + (0.0 if len(names) == 1 else -0.14 if name == row else 0.14)
+            axes.plot(times[name].interval, [place, place], color=look.color, lw=1.4)
+            face = look.color if name in tuned or not tuned else "white"
+            axes.plot(times[name].mean, place, look.marker, color=look.color, mfc=face, ms=5)
+        seeds = dict.fromkeys(f"{looked[name]}" for name in sorted(names, key=len))
+        _at_right(axes, height, ", ".join(seeds))
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: steps_text(steps)))
     axes.set_xlabel("M: environment steps of a run below threshold")
-    _name_rows(axes, names)
+    _name_rows(axes, list(rows))
     for model in models:
         look = style.style(models.index(model))
         axes.plot([], [], look.marker, color=look.color, label=style.plain(model), ls="none")
@@ -121,10 +134,21 @@ def draw_entries(outcome: DecisionOutcome) -> Figure:
         figure,
         outcome,
         "M: mean over seeds and the task's thresholds, with 95 percent intervals of each entry alone",
-        "right: seeds at the entry's last look",
+        "filled: with settings that tuning found" if tuned else "",
+        "right: seeds at the last look",
         "an early stop can over- or understate M; verdicts compare pairs at equal seeds",
     )
     return figure
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Return those of `TICKS` in a range whose labels, from 1 outward, do not touch."""
+    room = 0.09 * math.log(high / low)
+    kept = [1.0]
+    for tick in sorted(TICKS, key=lambda tick: abs(math.log(tick))):
+        if low <= tick <= high and all(abs(math.log(tick / other)) > room for other in kept):
+            kept.append(tick)
+    return kept
 
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:

@@ -34,6 +34,12 @@ def test_a_picture_shows_the_entries_as_they_are_published_now(name: str) -> Non
     )
 
 
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_what_a_picture_shows_is_published(name: str) -> None:
+    for pattern in PUBLISHED[name].entries:
+        assert list((ROOT / "leaderboard").glob(f"{pattern}/[!.]*"))
+
+
 @pytest.mark.parametrize("name", pictures.PICTURES)
 def test_a_command_is_one_that_the_suite_understands(name: str) -> None:
     assert parse(shlex.split(pictures.PICTURES[name].command)) == ""
@@ -44,7 +50,7 @@ def test_a_mark_follows_the_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     entry.mkdir(parents=True)
     (entry / "seeds.parquet").write_bytes(b"old")
     monkeypatch.setattr(pictures, "ROOT", tmp_path)
-    picture = pictures.Plot("plot curves", ("task/*",))
+    picture = pictures.Plot("plot curves", ("entries/task/*",))
     before = pictures.made_from(picture)
     assert pictures.made_from(picture) == before
     (entry / "seeds.parquet").write_bytes(b"new")

@@ -17,7 +17,7 @@ from tests.statistics.conftest import SURFACE
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
-FIRST_SCREEN = README.partition("\n## ")[0]
+BOARD = README.partition("\n## The paper's board\n")[2].partition("\n## ")[0]
 PAGE = (ROOT / "docs" / "leaderboard.md").read_text()
 
 
@@ -47,7 +47,7 @@ def rows(text: str) -> list[dict[str, str]]:
 
 
 def test_the_table_is_the_boards(board: list[dict[str, str]]) -> None:
-    shown = rows(FIRST_SCREEN.replace(" (†)", ""))
+    shown = rows(BOARD.replace(" (†)", ""))
     assert len(shown) == 9
     assert shown == [{name: row[name] for name in shown[0]} for row in board]
 
@@ -91,7 +91,7 @@ def test_the_table_by_executions_is_the_boards() -> None:
 
 
 def test_the_core_hours_are_the_boards(board: list[dict[str, str]]) -> None:
-    assert f"{sum(float(row['hours']) for row in board):.1f} core-hours for the nine" in FIRST_SCREEN
+    assert f"{sum(float(row['hours']) for row in board):.1f} core-hours for the nine" in BOARD
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_the_cells_of_the_retuned_network(first: str, second: str, sentence: str
     comparison = api.compare(first, second, task="beam6g", published=True)
     assert comparison.count(Verdict.LOSS) == 0
     text = sentence.format(comparison.count(Verdict.WIN)).replace(" in 1", " in one")
-    assert text in FIRST_SCREEN.replace("\n", " ")
+    assert text in BOARD.replace("\n", " ")
 
 
 def test_the_two_halves_of_the_seeds() -> None:
@@ -126,4 +126,4 @@ def test_the_two_halves_of_the_seeds() -> None:
 
     assert ahead(slice(0, 50)) == 0
     sentence = f"on seeds 50 to 99 the circuit is ahead in {ahead(slice(50, 100))} cells"
-    assert sentence in FIRST_SCREEN.replace("\n", " ")
+    assert sentence in BOARD.replace("\n", " ")

@@ -40,6 +40,19 @@ def test_every_plan_is_on_the_page(name: str) -> None:
     assert list(file.looks) == [20, 40, 60, 80, 100]
 
 
+def test_the_state() -> None:
+    outcome = tables.published("quantum-or-not")
+    looks = "20" + "".join(
+        f"{', ' if n < max(outcome.looked.values()) else ' and '}{n}"
+        for n in (40, 60, 80, 100)
+        if n <= max(outcome.looked.values())
+    )
+    decided = sum(pair.decided is not None for pair in outcome.pairs)
+    open_ = sum(pair.decided is None for pair in outcome.pairs)
+    assert f"Looks after {looks} seeds are taken, {decided} of {len(outcome.pairs)} pairs decided" in PROSE
+    assert f"{open_ or 'none'} open" in PROSE
+
+
 def test_the_hours_of_tuning() -> None:
     entries = tables.published("quantum-or-not").study.file.entries
     hours = sum(each.tuning.core_hours or 0 for each in entries if each.tuning is not None)

@@ -38,13 +38,17 @@ app = typer.Typer(
 )
 
 PlanArgument = Annotated[
-    Path, typer.Argument(metavar="PLAN.toml", help="A plan that `qrlsuite decide new` wrote.")
+    Path,
+    typer.Argument(
+        metavar="PLAN.toml", help="A plan that `qrlsuite decide new` wrote, or the name of a published one."
+    ),
 ]
 
 StartedArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="PLAN.toml", help="A plan, or a folder in which `qrlsuite decide export` published one."
+        metavar="PLAN.toml",
+        help="A plan, a folder in which `qrlsuite decide export` published one, or a published plan's name.",
     ),
 ]
 
@@ -263,12 +267,25 @@ def end(path: PlanArgument, runs: RunsOption = Path("runs")) -> None:
     typer.echo(f"ended; what was decided stays: {command('decide', 'status', str(path), runs=runs)}")
 
 
+def _published(path: Path) -> Path | None:
+    """Return the folder of a plan that comes with the suite, where its name was given and no path."""
+    folder = plans.PUBLISHED / path
+    named = len(path.parts) == 1 and not path.exists() and plans.is_published(folder)
+    return folder if named else None
+
+
 def _outcome(path: Path, runs: Path) -> DecisionOutcome:
+    """Read what a plan has decided; of a published one that has begun in the results folder, there."""
+    if (folder := _published(path)) is not None:
+        study = _study(path, runs)
+        return decided.read(folder / plans.PLAN, runs) if study.begun else plans.read(folder)
     return plans.read(path) if path.is_dir() else decided.read(path, runs)
 
 
 def _study(path: Path, runs: Path) -> DecisionStudy:
-    study = DecisionStudy(decisions.load(path), str(path), runs)
+    folder = _published(path)
+    file = path if folder is None else folder / plans.PLAN
+    study = DecisionStudy(decisions.load(file), str(path), runs)
     study.check()
     return study
 
