@@ -22,7 +22,7 @@ from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "quantum-or-not.md")
-TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*")
+TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*\n*")
 
 Rows = Iterator[Sequence[str]]
 
@@ -97,7 +97,7 @@ def filled(text: str) -> str:
             "|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines
         )
         asked = found[0].partition(" -->")[0]
-        return f"{asked} -->\n\n{body.replace(' --- ', '---')}\n"
+        return f"{asked} -->\n\n{body.replace(' --- ', '---')}\n\n"
 
     return TABLE.sub(table, text)
 

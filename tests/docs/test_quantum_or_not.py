@@ -24,6 +24,12 @@ def test_tables_are_what_the_plans_decide(page: Path) -> None:
     assert tables.filled(text) == text, "run `make pictures`"
 
 
+def test_a_table_that_was_empty_stands_apart_from_what_follows() -> None:
+    text = tables.filled("<!-- table: quantum-or-not verdicts 1 -->\n\n## Next\n")
+    assert re.search(r"<!-- .* -->\n\n\| pair A / B \|.*\n(\|.*\n)+\n## Next\n$", text)
+    assert tables.filled(text) == text
+
+
 def test_a_stale_table_is_replaced() -> None:
     stale = PAGE.replace("| 313 |", "| 312 |", 1)
     assert stale != PAGE
