@@ -38,8 +38,9 @@ def _counted(n: int, p: float, source: Any) -> int:
     """Draw from the binomial law by adding up its probabilities; for a mean n p that is small."""
     odds, left = p / (1.0 - p), source.random()
     term = math.exp(n * math.log1p(-p))
+    most = min(n, n * p + 10.0 * math.sqrt(n * p + 1.0))  # where terms add up to 1 but for rounding
     k = 0
-    while left > term and k < n:
+    while left > term and k + 1 <= most:
         left -= term
         k += 1
         term *= odds * (n - k + 1) / k
