@@ -48,15 +48,17 @@ def test_every_plan_is_on_the_page(name: str) -> None:
 
 def test_the_state() -> None:
     outcome = tables.published("quantum-or-not")
-    looks = "20" + "".join(
-        f"{', ' if n < max(outcome.looked.values()) else ' and '}{n}"
-        for n in (40, 60, 80, 100)
-        if n <= max(outcome.looked.values())
+    verdicts = [pair.verdict for pair in outcome.pairs]
+    equal, apart = (sum(each.startswith(word) for each in verdicts) for word in ("equal", "not told apart"))
+    differ = sum(each.endswith("needs fewer") for each in verdicts)
+    assert differ + equal + apart == len(verdicts)
+    assert (
+        f"{differ} of {len(verdicts)} pairs differ, {equal} are equal within 10 percent, {apart} are not"
+        in PROSE
     )
-    decided = sum(pair.decided is not None for pair in outcome.pairs)
-    open_ = sum(pair.decided is None for pair in outcome.pairs)
-    assert f"Looks after {looks} seeds are taken, {decided} of {len(outcome.pairs)} pairs decided" in PROSE
-    assert f"{open_ or 'none'} open" in PROSE
+    seeds = sum(outcome.looked.values())
+    hours = sum(each["core_hours"] for each in outcome.as_dict()["entries"])
+    assert f"The plan took {seeds} seeds and {hours:.1f} core-hours" in PROSE
 
 
 def test_the_hours_of_tuning() -> None:
