@@ -69,7 +69,9 @@ def draw(outcome: DecisionOutcome) -> Figure:
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: decided.percent(ratio - 1)))
+    axes.xaxis.set_major_formatter(
+        FuncFormatter(lambda ratio, _: decided.percent(ratio - 1) if ratio != 1 else "0")
+    )
     axes.set_xlabel("pair A / B: how much longer B is below the thresholds than A")
     _name_rows(axes, names)
     for tick, row in zip(axes.get_yticklabels(), rows):
@@ -85,7 +87,7 @@ def draw(outcome: DecisionOutcome) -> Figure:
         f"repeated confidence intervals: they hold at every look, {confidence:g} percent for all "
         f"{len(decision.pairs)} pairs together",
         "a verdict is decided at any threshold, the interval is that of their mean",
-        f"gray: equal within {100 * margin:g} percent",
+        f"shaded: equal within {100 * margin:g} percent",
         "right: seeds of each entry at the pair's last look",
         "an early stop overstates the difference",
         f"cut at a factor of {WIDEST[1]:g}" if any(map(_cut, decision.pairs)) else "",
