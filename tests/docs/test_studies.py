@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from qrlsuite import api, registry
+from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.published import PUBLISHED, read
 from qrlsuite.statistics import Comparison, Direction, Verdict
+from qrlsuite.studies.decided import versus
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.times import TimeRanking
@@ -28,6 +30,7 @@ ROWS = [
     if line.startswith("| ")
 ][1:]
 PAIR = re.compile(r"(?P<task>\w+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`")
+PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
 
 # What the paper expects of the first entry of a pair: that it needs fewer steps than the second, as many, or no fewer.
@@ -103,6 +106,17 @@ def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
     assert pairs == set(PAPER)
     changed = [" | ".join(now) for then, now in zip(written, computed) if then != now]
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
+
+
+def test_rows_of_a_plan() -> None:
+    """Evidence from a decision plan names pairs of it, each with its verdict."""
+    found = plans.read(plans.PUBLISHED / "quantum-or-not")
+    verdicts = {versus(pair): pair.verdict for pair in found.pairs}
+    rows = [row for row in ROWS if row[4].startswith("plan [quantum-or-not]")]
+    said = {match["pair"]: match["verdict"] for row in rows for match in PLANNED.finditer(row[4])}
+    assert len(said) == sum(row[4].count(" / ") for row in rows) > 0
+    assert said == {pair: verdicts[pair] for pair in said}
+    assert {row[5] for row in rows} == {f".05 for {len(found.pairs)} pairs"}
 
 
 def test_few_runs() -> None:
