@@ -1,7 +1,7 @@
 """Published decision plans: the plan, its log of looks, and the learning curves of its entries.
 
     <name>/plan.toml                the plan as it was when its first seed began
-           looks.jsonl              when each look was taken, and what it found
+           looks.jsonl              when the first seed was begun and each look taken, and what it found
            <task>/<entry>/...       as published entries, see `qrlsuite.leaderboard.published`
 
 Verdicts are not stored: they are computed from the plan and the curves.
@@ -180,6 +180,6 @@ def take_over(folder: Path, runs: Path) -> list[TakenOver]:
     study = DecisionStudy(source.file, source.source, runs)
     study.begin()
     done = [takeover.take_over(store, study.folder, source.file.hash) for store in takeover.sources(folder)]
-    if (folder / LOG).exists() and not (study.folder / LOG).exists():
+    if (folder / LOG).exists() and not study.taken:  # the seeds were begun where they were trained
         shutil.copyfile(folder / LOG, study.folder / LOG)
     return done

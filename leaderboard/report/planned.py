@@ -131,6 +131,7 @@ def _facts(outcome: DecisionOutcome, plain: dict[str, Any]) -> list[tuple[str, s
         ("State", state),
         ("Task", f"{entry.task.name}, {steps} environment steps"),
         ("Plan written", f"{study.file.written.astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC"),
+        *([("First seed begun", _minute(study.begun_at))] if study.begun_at else []),
         ("Hash of the plan", study.file.hash),
         (
             "Seeds",

@@ -96,6 +96,7 @@ class DecisionOutcome(Shown):
             "plan": study.file.name,
             "hash": study.file.hash,
             "finished": decision.finished,
+            "begun_at": study.begun_at,
             "ended": study.ended,
             "looks_taken": study.taken,
             "reason": study.file.reason or None,
@@ -148,6 +149,8 @@ class DecisionOutcome(Shown):
                 "M (95%): environment steps that a run of the entry spends below threshold, mean over seeds and the "
                 "task's thresholds, at its last look"
             )
+        if study.begun_at:
+            yield Text(f"first seed begun {study.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
         if note := reason_note(study):

@@ -4,7 +4,7 @@ A plan is a TOML file that fixes, before the first seed is trained, who is compa
 results are looked at, and at which error (`qrlsuite.statistics.sequential`). Its results lie in a folder of their own:
 
     <runs>/decisions/<name>/plan.toml           the plan as it was when its first seed began
-                            looks.jsonl         when each look was taken, and what it found
+                            looks.jsonl         when the first seed was begun and each look taken, and what it found
                             <task>/<entry>/...  as in any results folder; each seed's record has the plan's hash
 
 What is decided follows from the plan and the curves alone. The log is not read to decide anything: it says when each
@@ -451,6 +451,8 @@ class DecisionStudy:
             )
         if not self.begun:
             write_atomically(self.folder / "plan.toml", dumps(self.file).encode())
+            if self.begun_at is None:
+                append(self._log, json_line({"begun": _now(), "plan": self.file.hash}))
 
     def end(self) -> None:
         """Close the plan for good, with its open pairs open.
@@ -472,6 +474,12 @@ class DecisionStudy:
     @property
     def _log(self) -> Path:
         return self.folder / "looks.jsonl"
+
+    @property
+    def begun_at(self) -> str | None:
+        """When its first seed was begun, by the log; None if it was not, or by a version that did not note it."""
+        lines = (line for line in read_lines(self._log) if "begun" in line)
+        return next((str(line["begun"]) for line in lines if line["plan"] == self.file.hash), None)
 
     @property
     def ended(self) -> str | None:

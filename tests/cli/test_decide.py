@@ -179,6 +179,9 @@ def test_an_entry_stops_when_all_its_pairs_are_closed() -> None:
     assert found["seeds_saved"] == 60 + 60 + 80
     assert found["core_hours_saved"] == pytest.approx([2.0, 2.0])
     assert list(found["looks_taken"]) == ["20", "40"]
+    written = answer("show", "widths.toml")["written"]
+    times = [written.replace("Z", "+00:00"), found["begun_at"], *found["looks_taken"].values()]
+    assert times == sorted(times)
 
     log = Path("runs/decisions/widths/looks.jsonl").read_bytes()
     again = answer("run", "widths.toml", "--engine", "scripted")
@@ -619,7 +622,7 @@ def test_a_published_plan_is_decided_by_its_curves_and_goes_on_elsewhere(exporte
     assert taken.output.count("imported seeds 10000:10005") == 2, taken.output
     there = answer("status", "p.toml", "--runs", "elsewhere")
     assert [pair["p"] for pair in there["pairs"]] == [pair["p"] for pair in before["pairs"]]
-    assert there["looks_taken"] == before["looks_taken"]
+    assert [there[key] for key in ("begun_at", "looks_taken")] == [before["begun_at"], before["looks_taken"]]
     page = ["leaderboard", "--runs", "elsewhere", "--format", "html", "--out", "page.html"]
     runner.invoke(build(), page, catch_exceptions=False)
     assert "p: which needs fewer steps" in Path("page.html").read_text()

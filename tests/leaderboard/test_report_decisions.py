@@ -80,6 +80,7 @@ def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) ->
     assert facts["State"] == "finished"
     assert facts["Hash of the plan"] == found[0].study.file.hash
     assert facts["Plan written"].endswith(" UTC")
+    assert facts["First seed begun"] >= facts["Plan written"]
     assert facts["Seeds"] == "10000:10100, 100 used, 200 saved"
     assert dict(two.facts)["State"] == "goes on: next look at 40 seeds"
     assert "p ≤ 0.015 at 40 seeds" in two.pairs[0].needs
