@@ -31,7 +31,7 @@ def settings(outcome: DecisionOutcome, questions: int | None) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     yield "entry", "parameters", "settings", "trials", "M"
     for planned in outcome.study.file.entries:
-        if planned.tuning is None:
+        if planned.tuning is None or planned.tuning.value is None:  # the task's own settings
             continue
         entry, tuning = outcome.study.entries[str(planned.name)], planned.tuning
         found = []
@@ -41,7 +41,7 @@ def settings(outcome: DecisionOutcome, questions: int | None) -> Rows:
             found.append(f"{name} {getattr(options, name):g}")
         name = str(planned.name).removesuffix(", tuned")
         parameters = str(sum(count_parameters(entry)))
-        yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(tuning.value or 0.0)
+        yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(planned.tuning.value)
 
 
 def verdicts(outcome: DecisionOutcome, questions: int | None) -> Rows:

@@ -61,7 +61,14 @@ def test_the_state() -> None:
     assert f"The plan took {seeds} seeds and {hours:.1f} core-hours" in PROSE
 
 
-def test_the_hours_of_tuning() -> None:
-    entries = tables.published("quantum-or-not").study.file.entries
-    hours = sum(each.tuning.core_hours or 0 for each in entries if each.tuning is not None)
-    assert re.search(rf"\b{hours:.1f} core-hours for all\b", PROSE)
+@pytest.mark.parametrize(
+    ("plan", "sentence"),
+    [
+        ("quantum-or-not", "{} core-hours for all"),
+        ("quantum-or-not-cartpole", "whole runs of 500 epochs, in {} core-hours"),
+    ],
+)
+def test_the_hours_of_tuning(plan: str, sentence: str) -> None:
+    tunings = [entry.tuning for entry in tables.published(plan).study.file.entries]
+    hours = sum(each.core_hours or 0 for each in tunings if each is not None and each.value is not None)
+    assert sentence.format(f"{hours:.1f}") in PROSE
