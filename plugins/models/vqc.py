@@ -355,6 +355,12 @@ class VQCPopulation(_Hybrid):
             runner, {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
         )
 
+    def prepare(self) -> None:
+        """Let the circuit's backend compile what the first pass would, if it has a way to."""
+        prepare = getattr(self._runner.backend, "prepare", None)
+        if prepare is not None:
+            prepare(next(self.output.parameters()))
+
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
         return self._stacked(x, dict(self.named_parameters()))

@@ -44,7 +44,13 @@ def gpu() -> str:
     names = [f"{device.name} {device.total_memory / 1e9:.0f} GB" for device in devices]
     driver = "an" if os.path.exists("/proc/driver/nvidia/version") else "no"
     built = f"torch for CUDA {torch.version.cuda}" if torch.version.cuda else "torch for the CPU"
-    return f"{', '.join(names) or 'none'}, {built}, {driver} NVIDIA driver"
+    text = f"{', '.join(names) or 'none'}, {built}, {driver} NVIDIA driver"
+    if not names:
+        return text
+    from qrlsuite.plugins.circuits.native import gpu as kernels
+
+    problem = kernels.trouble()
+    return f"{text}, circuits " + (f"slow there: {problem}" if problem else "by kernels")
 
 
 def simulator() -> str:

@@ -261,6 +261,7 @@ class GroupRun:
             try:
                 with guard.deferred():
                     self._begin()
+                self.trainer.models.prepare()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
                     epoch = self.trainer.train_epoch()

@@ -17,6 +17,7 @@ from qrlsuite.plugins.circuits.native.program import Program, compile_circuit
 from qrlsuite.plugins.circuits.options import NativeOptions
 
 if TYPE_CHECKING:
+    from qrlsuite.plugins.circuits.native import gpu
     from qrlsuite.plugins.circuits.native.cpu import Simulator
     from qrlsuite.plugins.circuits.native.sampling import ShotSampler
 
@@ -27,9 +28,10 @@ class NativeBackend:
     """Batched statevector simulation, see `qrlsuite.circuit.CircuitBackend`.
 
     Exact values have adjoint gradients; shots and noise are described in `sampling`, and computed on the CPU. There
-    compiled kernels run on one thread; tensors on another device are computed there, by plain torch
-    operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state. Mean-field approximations of
-    circuits take 3 numbers per qubit and 6 per gate.
+    compiled kernels run on one thread. Tensors on an NVIDIA GPU are computed there, by kernels of its own (see `gpu`);
+    mean-field approximations, circuits of more than 14 connected qubits, and everything where package `numba-cuda` is
+    missing, by plain torch operations. Memory is constant in depth: 2^(n + 1) numbers per lane and state. Mean-field
+    approximations of circuits take 3 numbers per qubit and 6 per gate.
 
     Parameters
     ----------
@@ -97,14 +99,32 @@ class NativeBackend:
             flat = torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
         else:
             flat = inputs.new_zeros((size, 0))
-        run = self.simulator() if inputs.device.type == "cpu" else self.by_torch
-        result = run(inputs, flat)
+        result = self._run(inputs, flat)
         if not bool(torch.isfinite(result.detach().sum())):
             raise OptionError(NOT_FINITE)
         return result
 
+    def prepare(self, like: Tensor) -> None:
+        """Compile the kernels, or load them, by a pass there and back of one sample of that dtype and device."""
+        inputs = torch.zeros((1, 1, self.circuit.inputs), dtype=like.dtype, device=like.device)
+        parameters = {
+            name: torch.zeros((1, *shape), dtype=like.dtype, device=like.device, requires_grad=True)
+            for name, shape in self.shapes.items()
+        }
+        values = self(inputs, parameters, [0])
+        if values.requires_grad:
+            values.sum().backward()
+
+    def _run(self, inputs: Tensor, flat: Tensor) -> Tensor:
+        """Return expectation values (S, B, O) of inputs and flat parameters (S, P), computed where these are."""
+        if inputs.device.type == "cpu":
+            return self.simulator()(inputs, flat)
+        if self.gpu_simulator is not None and self.gpu_simulator.takes(inputs):
+            return self.gpu_simulator(inputs, flat)
+        return self.by_torch(inputs, flat)
+
     def by_torch(self, inputs: Tensor, flat: Tensor) -> Tensor:
-        """Return what the kernels return by torch operations, on any device, with flat parameters (S, P)."""
+        """Return the same by torch operations, on any device."""
         if self.circuit.mean_field:
             from qrlsuite.plugins.circuits.native import mean_field
 
@@ -115,6 +135,13 @@ class NativeBackend:
     def program(self) -> Program:
         """What devices other than the CPU run: steps on the whole state, made when first needed."""
         return compile_circuit(self.circuit)
+
+    @cached_property
+    def gpu_simulator(self) -> gpu.Simulator | None:
+        """The simulator on NVIDIA GPUs, made when first needed; None of a mean-field circuit, or where it fails."""
+        from qrlsuite.plugins.circuits.native import gpu
+
+        return None if self.circuit.mean_field or gpu.trouble() else gpu.Simulator(self.program)
 
     def simulator(self) -> Simulator:
         """Return the CPU simulator, made when first needed."""
