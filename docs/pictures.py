@@ -93,20 +93,20 @@ PICTURES: dict[str, Picture] = {
     "study-deploy-errors.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
     "study-fig1.png": Plot(
-        "plot surface --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=64' "
-        "--entry 'vqc-native qubits=10'",
+        "plot surface --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=64' "
+        "--entry 'vqc-native qubits=14'",
         ("entries/beam6g/*",),
     ),
     "study-fig6.png": Plot(
-        "plot bars --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' "
-        "--entry 'vqc-native qubits=10'",
+        "plot bars --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=32' "
+        "--entry 'mlp width=64' --entry 'vqc-native qubits=10' --entry 'vqc-native qubits=14'",
         ("entries/beam6g/*",),
     ),
     "study-fig7.png": Plot(
-        "plot scaling --task beam6g --published --set 'epsilons=[0.15]' --set 'deltas=[0.75]' "
+        "plot scaling --task beam6g --published --seeds 30 --set 'epsilons=[0.15]' --set 'deltas=[0.75]' "
         "--entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' --entry 'mlp width=128' "
         "--entry 'mlp width=256' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=8' "
-        "--entry 'vqc-native qubits=10'",
+        "--entry 'vqc-native qubits=10' --entry 'vqc-native qubits=14'",
         ("entries/beam6g/*",),
     ),
     "study-ppo.png": Unpublished("study run ppo --seeds 10"),

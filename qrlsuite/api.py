@@ -270,6 +270,7 @@ def plot(
     entries: Sequence[str | EntryCurves] = (),
     horizon: int | None = None,
     min_seeds: int = 1,
+    seeds: Seeds | None = None,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
     environment: Mapping[str, Any] | None = None,
@@ -286,6 +287,8 @@ def plot(
         What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
     tasks, entries, horizon, min_seeds, runs, published:
         As for `board`. Without `entries` all of the task are drawn, the smallest model first.
+    seeds:
+        Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; None means all.
     environment:
         For a picture of an environment: options that replace the task's.
     settings:
@@ -315,6 +318,7 @@ def plot(
         entries,
         horizon=horizon,
         min_seeds=min_seeds,
+        seeds=seeds,
         runs=Path(runs),
         published=published,
         settings=settings,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -45,6 +45,7 @@ def compose(
     *,
     horizon: int | None = None,
     min_seeds: int = 1,
+    seeds: int | str | Iterable[int] | None = None,
     runs: Path,
     published: bool = False,
     settings: Mapping[str, Any],
@@ -58,6 +59,8 @@ def compose(
         A name of `summaries`.
     tasks, entries, horizon, min_seeds, runs, published:
         As for `qrlsuite.leaderboard.collect.select`.
+    seeds:
+        Draw these alone, of every entry, see `EntryCurves.with_seeds`; None means all.
     settings:
         The picture's settings by name.
     environment:
@@ -84,7 +87,13 @@ def compose(
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
     if data == "deployed":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite study run deploy")
-    selection = {"--task": tasks, "--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1}
+    selection = {
+        "--task": tasks,
+        "--entry": entries,
+        "--horizon": horizon,
+        "--min-seeds": min_seeds > 1,
+        "--seeds": seeds,
+    }
     if data is None:
         if any(selection.values()):
             name = next(name for name, value in selection.items() if value)
@@ -94,6 +103,8 @@ def compose(
     own = {"horizon": horizon} if cuts and horizon is not None else {}
     lookup.check_tasks(runs, *tasks)
     selected, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
+    if seeds is not None:
+        selected = [entry.with_seeds(seeds) for entry in selected]
     if not entries:
         selected.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
         selected = [replace(entry, color=place) for place, entry in enumerate(selected)]

@@ -159,6 +159,12 @@ def test_pictures_are_figures(kind: str, small: EntryCurves, large: EntryCurves)
     assert "mlp width=64" in texts
 
 
+def test_a_picture_of_equal_numbers(small: EntryCurves, large: EntryCurves) -> None:
+    figure = api.plot("bars", entries=[small, large], seeds=30, **WHERE)
+    shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert ["30 seeds*" in text for text in shown] == [True, True]
+
+
 def test_pictures_of_an_environment_take_its_options() -> None:
     assert api.plot("field", tasks="beam6g", environment={"degree": 5}, resolution=20).axes
 
@@ -194,6 +200,11 @@ def test_a_picture_names_what_it_leaves_out(
         ),
         (lambda: api.plot("curve", tasks="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
         (lambda: api.plot("curves", **WHERE), OptionError, "holds several tasks"),
+        (
+            lambda: api.plot("bars", tasks="beam6g", seeds=101, **WHERE),
+            OptionError,
+            "has no complete run of seed 100",
+        ),
         (
             lambda: api.plot("bars", tasks="beam6g", epsilon=[0.1], **WHERE),
             OptionError,

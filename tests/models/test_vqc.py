@@ -244,6 +244,26 @@ def test_a_target_network_draws_its_own_samples():
     assert not torch.equal(together(x), target(x))
 
 
+@pytest.mark.parametrize("shots", [None, 10])
+def test_preparing_compiles_and_leaves_no_trace(shots):
+    """Else the first epoch would hold the compiler's time, and every estimate that rests on it."""
+    given = small("native", shots=shots)
+    model = vqc.population(agents(2, given), given)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    model.prepare()
+    assert set(model.executions.as_dict().values()) == {0}
+    assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())
+    if shots is None:
+        assert torch.float32 in model._runner.backend.simulator()._workspaces
+
+
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "native"])
+def test_other_backends_have_nothing_to_compile(backend):
+    given = small(backend)
+    vqc.population(agents(1, given), given).prepare()
+
+
 def test_exact_models_do_not_count_passes():
     together = vqc.population(agents(2, small()), small())
     together(observations(2, 3, 3))

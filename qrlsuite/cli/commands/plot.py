@@ -45,6 +45,13 @@ def plot(
     entry: EntryOption = None,
     horizon: HorizonOption = None,
     min_seeds: MinSeedsOption = 1,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            "--seeds",
+            help="Only these seeds of every entry, 30 or 0:30: S_hat of 30 runs is another quantity than of 100.",
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -84,6 +91,7 @@ def plot(
         entry or [],
         horizon=horizon,
         min_seeds=min_seeds,
+        seeds=seeds,
         runs=runs,
         published=published,
         settings=picture_settings,
