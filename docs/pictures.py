@@ -84,8 +84,8 @@ PICTURES: dict[str, Picture] = {
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
     "report-times.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1104, "By mean time below threshold"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1240),
-    "policies.png": Unpublished(  # after `study run fig7`: it plays agents that were trained here
-        "evaluate 'mlp width=64' 'vqc-native qubits=10' --best 10 --episodes 1000 --out policies.png"
+    "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
+        "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
     "study-antennas.png": Unpublished(
         "study run antennas --seeds 10 --only mlp --only a2 --only a3"  # the circuit on ten of twenty placements
