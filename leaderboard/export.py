@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard import published
@@ -51,13 +54,24 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
         entry.curves,
         [run.seconds / 3600 for run in runs],
         [run.executions for run in runs],
-        [run.record["provenance"][-1] if run.record.get("provenance") else {} for run in runs],
+        [_made_with(run.record.get("provenance") or [{}]) for run in runs],
         {"classical": 0, "quantum": 0, **parameters_of(run.record for run in runs)},
         fingerprint(built, entry.seeds),
     )
     _replace(folder, content)
     published.read(folder)
     return folder
+
+
+def _made_with(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a seed's last epochs were made with; under `before`, what else earlier ones were made with."""
+    *earlier, last = records
+    before = [record for record in dict.fromkeys(map(_frozen, earlier)) if record != _frozen(last)]
+    return {**last, **({"before": [json.loads(record) for record in before]} if before else {})}
+
+
+def _frozen(record: Mapping[str, Any]) -> str:
+    return json.dumps(record, sort_keys=True)
 
 
 def _refuse_smaller(folder: Path, entry: EntryCurves, force: bool) -> None:

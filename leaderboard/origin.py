@@ -8,6 +8,15 @@ from typing import Any
 from qrlsuite.results import provenance as machine
 
 
+def all_of(made_with: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the record of a published seed's last epochs, and those of earlier ones that were made otherwise."""
+    before = made_with.get("before")
+    return [
+        made_with,
+        *(each for each in (before if isinstance(before, list) else []) if isinstance(each, dict)),
+    ]
+
+
 def versions(provenance: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
     """Return every version that occurs, by distribution; Python's under "python"."""
     by_package: dict[str, set[str]] = {}

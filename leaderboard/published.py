@@ -80,7 +80,7 @@ class PublishedEntry:
         """Return what a leaderboard ranks."""
         record, identity = self.record, self.record["identity"]
         count = record["published"]["parameters"]
-        provenance = self.provenance
+        provenance = [made for last in self.provenance for made in origin.all_of(last)]
         return EntryCurves(
             name=record["name"],
             label=record["label"],

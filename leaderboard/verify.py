@@ -11,7 +11,7 @@ import numpy as np
 
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import Entry, from_record
-from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard import origin, published
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.leaderboard.published import PublishedEntry
 from qrlsuite.results import provenance
@@ -165,8 +165,7 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
     compared, and the device was the CPU.
     """
     here = provenance.collect(made_by.distributions())
-    for place in places:
-        record = entry.provenance[place]
+    for record in (made for place in places for made in origin.all_of(entry.provenance[place])):
         if provenance.device_kind(record) != "cpu":
             name = record["device"].get("name", "unknown")
             return f"trained on the CPU here, on {provenance.device_kind(record)} ({name}) there"

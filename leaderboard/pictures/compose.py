@@ -15,6 +15,7 @@ from qrlsuite.experiment import task as task_files
 from qrlsuite.leaderboard import collect, pictures
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results import lookup
+from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
 
@@ -104,7 +105,14 @@ def compose(
     lookup.check_tasks(runs, *tasks)
     selected, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
     if seeds is not None:
-        selected = [entry.with_seeds(seeds) for entry in selected]
+        wanted = read_seeds(seeds)
+        lacking = [entry for entry in selected if not entries and set(wanted) - set(entry.seeds)]
+        left_out += [
+            f"{entry.label}: {len(entry.seeds)} seeds, and not all that were asked for" for entry in lacking
+        ]
+        selected = [
+            entry.with_seeds(wanted) for entry in selected if all(entry is not each for each in lacking)
+        ]
     if not entries:
         selected.sort(key=lambda entry: (entry.model, sum(entry.parameters), entry.label))
         selected = [replace(entry, color=place) for place, entry in enumerate(selected)]

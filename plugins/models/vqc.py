@@ -355,11 +355,11 @@ class VQCPopulation(_Hybrid):
             runner, {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
         )
 
-    def prepare(self) -> None:
+    def compile_circuits(self) -> None:
         """Let the circuit's backend compile what the first pass would, if it has a way to."""
-        prepare = getattr(self._runner.backend, "prepare", None)
-        if prepare is not None:
-            prepare(next(self.output.parameters()))
+        compile_for = getattr(self._runner.backend, "compile_for", None)
+        if compile_for is not None and self.simulator:
+            compile_for(next(self.output.parameters()))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""

@@ -50,9 +50,9 @@ class CircuitBackend(Protocol):
         counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
     simulator (bool):
         False where circuits run on a device, whose executions may cost money; by default true.
-    prepare (callable):
-        `prepare(like)` compiles what the first passes on tensors of the dtype and device of `like` would compile. It
-        is called before training, so that no epoch's time holds it.
+    compile_for (callable):
+        Of a simulator: `compile_for(like)` compiles what the first passes on tensors of the dtype and device of
+        `like` would compile. It is called before training, so that no epoch's time holds it.
     """
 
     shots: int | None
@@ -139,7 +139,7 @@ class _WithProducts:
         self.backend = backend
         self.products = products
         self.shots = backend.shots
-        for name in ("draws", "gradient_circuits", "simulator", "prepare"):
+        for name in ("draws", "gradient_circuits", "simulator", "compile_for"):
             if hasattr(backend, name):
                 setattr(self, name, getattr(backend, name))
 

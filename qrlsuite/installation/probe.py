@@ -47,9 +47,9 @@ def gpu() -> str:
     text = f"{', '.join(names) or 'none'}, {built}, {driver} NVIDIA driver"
     if not names:
         return text
-    from qrlsuite.plugins.circuits.native import gpu as kernels
+    from qrlsuite.plugins.circuits.native.backend import trouble
 
-    problem = kernels.trouble()
+    problem = trouble()
     return f"{text}, circuits " + (f"slow there: {problem}" if problem else "by kernels")
 
 

@@ -64,8 +64,10 @@ def device_kind(made_with: Mapping[str, Any]) -> str:
 def _device(device: torch.device) -> dict[str, str]:
     import torch
 
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else processor()
-    return {"kind": device.type, "name": name}
+    if device.type != "cuda":
+        return {"kind": device.type, "name": processor()}
+    name = torch.cuda.get_device_name(device)
+    return {"kind": device.type, "name": name, "numba-cuda": version("numba-cuda") or "none"}
 
 
 def processor() -> str:

@@ -167,6 +167,7 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
             trainer.restore(header["epoch"], arrays)
         else:
             trainer.start()
+        trainer.models.compile_circuits()
         began = time.monotonic()
         while trainer.epoch < header["epochs"]:
             epoch = trainer.train_epoch()

@@ -261,7 +261,7 @@ class GroupRun:
             try:
                 with guard.deferred():
                     self._begin()
-                self.trainer.models.prepare()
+                self.trainer.models.compile_circuits()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
                     epoch = self.trainer.train_epoch()

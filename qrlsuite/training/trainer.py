@@ -227,10 +227,10 @@ class ModelBuilder:
         counts = {"classical": classical, "quantum": quantum, "networks": len(counted)}
         return {**counts, "fixed": fixed} if fixed else counts
 
-    def prepare(self) -> None:
-        """Let models compile what their first pass would: no epoch's time, and no estimate from it, holds that."""
+    def compile_circuits(self) -> None:
+        """Let models of circuits compile what their first pass would: no epoch's time, and no estimate, holds that."""
         for module in self.built:
-            getattr(module, "prepare", lambda: None)()
+            getattr(module, "compile_circuits", lambda: None)()
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""

@@ -13,6 +13,7 @@ import torch
 
 from qrlsuite.circuit import Circuit, ansatz
 from qrlsuite.plugins.circuits.native import NativeBackend
+from qrlsuite.plugins.circuits.native import backend as native
 from tests.conftest import HANGS
 
 
@@ -37,7 +38,10 @@ def circuits() -> dict[str, Circuit]:
         hadamards.append("H", q)
     hadamards.append("RZ", 0, hadamards.input(1), control=2)
     hadamards.append("H", 0)
+    fixed = Circuit(1)
+    fixed.append("RX", 0, fixed.input(0))
     return {
+        "no parameters": fixed,
         "iqp": ansatz("iqp", qubits=2, layers=2),
         "cx": ansatz("cx", qubits=3, layers=2, gate="u3"),
         "cz, products": products,
@@ -68,11 +72,22 @@ def differences(circuit: Circuit, dtype: torch.dtype) -> dict[str, float]:
     }
 
 
-def main(shared: int) -> None:
-    """Print the differences of all circuits, where a block has so many bytes of shared memory."""
+def main(states: int) -> None:
+    """Print the differences of all circuits, where a block has room for so many states in shared memory, and no more.
+
+    For one state it is one circuit, which needs the same as others do of another size.
+    """
     from qrlsuite.plugins.circuits.native import gpu
 
-    gpu._shared_limit = lambda device: shared  # type: ignore[assignment]
+    kinds = (torch.float64, torch.float32)
+    chosen = {(name, kind) for name in circuits() for kind in kinds if name == "iqp" or kind == torch.float64}
+    room = {0: 0, 2: gpu.ALWAYS_SHARED}
+    if states == 1:
+        chosen = {("iqp", torch.float64)}
+        program = NativeBackend(circuits()["iqp"]).program
+        room[1] = gpu.Simulator(program).bytes_of(torch.zeros(0, dtype=torch.float64), 1, backward=True)
+    gpu._shared_limit = lambda device: room[states]  # type: ignore[assignment]
+    gpu.BLOCKS = 3  # of 4 lanes, so that one takes a second where blocks share the memory of all
     launched = []
     launch = gpu._launch
 
@@ -81,22 +96,22 @@ def main(shared: int) -> None:
         launch(name, *arguments)  # type: ignore[arg-type]
 
     gpu._launch = listening  # type: ignore[assignment]
-    found = {}
-    for dtype, only in ((torch.float64, None), (torch.float32, "iqp")):
-        for name, circuit in circuits().items():
-            if only in (None, name):
-                found[f"{name}, {dtype}"] = differences(circuit, dtype)
+    found = {f"{name}, {kind}": differences(circuits()[name], kind) for name, kind in sorted(chosen, key=str)}
     print(json.dumps({"launched": sorted(set(launched)), "differences": found}))
 
 
 @pytest.mark.parametrize(
-    ("shared", "kernels"),
-    [(48 << 10, ["backward shared", "collect", "forward shared"]), (0, ["backward", "collect", "forward"])],
-    ids=["states in shared memory", "states in the memory of all"],
+    ("states", "kernels"),
+    [
+        (2, ["backward shared", "collect", "forward shared"]),
+        (1, ["backward half", "collect", "forward shared"]),
+        (0, ["backward", "collect", "forward"]),
+    ],
+    ids=["both states in shared memory", "one of them", "none"],
 )
-def test_simulated_kernels_equal_the_cpus(shared: int, kernels: list[str]) -> None:
+def test_simulated_kernels_equal_the_cpus(states: int, kernels: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.circuits.test_gpu", str(shared)],
+        [sys.executable, "-m", "tests.circuits.test_gpu", str(states)],
         cwd=Path(__file__).parents[2],
         env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
         capture_output=True,
@@ -127,10 +142,8 @@ def test_circuits_have_every_kind_of_step() -> None:
 def test_a_missing_package_is_named_once(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from qrlsuite.plugins.circuits.native import gpu
-
-    monkeypatch.setattr(gpu.importlib.util, "find_spec", lambda name: None)
-    gpu.trouble.cache_clear()
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
+    native.trouble.cache_clear()
     try:
         for _ in range(2):
             backend = NativeBackend(ansatz("iqp", qubits=2, layers=1))
@@ -139,7 +152,7 @@ def test_a_missing_package_is_named_once(
         assert said.count("plain torch operations") == 1
         assert "pip install 'qrlsuite[cuda]'" in said
     finally:
-        gpu.trouble.cache_clear()
+        native.trouble.cache_clear()
 
 
 if __name__ == "__main__":

@@ -163,6 +163,8 @@ def test_a_picture_of_equal_numbers(small: EntryCurves, large: EntryCurves) -> N
     figure = api.plot("bars", entries=[small, large], seeds=30, **WHERE)
     shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert ["30 seeds*" in text for text in shown] == [True, True]
+    with pytest.warns(UserWarning, match="qubits=14: 30 seeds, and not all that were asked for"):
+        api.plot("bars", tasks="beam6g", seeds=iter(range(40)), **WHERE)
 
 
 def test_pictures_of_an_environment_take_its_options() -> None:
@@ -201,7 +203,7 @@ def test_a_picture_names_what_it_leaves_out(
         (lambda: api.plot("curve", tasks="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
         (lambda: api.plot("curves", **WHERE), OptionError, "holds several tasks"),
         (
-            lambda: api.plot("bars", tasks="beam6g", seeds=101, **WHERE),
+            lambda: api.plot("bars", entries=["mlp width=64"], tasks="beam6g", seeds=101, **WHERE),
             OptionError,
             "has no complete run of seed 100",
         ),

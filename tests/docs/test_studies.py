@@ -105,6 +105,9 @@ def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
                 for label in (first, second)
             )
             held = f".05 for {board.n_pairs} pair" + "s" * (board.n_pairs > 1)
+            labels = [each.entry.label for each in board.rows]
+            if board.board.few[board.order[labels.index(first)], board.order[labels.index(second)]]:
+                held = f"about {held}: unequal numbers"
             pairs.add(f"{first} / {second}")
             written.append(row[2:])
             computed.append([verdict(board, first, second, cells), seeds, evidence, held])

@@ -298,6 +298,24 @@ def test_another_device_is_another_machine(folder: Path) -> None:
     assert "trained on the CPU here, on cuda (NVIDIA H100) there" in verdict.message
 
 
+def test_epochs_of_a_gpu_before_those_of_the_cpu_are_not_forgotten(folder: Path, tmp_path: Path) -> None:
+    runs = next(tmp_path.glob("runs/*/*"))
+    for path in runs.glob("seed-*/run.json"):
+        record = json.loads(path.read_text())
+        (last,) = record["provenance"]
+        record["provenance"] = [{**last, "device": {"kind": "cuda", "name": "NVIDIA H100"}}, last, last]
+        path.write_text(json.dumps(record))
+    entry = collect.read_entry(EntryStore(runs))
+    assert entry is not None
+    again = export(entry, tmp_path / "again")
+    (found,), _ = collect.collect(tmp_path / "again")
+    assert found.devices == ("cpu", "cuda")
+    rewrite(again / "curves.parquet", lambda c: c.update(score=[s - 1e-6 for s in c["score"]]))
+    verdict = verify.verify(again, rerun=1)
+    assert (verdict.ok, verdict.check) == (True, "plausible"), verdict.message
+    assert "trained on the CPU here, on cuda (NVIDIA H100) there" in verdict.message
+
+
 def test_verification_is_no_run_that_trackers_hear_of(folder: Path) -> None:
     heard: list[str] = []
 

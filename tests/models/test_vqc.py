@@ -245,12 +245,12 @@ def test_a_target_network_draws_its_own_samples():
 
 
 @pytest.mark.parametrize("shots", [None, 10])
-def test_preparing_compiles_and_leaves_no_trace(shots):
+def test_compiling_ahead_leaves_no_trace(shots):
     """Else the first epoch would hold the compiler's time, and every estimate that rests on it."""
     given = small("native", shots=shots)
     model = vqc.population(agents(2, given), given)
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    model.prepare()
+    model.compile_circuits()
     assert set(model.executions.as_dict().values()) == {0}
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
     assert all(parameter.grad is None for parameter in model.parameters())
@@ -261,7 +261,7 @@ def test_preparing_compiles_and_leaves_no_trace(shots):
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "native"])
 def test_other_backends_have_nothing_to_compile(backend):
     given = small(backend)
-    vqc.population(agents(1, given), given).prepare()
+    vqc.population(agents(1, given), given).compile_circuits()
 
 
 def test_exact_models_do_not_count_passes():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
+import sys
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -104,9 +106,11 @@ class NativeBackend:
             raise OptionError(NOT_FINITE)
         return result
 
-    def prepare(self, like: Tensor) -> None:
+    def compile_for(self, like: Tensor) -> None:
         """Compile the kernels, or load them, by a pass there and back of one sample of that dtype and device."""
-        inputs = torch.zeros((1, 1, self.circuit.inputs), dtype=like.dtype, device=like.device)
+        inputs = torch.zeros(
+            (1, 1, self.circuit.inputs), dtype=like.dtype, device=like.device, requires_grad=True
+        )
         parameters = {
             name: torch.zeros((1, *shape), dtype=like.dtype, device=like.device, requires_grad=True)
             for name, shape in self.shapes.items()
@@ -139,9 +143,11 @@ class NativeBackend:
     @cached_property
     def gpu_simulator(self) -> gpu.Simulator | None:
         """The simulator on NVIDIA GPUs, made when first needed; None of a mean-field circuit, or where it fails."""
+        if self.circuit.mean_field or trouble() is not None:
+            return None
         from qrlsuite.plugins.circuits.native import gpu
 
-        return None if self.circuit.mean_field or gpu.trouble() else gpu.Simulator(self.program)
+        return gpu.Simulator(self.program)
 
     def simulator(self) -> Simulator:
         """Return the CPU simulator, made when first needed."""
@@ -174,6 +180,28 @@ class NativeBackend:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NativeBackend:
         return self
+
+
+@cache
+def trouble() -> str | None:
+    """Return why kernels do not run on a GPU here, None where they do; said once, for torch operations are slower."""
+    if importlib.util.find_spec("numba_cuda") is None:
+        problem = "pip install 'qrlsuite[cuda]'"
+    else:
+        try:
+            from qrlsuite.plugins.circuits.native import gpu
+
+            if gpu.computes_right():
+                return None
+            problem = "numba-cuda computes wrong numbers here"
+        except Exception as error:  # whatever a driver, a toolkit, or another version of numpy makes of it
+            problem = f"numba-cuda fails here with {type(error).__name__}: {error}"
+    print(
+        f"qrlsuite: circuits run on this GPU by plain torch operations, many times slower than by kernels: {problem}",
+        file=sys.stderr,
+        flush=True,
+    )
+    return problem
 
 
 def _check(options: NativeOptions, circuit: Circuit) -> None:

@@ -10,9 +10,8 @@ Gradients are adjoint, as on the CPU (see `sweeps`). `backward` collects the slo
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
-import sys
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,7 @@ import torch
 from numba import cuda as _cuda
 from torch import Tensor
 
+from qrlsuite.circuit import Circuit
 from qrlsuite.plugins.circuits.native.program import (
     AXIS_X,
     AXIS_Y,
@@ -33,6 +33,7 @@ from qrlsuite.plugins.circuits.native.program import (
     PHASE,
     ROTATE,
     Program,
+    compile_circuit,
 )
 
 if TYPE_CHECKING:
@@ -641,12 +642,7 @@ def _kernels(kind: Any) -> dict[str, Any]:
                 total += slope * flat[seed, angles[index, 1]] if angles[index, 1] >= 0 else slope
             grad_inputs[seed, b, feature] = total
 
-    @cuda.jit
-    def probe(there: Any) -> None:
-        there[0] = one
-
     return {
-        "probe": probe,
         "forward shared": forward(True),
         "forward": forward(False),
         "backward shared": backward(True, True),
@@ -765,26 +761,15 @@ def _view(tensor: Tensor) -> Any:
     return cuda.as_cuda_array(tensor, sync=False) if tensor.is_cuda else tensor.numpy()
 
 
-@cache
-def trouble() -> str | None:
-    """Return why kernels do not run on a GPU here, None where they do; said once, for torch operations are slower."""
-    if importlib.util.find_spec("numba_cuda") is None:
-        problem = "pip install 'qrlsuite[cuda]'"
-    else:
-        try:
-            there = torch.zeros(1, device="cuda")
-            _kernels(np.float32)["probe"][1, 1](_view(there))
-            if float(there) == 1.0:
-                return None
-            problem = "numba-cuda computes wrong numbers here"
-        except Exception as error:  # whatever a driver, a toolkit, or another version of numpy makes of it
-            problem = f"numba-cuda fails here with {type(error).__name__}: {error}"
-    print(
-        f"qrlsuite: circuits run on this GPU by plain torch operations, many times slower than by kernels: {problem}",
-        file=sys.stderr,
-        flush=True,
-    )
-    return problem
+def computes_right() -> bool:
+    """Compute <Z> = cos(x + w) and its slopes on torch's current GPU; return whether they are right."""
+    circuit = Circuit(1)
+    circuit.append("RX", 0, circuit.input(0) + circuit.parameter("w", (1,))[0])
+    x, w = (torch.full(shape, 0.25, device="cuda", requires_grad=True) for shape in ((1, 1, 1), (1, 1)))
+    value = Simulator(compile_circuit(circuit))(x, w)
+    slopes = torch.autograd.grad(value.sum(), [x, w])
+    found = [float(number) for number in (value, *slopes)]
+    return np.allclose(found, [math.cos(0.5), -math.sin(0.5), -math.sin(0.5)], atol=1e-6)
 
 
 @cache
