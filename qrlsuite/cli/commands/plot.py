@@ -103,8 +103,8 @@ def plot(
     path = output or (runs / name if drawn.entries else Path(name))
     write_atomically(path, pictures.encode(drawn.figure, format_))
     if json_output:
-        seeds = {e.name: len(e.seeds) for e in drawn.entries}
-        typer.echo(json.dumps({"picture": str(path), "kind": kind, "seeds": seeds}))
+        counts = {e.name: len(e.seeds) for e in drawn.entries}
+        typer.echo(json.dumps({"picture": str(path), "kind": kind, "seeds": counts}))
     else:
         typer.echo(f"wrote {path}")
 
