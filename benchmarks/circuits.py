@@ -2,12 +2,16 @@
 
     python benchmarks/circuits.py --qubits 4 6 8 10 --plot circuits.png
     python benchmarks/circuits.py --bound
+    python benchmarks/circuits.py --device cuda
 
 With `--bound`: the native simulator alone, every built-in ansatz, 10 seeds together, as a share of the processor's
 bound: of what a loop of fused multiply-adds on the same vectors reaches, measured in turn with it. Work is counted
 as in a plain list of gates: 28 operations per amplitude pair that a block of rotations touches (80 backward), 2 per
 amplitude and Hadamard (4 backward), nothing for CNOT and CZ. Shares are medians: of the kernels forward, backward and
 both, and of the whole call from torch.
+
+With `--device cuda`: the native simulator on a GPU, 100 seeds together (50 of 12 qubits, 30 of 14), by the clock,
+against one core of the machine that the GPU is in.
 
 Work: the paper's hybrid circuit (`iqp`, `rot`, 4 layers), gradients by inputs, scalings and weights. Peers are
 PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), lightning.qubit with
@@ -39,17 +43,26 @@ Call = Callable[[], object]
 
 
 def torch_call(
-    circuit: Circuit, backend: str, dtype: torch.dtype, batch: int = BATCH, **options: object
+    circuit: Circuit,
+    backend: str,
+    dtype: torch.dtype,
+    batch: int = BATCH,
+    seeds: int = 1,
+    device: str = "cpu",
+    **options: object,
 ) -> Call:
     """Return one forward and backward pass through a registered backend."""
     run = create_backend(backend, circuit, **options)
     source = torch.Generator().manual_seed(0)
-    x = torch.rand(1, batch, circuit.inputs, dtype=dtype, generator=source).requires_grad_()
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.rand(seeds, *shape, dtype=dtype, generator=source)
+
+    x = drawn(batch, circuit.inputs).to(device).requires_grad_()
     parameters = {
-        name: (6.28 * torch.rand(1, *p.shape, dtype=dtype, generator=source)).requires_grad_()
-        for name, p in circuit.parameters.items()
+        name: (6.28 * drawn(*p.shape)).to(device).requires_grad_() for name, p in circuit.parameters.items()
     }
-    cotangent = torch.rand(1, batch, len(circuit.observables), dtype=dtype, generator=source)
+    cotangent = drawn(batch, len(circuit.observables)).to(device)
     return lambda: run(x, parameters).backward(cotangent)
 
 
@@ -219,6 +232,26 @@ def print_shares(qubits: list[int], layers: int, seconds: float) -> None:
             print(f"{f'{name} {gate}':>10}{n:>8}{cells}", flush=True)
 
 
+def print_gpu(qubits: list[int], layers: int, seconds: float, device: str) -> None:
+    """Print milliseconds of a population on a GPU, by the clock, and of the same work on one core."""
+    print(f"{'qubits':>6} {'seeds':>5} {device:>10} {'one core':>10} {'ratio':>6}")
+    for n in qubits:
+        circuit = ansatz("iqp", qubits=n, layers=layers)
+        seeds = 100 if n <= 10 else 50 if n <= 12 else 30
+        call = torch_call(circuit, "native", torch.float32, seeds=seeds, device=device)
+        times: list[float] = []
+        call()  # compiles
+        while sum(times) < seconds or len(times) < 3:
+            began = time.perf_counter()
+            call()
+            if device != "cpu":
+                torch.cuda.synchronize(device)
+            times.append(time.perf_counter() - began)
+        there = 1e3 * statistics.median(times)
+        here = seeds * median_ms(torch_call(circuit, "native", torch.float32), seconds)
+        print(f"{n:>6} {seeds:>5} {there:>10.3g} {here:>10.3g} {here / there:>6.3g}", flush=True)
+
+
 def main() -> None:
     """Measure, print the table, and draw it where asked."""
     parser = argparse.ArgumentParser(
@@ -232,8 +265,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="native and PennyLane only")
     parser.add_argument("--plot", help="draw milliseconds against qubits to this file")
     parser.add_argument("--bound", action="store_true", help="shares of the processor's bound, native alone")
+    parser.add_argument("--device", help="cuda: the native simulator there, against one core")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.device:
+        print_gpu(arguments.qubits, arguments.layers, arguments.seconds, arguments.device)
+        return
     if arguments.bound:
         print_shares(arguments.qubits, arguments.layers, arguments.seconds)
         return
