@@ -141,7 +141,8 @@ def collected(
 def export(study: DecisionStudy, out: Path) -> Path:
     """Write a plan and its finished seeds to `out/<name>`; returns that folder.
 
-    Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less.
+    Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less, and the plan's own file
+    stays as it is: it may have been published before its first seed.
 
     Raises
     ------
@@ -152,11 +153,12 @@ def export(study: DecisionStudy, out: Path) -> Path:
     if not study.begun:
         raise OptionError(f"{study.source}: the plan has not begun, so there is nothing to export")
     folder = out / study.file.name
-    if is_published(folder) and (there := decisions.load(folder / PLAN).hash) != study.file.hash:
+    if not is_published(folder):
+        write_atomically(folder / PLAN, decisions.dumps(study.file).encode())
+    elif (there := decisions.load(folder / PLAN).hash) != study.file.hash:
         raise OptionError(
             f"{folder} holds another plan ({there}, this one is {study.file.hash}): choose another --out"
         )
-    write_atomically(folder / PLAN, decisions.dumps(study.file).encode())
     for name, entry in study.entries.items():
         held = collect.read_entry(EntryStore.find(study.folder, entry)) if study.seeds(name) else None
         finished = None if held is None else held.reaching(study.file.epochs)

@@ -630,6 +630,13 @@ def test_a_published_plan_is_decided_by_its_curves_and_goes_on_elsewhere(exporte
     assert "2 of 2 entries ok" in verified.output, verified.output
 
 
+def test_a_plan_published_before_its_first_seed_keeps_its_file(exported: Path) -> None:
+    plan = exported / "plan.toml"
+    plan.write_text(f"# committed before the first seed\n{plan.read_text()}")
+    say("export", "p.toml", "--out", "plans")
+    assert plan.read_text().startswith("# committed before the first seed\n")
+
+
 def test_a_damaged_published_plan_is_refused(exported: Path, refused: Refused) -> None:
     text = (exported / "plan.toml").read_text()
     (exported / "plan.toml").write_text(text.replace("alpha = 0.05", "alpha = 0.5"))
