@@ -141,8 +141,8 @@ def collected(
 def export(study: DecisionStudy, out: Path) -> Path:
     """Write a plan and its finished seeds to `out/<name>`; returns that folder.
 
-    Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less, and the plan's own file
-    stays as it is: it may have been published before its first seed.
+    Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less, and the plan's own
+    file stays as it is: it may have been published before its first seed.
 
     Raises
     ------
