@@ -12,6 +12,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
 
 def main(modules: list[str]) -> None:
@@ -47,9 +48,12 @@ def gpu() -> str:
     text = f"{', '.join(names) or 'none'}, {built}, {driver} NVIDIA driver"
     if not names:
         return text
-    from qrlsuite.plugins.circuits.native.backend import trouble
+    from qrlsuite.circuit import Circuit, create_backend
 
-    problem = trouble()
+    circuit = Circuit(1)
+    circuit.append("RX", 0, circuit.input(0))
+    native: Any = create_backend("native", circuit)
+    problem = native.gpu_trouble()
     return f"{text}, circuits " + (f"slow there: {problem}" if problem else "by kernels")
 
 

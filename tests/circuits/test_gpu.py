@@ -60,7 +60,7 @@ def differences(circuit: Circuit, dtype: torch.dtype) -> dict[str, float]:
     flat = 6 * torch.rand(2, circuit.parameter_count, generator=source, dtype=dtype)
     cotangent = torch.rand(2, 2, len(circuit.measured), generator=source, dtype=dtype)
     results = []
-    for run in (backend.simulator(), gpu.Simulator(backend.program)):
+    for run in (backend.simulator(), gpu.GPUSimulator(backend.program)):
         x, p = inputs.clone().requires_grad_(), flat.clone().requires_grad_()
         values = run(x, p)
         values.backward(cotangent)
@@ -85,7 +85,7 @@ def main(states: int) -> None:
     if states == 1:
         chosen = {("iqp", torch.float64)}
         program = NativeBackend(circuits()["iqp"]).program
-        room[1] = gpu.Simulator(program).bytes_of(torch.zeros(0, dtype=torch.float64), 1, backward=True)
+        room[1] = gpu.GPUSimulator(program).bytes_of(torch.zeros(0, dtype=torch.float64), 1, backward=True)
     gpu._shared_limit = lambda device: room[states]  # type: ignore[assignment]
     gpu.BLOCKS = 3  # of 4 lanes, so that one takes a second where blocks share the memory of all
     launched = []

@@ -367,7 +367,9 @@ def test_elsewhere_the_beginning_must_agree_and_the_end_be_plausible(
     assert entry is not None
     folder = export(entry, tmp_path / "entries")
     edit(folder, elsewhere)
-    verdict = verify.verify(folder, rerun=3)
+    verdict = verify.verify(
+        folder, rerun=3, generator=np.random.default_rng(0)
+    )  # the worst three of 14 are implausible
     assert verdict.ok, verdict.message
     assert verdict.check == "plausible"
     assert "another processor there" in verdict.message

@@ -141,13 +141,17 @@ class NativeBackend:
         return compile_circuit(self.circuit)
 
     @cached_property
-    def gpu_simulator(self) -> gpu.Simulator | None:
+    def gpu_simulator(self) -> gpu.GPUSimulator | None:
         """The simulator on NVIDIA GPUs, made when first needed; None of a mean-field circuit, or where it fails."""
         if self.circuit.mean_field or trouble() is not None:
             return None
         from qrlsuite.plugins.circuits.native import gpu
 
-        return gpu.Simulator(self.program)
+        return gpu.GPUSimulator(self.program)
+
+    def gpu_trouble(self) -> str | None:
+        """Return why circuits do not run by kernels on a GPU here, None where they do."""
+        return trouble()
 
     def simulator(self) -> Simulator:
         """Return the CPU simulator, made when first needed."""

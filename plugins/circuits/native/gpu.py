@@ -652,7 +652,7 @@ def _kernels(kind: Any) -> dict[str, Any]:
     }
 
 
-class Simulator:
+class GPUSimulator:
     """Runs one circuit's program on a GPU; not to be shared between threads.
 
     Parameters
@@ -671,7 +671,7 @@ class Simulator:
 
     def __call__(self, inputs: Tensor, flat: Tensor) -> Tensor:
         """Return expectation values (S, B, O) of inputs (S, B, I) and flat parameters (S, P), differentiably."""
-        result: Tensor = _Expectations.apply(inputs, flat, self)  # type: ignore[no-untyped-call]
+        result: Tensor = _GPUExpectations.apply(inputs, flat, self)  # type: ignore[no-untyped-call]
         return result
 
     def takes(self, like: Tensor) -> bool:
@@ -766,7 +766,7 @@ def computes_right() -> bool:
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0) + circuit.parameter("w", (1,))[0])
     x, w = (torch.full(shape, 0.25, device="cuda", requires_grad=True) for shape in ((1, 1, 1), (1, 1)))
-    value = Simulator(compile_circuit(circuit))(x, w)
+    value = GPUSimulator(compile_circuit(circuit))(x, w)
     slopes = torch.autograd.grad(value.sum(), [x, w])
     found = [float(number) for number in (value, *slopes)]
     return np.allclose(found, [math.cos(0.5), -math.sin(0.5), -math.sin(0.5)], atol=1e-6)
@@ -813,11 +813,11 @@ def _allow(kernel: Any, shared: int, like: Tensor, arguments: Any) -> None:
     _ALLOWED[kernel, device] = shared
 
 
-class _Expectations(torch.autograd.Function):
+class _GPUExpectations(torch.autograd.Function):
     """Expectation values with adjoint gradients."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, flat: Tensor, simulator: Simulator) -> Tensor:
+    def forward(ctx: Any, inputs: Tensor, flat: Tensor, simulator: GPUSimulator) -> Tensor:
         x, p = inputs.detach().contiguous(), flat.detach().contiguous()
         lanes = x.shape[0] * x.shape[1]
         keep = any(ctx.needs_input_grad[:2])
@@ -850,7 +850,7 @@ class _Expectations(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, Tensor, None]:
         x, p, finals = ctx.saved_tensors
-        simulator: Simulator = ctx.simulator
+        simulator: GPUSimulator = ctx.simulator
         lanes = x.shape[0] * x.shape[1]
         tables, gather = simulator.tables(x)
         limit = _shared_limit(x.device.index or 0)
