@@ -77,6 +77,12 @@ def compose(
         If a plugin's picture returns no figure.
     """
     spec = find(kind, tasks)
+    selection = {"--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1, "--seeds": seeds}
+    if spec is None:
+        selection["--task"] = tasks
+    if (spec is not None or pictures.KINDS[kind].data is None) and any(selection.values()):
+        name = next(name for name, value in selection.items() if value)
+        raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
     if spec is not None:
         return Composed(_of_environment(kind, spec, tasks, settings, environment), tasks=tuple(tasks))
     if environment:
@@ -88,17 +94,7 @@ def compose(
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
     if data == "deployed":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite study run deploy")
-    selection = {
-        "--task": tasks,
-        "--entry": entries,
-        "--horizon": horizon,
-        "--min-seeds": min_seeds > 1,
-        "--seeds": seeds,
-    }
     if data is None:
-        if any(selection.values()):
-            name = next(name for name, value in selection.items() if value)
-            raise OptionError(f"picture '{kind}' shows no results: leave {name} out")
         return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}

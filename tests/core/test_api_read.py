@@ -203,6 +203,11 @@ def test_a_picture_names_what_it_leaves_out(
         (lambda: api.plot("curve", tasks="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
         (lambda: api.plot("curves", **WHERE), OptionError, "holds several tasks"),
         (
+            lambda: api.plot("field", tasks="beam6g", seeds=3),
+            OptionError,
+            "picture 'field' shows no results: leave --seeds out",
+        ),
+        (
             lambda: api.plot("bars", entries=["mlp width=64"], tasks="beam6g", seeds=101, **WHERE),
             OptionError,
             "has no complete run of seed 100",
