@@ -8,13 +8,14 @@ import pytest
 import torch
 from scipy import stats
 
-from qrlsuite.circuit import Circuit, ansatz, create_backend
+from qrlsuite.circuit import Angle, Circuit, ansatz, create_backend
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.circuits.native import draws
+from qrlsuite.plugins.circuits.native.noise import PauliNoise
 from tests.circuits.test_backends import assert_close, draw, evaluate
 
 NOISE = {"noise_model": "depolarizing", "noise_rate": 0.1, "readout_error": 0.03}
@@ -30,14 +31,38 @@ def test_counts_of_one_qubit_follow_the_binomial_law():
     assert stats.chisquare(counts, expected).pvalue > 0.001
 
 
+def counted(shots, probabilities, seed=5, **options):
+    """Return counts (R, K) of states with probabilities (R, K), each measured in shots (R,)."""
+    rows = len(probabilities)
+    records = np.zeros((rows, 2 * probabilities.shape[1], 1))
+    records[:, ::2, 0] = np.sqrt(probabilities)
+    counts = np.zeros(probabilities.shape, np.int64)
+    settings = {"flipped": np.zeros(rows, np.int64), "wrong": 0.0, **options}
+    source = np.random.default_rng(seed)
+    draws.measure(records, 0, *settings.values(), np.array(shots), np.arange(rows), source, counts)
+    return counts
+
+
 @pytest.mark.parametrize(
     ("shots", "p"),
-    [(1, 0.3), (19, 0.5), (50, 0.21), (1000, 0.93), (1000, 0.009), (10_000, 0.3), (10_000_000, 1e-6)],
+    [
+        (1, 0.3),
+        (3, 0.4),
+        (4, 0.3),
+        (19, 0.5),
+        (50, 0.21),
+        (1000, 0.93),
+        (1000, 0.009),
+        (10_000, 0.3),
+        (10_000_000, 1e-6),
+    ],
 )
 def test_counts_follow_the_binomial_law_whichever_way_they_are_drawn(shots, p):
-    rows, first = 40_000, np.array([[1 - p - 0.001, p, 0.001]])  # the second outcome: after another was drawn
-    counts = np.empty((rows, 3), np.int64)
-    draws.multinomial(np.full(rows, shots), np.repeat(first, rows, axis=0), np.random.default_rng(5), counts)
+    rows, first = (
+        40_000,
+        np.array([[1 - p - 0.001, p, 0.001, 0]]),
+    )  # the second outcome: after another was drawn
+    counts = counted(np.full(rows, shots), np.repeat(first, rows, axis=0))
     assert counts.min() >= 0
     assert set(counts.sum(axis=1)) == {shots}
     law = stats.binom(shots, p)
@@ -49,13 +74,21 @@ def test_counts_follow_the_binomial_law_whichever_way_they_are_drawn(shots, p):
 
 
 def test_counts_of_outcomes_that_are_certain_or_impossible():
-    probabilities = np.array([[0.0, 1.0, 0.0], [2.0, 0.0, 2.0], [0.0, 0.0, 0.5]])  # sums need not be 1
-    counts = np.empty((3, 3), np.int64)
-    draws.multinomial(np.array([7, 1000, 0]), probabilities, np.random.default_rng(1), counts)
-    assert counts[0].tolist() == [0, 7, 0]
-    assert counts[1, 1] == 0
+    probabilities = np.array([[0, 1, 0, 0], [2, 0, 2, 0], [0, 0, 0.5, 0], [0, 0, 3, 0]])  # sums need not be 1
+    counts = counted([7, 1000, 0, 3], probabilities)
+    assert counts[0].tolist() == [0, 7, 0, 0]
+    assert counts[1, [1, 3]].tolist() == [0, 0]
     assert 400 < counts[1, 0] < 600
-    assert counts[2].tolist() == [0, 0, 0]
+    assert counts[2].tolist() == [0, 0, 0, 0]
+    assert counts[3].tolist() == [0, 0, 3, 0]
+
+
+@pytest.mark.parametrize("shots", [2, 5])  # one by one, and outcome by outcome
+def test_bits_are_flipped_and_then_read_wrongly(shots):
+    probabilities = np.tile([0.0, 1.0, 0.0, 0.0], (20_000, 1))  # the bits 01, which are flipped to 10
+    counts = counted(np.full(20_000, shots), probabilities, flipped=np.full(20_000, 3), wrong=0.1)
+    expected = 20_000 * shots * np.array([0.09, 0.01, 0.81, 0.09])
+    assert stats.chisquare(counts.sum(0), expected).pvalue > 0.001
 
 
 @pytest.mark.parametrize(
@@ -122,6 +155,63 @@ def test_gradients_under_noise_agree_with_density_matrices(options):
     expected = evaluate(create_backend("qiskit", circuit, estimator="aer", **NOISE), *given)
     backend = create_backend("native", circuit, trajectories=2000, **NOISE, **options)
     assert_close(evaluate(backend, *given, seeds=[2]), expected, 0.1)
+
+
+def every_gate():
+    """A circuit on 3 qubits with every gate, each between rotations that tell its errors apart."""
+    circuit = Circuit(3, inputs=1)
+    angle = 0.3
+
+    def turn():
+        nonlocal angle
+        for q in range(3):
+            circuit.append("RX", q, Angle(constant=(angle := angle + 0.4)))
+            circuit.append("RY", q, Angle(constant=(angle := angle + 0.4)))
+
+    turn()
+    for gate in ("H", "X", "Y", "Z", "S", "T"):
+        circuit.append(gate, 1)
+        turn()
+    for gate in ("CNOT", "CZ", "SWAP"):
+        circuit.append(gate, (2, 0))
+        turn()
+    for gate in ("RX", "RY", "RZ"):
+        circuit.append(gate, 0, circuit.input(0), control=1)
+    circuit.append("U3", 2, circuit.input(0), Angle(constant=0.2), Angle(constant=1.2), control=0)
+    circuit.append("RYY", (1, 2), circuit.input(0))
+    circuit.measure([0, 1, 2, (0, 1), (0, 1, 2)])
+    return circuit
+
+
+def test_errors_at_the_end_are_what_they_are_where_they_happen():
+    circuit = every_gate()
+    elementary = Elementary(circuit, AngleTable(circuit))
+    noise = PauliNoise(elementary, 3, 0.1)
+    drawn = noise.draw(200, np.random.default_rng(3))
+    errors = noise.carry(drawn)
+    assert 100 < len(errors.hit) < 200
+    rotations = np.linspace(-2, 2, elementary.rotations)
+    angles = np.append(rotations, noise.constants)
+
+    def values(run, angles):
+        return create_backend("native", run)(torch.from_numpy(angles)[None, None], {})[0, 0].numpy()
+
+    inserted = [
+        Circuit(3, inputs=elementary.rotations) for _ in range(200)
+    ]  # each error as gates where it happens
+    for (name, wires, rotation), (places, codes) in zip(elementary.gates, drawn):
+        for run in inserted:
+            run.append(name, wires, *([] if rotation is None else [run.input(rotation)]))
+        for place, code in zip(places, codes):
+            for number, wire in enumerate(wires):
+                for gate, bit in (("X", 2 * number), ("Z", 2 * number + 1)):
+                    if code >> bit & 1:
+                        inserted[place].append(gate, wire)
+    for place, negated, flipped in zip(errors.hit, errors.negated.T, errors.flipped.T):
+        inserted[place].measure(circuit.observables)
+        signs = [(-1.0) ** flipped[list(qubits)].sum() for qubits in circuit.measured]
+        found = signs * values(noise.circuit(circuit.observables), angles * (1.0 - 2.0 * negated))
+        assert np.allclose(found, values(inserted[place], rotations), atol=1e-12)
 
 
 def test_noise_of_rate_zero_is_none():

@@ -1,4 +1,4 @@
-"""Outcomes of final states: their probabilities, and counts drawn from the multinomial law.
+"""Measured outcomes of final states: counts drawn from the multinomial law.
 
 NumPy's own `multinomial` sets its rejection sampler up anew for each binomial draw, which takes longer than all else
 that a shifted circuit of few qubits needs. The method here has a cheap setup.
@@ -94,33 +94,79 @@ def _binomial(n: int, p: float, source: Any) -> int:
     return k if p <= 0.5 else n - k
 
 
-@kernel
-def probabilities(records: Any, first: int, out: Any) -> None:
-    """Write the squares of a component's amplitudes, out (L, 2^n), from chunks of states (C, rows, V).
+@inlined
+def _place(sums: Any, value: float) -> int:
+    """Return the first place whose sum is above the value; of the last sum itself, the first place that reaches it."""
+    first, last = 0, len(sums) - 1
+    while first < last:
+        middle = (first + last) // 2
+        if sums[middle] > value or sums[middle] == sums[-1]:
+            last = middle
+        else:
+            first = middle + 1
+    return first
 
-    `first` is the component's first amplitude.
+
+@inlined
+def _multinomial(shots: int, probabilities: Any, sums: Any, source: Any, counts: Any) -> None:
+    """Add counts (K,) of K outcomes in so many shots, from probabilities (K,), which are divided by their sum.
+
+    Fewer shots than outcomes are drawn one by one; `sums` (K,) is written for it.
     """
-    lanes = records.shape[2]
-    for row in range(out.shape[0]):
-        chunk, v = row // lanes, row % lanes
-        for i in range(out.shape[1]):
+    outcomes, left, total = len(probabilities), shots, 0.0
+    for k in range(outcomes):
+        total += probabilities[k]
+        sums[k] = total
+    if shots < outcomes and total > 0.0:
+        for _ in range(shots):
+            counts[_place(sums, total * source.random())] += 1
+        return
+    for k in range(outcomes - 1):
+        p = probabilities[k]
+        drawn = _binomial(left, min(1.0, p / total), source) if left and total > 0.0 else 0
+        counts[k] += drawn
+        left -= drawn
+        total -= p
+    counts[outcomes - 1] += left
+
+
+@kernel
+def measure(
+    records: Any, first: int, flipped: Any, wrong: float, shots: Any, lanes: Any, source: Any, counts: Any
+) -> None:
+    """Measure a component's final states, and add up how often each outcome is read.
+
+    Parameters
+    ----------
+    records:
+        (C, rows, V): chunks of the states of R runs; `first` is the component's first amplitude in each.
+    flipped:
+        (R,): a run's outcome is read as outcome ^ flipped.
+    wrong:
+        The probability that a bit is then read wrongly.
+    shots, lanes:
+        (R,): how often each run is measured, and which row of `counts` that counts for.
+    source:
+        A NumPy generator.
+    counts:
+        (L, 2^n), to which is added.
+    """
+    outcomes, width = counts.shape[1], records.shape[2]
+    read, sums = np.empty(outcomes), np.empty(outcomes)
+    for run in range(len(shots)):
+        if shots[run] == 0:
+            continue
+        chunk, v = run // width, run % width
+        for i in range(outcomes):
             re, im = records[chunk, 2 * (first + i), v], records[chunk, 2 * (first + i) + 1, v]
-            out[row, i] = np.float64(re) * re + np.float64(im) * im
-
-
-@kernel
-def multinomial(shots: Any, probabilities: Any, source: Any, counts: Any) -> None:
-    """Draw counts (R, K) of K outcomes in shots (R,), from probabilities (R, K) and a NumPy generator.
-
-    A row's probabilities are divided by their sum.
-    """
-    for row in range(probabilities.shape[0]):
-        left, total = shots[row], 0.0
-        for k in range(probabilities.shape[1]):
-            total += probabilities[row, k]
-        for k in range(probabilities.shape[1] - 1):
-            p = probabilities[row, k]
-            counts[row, k] = _binomial(left, min(1.0, p / total), source) if left and total > 0.0 else 0
-            left -= counts[row, k]
-            total -= p
-        counts[row, -1] = left
+            read[i ^ flipped[run]] = np.float64(re) * re + np.float64(im) * im
+        if wrong > 0.0:
+            bit = 1
+            while bit < outcomes:
+                for i in range(outcomes):
+                    if i & bit == 0:
+                        zero, one = read[i], read[i | bit]
+                        read[i] = (1.0 - wrong) * zero + wrong * one
+                        read[i | bit] = (1.0 - wrong) * one + wrong * zero
+                bit *= 2
+        _multinomial(shots[run], read, sums, source, counts[lanes[run]])
