@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -81,11 +81,13 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
             axes.plot([max(low, per_step), high], [heights[k]] * 2, color=look.color, lw=1.6)
             axes.plot(max(point, per_step), heights[k], look.marker, color=look.color, ms=7, mec="white")
             if found.unsettled[0, 0]:
-                axes.text(high * 1.08, heights[k], "≥", va="center", fontsize=9)
+                right = {"xytext": (6, 0), "textcoords": "offset points"}
+                axes.annotate("≥", (high, heights[k]), **right, va="center", fontsize=9)
         axes.set_xscale("log")
-        axes.margins(x=0.15)
+        axes.margins(x=0.2)
         axes.set_xlabel(f"Ŝ ({AXES[unit]})")
         axes.xaxis.set_major_formatter(steps_text)
+        axes.xaxis.set_minor_formatter(_between_decades(*axes.get_xlim()))
         style.tidy(axes)
     panels[0].set_yticks(
         heights, [f"{name}: {style.seeds_text(e)}" for name, e in zip(style.labels(entries), entries)]
@@ -104,3 +106,15 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         style.note(entries),
     )
     return figure
+
+
+def _between_decades(low: float, high: float) -> Callable[[float, object], str]:
+    """Return what labels ticks between powers of ten: all on a short axis, 2 and 5 on a longer one, else none."""
+    decades = math.log10(high / low)
+    labeled = range(2, 10) if decades < 0.4 else (2, 5) if decades < 1.2 else ()
+
+    def text(value: float, position: object) -> str:
+        digit = round(value / 10 ** math.floor(math.log10(value) + 1e-9))
+        return steps_text(value) if digit in labeled else ""
+
+    return text
