@@ -86,6 +86,11 @@ EXPECTED = {
         for gradient in ("", " gradient=spsa")
         for n in (100, 1000, 10000)
     ],
+    "stacking": [
+        text
+        for task in ("beam6g", "beam6g+7d1167f1")
+        for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
+    ],
 }
 
 
