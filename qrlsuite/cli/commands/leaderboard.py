@@ -89,7 +89,7 @@ def leaderboard(
 ) -> None:
     """Rank the entries of each task by significant outperformance.
 
-    A tier is 1 + the length of the longest chain of entries above that outperform one another. Entries are
+    A tier is 1 + the length of the longest chain of entries above, each of which outperforms the next. Entries are
     compared at equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: the
     environment steps at which fewer than a fraction delta of the runs score 1 - epsilon or more, with its 5th to
     95th percentile. With --published, your own copy of a published entry is shown too if it has fewer epochs.
