@@ -31,6 +31,19 @@ def test_counts_of_one_qubit_follow_the_binomial_law():
     assert stats.chisquare(counts, expected).pvalue > 0.001
 
 
+@pytest.mark.parametrize("options", [{}, {"shots": 4000}])
+def test_flipped_bits_belong_to_their_qubits_in_products_too(options):
+    circuit = Circuit(3)
+    for _ in range(10):
+        circuit.append("X", 2)
+    circuit.measure([0, 1, 2, (0, 1), (1, 2), (0, 1, 2)])
+    noise = {"noise_model": "depolarizing", "noise_rate": 1.0, "trajectories": 4000}
+    backend = create_backend("native", circuit, **noise, **options)
+    values = backend(torch.zeros(1, 1, 3, dtype=torch.float64), {}, [1])[0, 0]
+    left = 0.9**10  # a one-qubit gate has a tenth of the rate
+    assert_close([values], [torch.tensor([1, 1, left, 1, left, left])], 4 / math.sqrt(4000))
+
+
 def counted(shots, probabilities, seed=5, **options):
     """Return counts (R, K) of states with probabilities (R, K), each measured in shots (R,)."""
     rows = len(probabilities)

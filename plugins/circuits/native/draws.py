@@ -96,7 +96,11 @@ def _binomial(n: int, p: float, source: Any) -> int:
 
 @inlined
 def _place(sums: Any, value: float) -> int:
-    """Return the first place whose sum is above the value; of the last sum itself, the first place that reaches it."""
+    """Return the first place whose sum is above the value.
+
+    Rounding can make the value the last sum itself. It belongs to the first place that reaches this sum: those behind
+    it have probability 0.
+    """
     first, last = 0, len(sums) - 1
     while first < last:
         middle = (first + last) // 2
@@ -132,7 +136,7 @@ def _multinomial(shots: int, probabilities: Any, sums: Any, source: Any, counts:
 
 @kernel
 def measure(
-    records: Any, first: int, flipped: Any, wrong: float, shots: Any, lanes: Any, source: Any, counts: Any
+    records: Any, first: int, flipped: Any, wrong: float, shots: Any, rows: Any, source: Any, counts: Any
 ) -> None:
     """Measure a component's final states, and add up how often each outcome is read.
 
@@ -141,10 +145,10 @@ def measure(
     records:
         (C, rows, V): chunks of the states of R runs; `first` is the component's first amplitude in each.
     flipped:
-        (R,): a run's outcome is read as outcome ^ flipped.
+        (R,): a run's outcome is read as outcome ^ flipped. The highest of the n bits is the component's first wire.
     wrong:
         The probability that a bit is then read wrongly.
-    shots, lanes:
+    shots, rows:
         (R,): how often each run is measured, and which row of `counts` that counts for.
     source:
         A NumPy generator.
@@ -169,4 +173,4 @@ def measure(
                         read[i] = (1.0 - wrong) * zero + wrong * one
                         read[i | bit] = (1.0 - wrong) * one + wrong * zero
                 bit *= 2
-        _multinomial(shots[run], read, sums, source, counts[lanes[run]])
+        _multinomial(shots[run], read, sums, source, counts[rows[run]])

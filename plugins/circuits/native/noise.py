@@ -33,10 +33,10 @@ says whether it has an X, bit 2 k + 1 whether it has a Z."""
 
 
 class Errors(NamedTuple):
-    """What errors do to the circuit in the H trajectories that have any."""
+    """What errors do to the circuit in the H trajectories on which they have an effect."""
 
     hit: NDArray[np.int64]
-    """(H,): these trajectories, in order."""
+    """(H,): these trajectories, in order. An error may also be the identity, or meet nothing that it changes."""
     negated: Bits
     """(R, H): 1 where a rotation turns the other way."""
     flipped: Bits
@@ -104,7 +104,8 @@ class PauliNoise:
             for number, wire in enumerate(wires):
                 x[wire, those] ^= (code >> 2 * number) & 1
                 z[wire, those] ^= (code >> 2 * number + 1) & 1
-        return Errors(hit, negated, x)
+        felt = negated.any(0) | x.any(0)
+        return Errors(hit[felt], negated[:, felt], x[:, felt])
 
 
 def _anticommute(rotation: str, x: Bits, z: Bits) -> Bits:

@@ -27,7 +27,7 @@ from qrlsuite.plugins.circuits.native.program import Program
 from qrlsuite.plugins.circuits.options import NativeOptions
 
 PART_BYTES = 64 << 20
-"""Memory that the states of one call of the kernels may take."""
+"""Memory that the states of one call of the kernels may take; all trajectories of an input are in one call, though."""
 
 
 class ShotSampler:
@@ -139,7 +139,7 @@ class ShotSampler:
         for (wires, first), signs in zip(self._components, self._signs):
             mask = np.zeros(runs, np.int64)
             if flipped is not None:
-                for wire in wires:  # the first is the highest bit
+                for wire in wires:
                     mask = 2 * mask + flipped[wire]
             counts = np.zeros((lanes, 1 << len(wires)), np.int64)
             draws.measure(records, first, mask, self.options.readout_error, shots, lane, source, counts)
