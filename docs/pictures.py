@@ -90,8 +90,8 @@ PICTURES: dict[str, Picture] = {
     "study-antennas.png": Unpublished(
         "study run antennas --seeds 10 --only mlp --only a2 --only a3"  # the circuit on ten of twenty placements
     ),
-    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
-    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20 --only qubits=6 --only mlp"),
+    "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
+    "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
     "study-fig1.png": Plot(
         "plot surface --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=64' "
         "--entry 'vqc-native qubits=14'",
