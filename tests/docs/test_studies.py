@@ -16,7 +16,9 @@ from qrlsuite import api, registry
 from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.published import PUBLISHED, read
-from qrlsuite.statistics import Comparison, Direction, Verdict
+from qrlsuite.leaderboard.times import percent
+from qrlsuite.statistics import Comparison, Direction, LearningCurves, Verdict, times_board
+from qrlsuite.statistics.standings import holm
 from qrlsuite.studies.decided import versus
 
 if TYPE_CHECKING:
@@ -29,7 +31,8 @@ ROWS = [
     for line in TABLE.splitlines()
     if line.startswith("| ")
 ][1:]
-PAIR = re.compile(r"(?P<task>\w+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`")
+PAIR = re.compile(r"(?P<task>[\w+-]+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`")
+ACROSS = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`: ")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
 
@@ -52,9 +55,13 @@ PAPER = {
     "ddqn vqc-native qubits=8 / ddqn vqc-native qubits=6": "fewer",
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=8": "fewer",
     "ddqn mlp width=64 / ddqn vqc-native qubits=10": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn mlp width=64": "as many",
     "ddqn mlp width=16 lr=0.002 / ddqn mlp width=16": "no fewer",
     "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
 }
+
+# What the paper expects of all models on one task, against `beam6g`.
+EXPECTED = {"beam6g-degree6": "more"}
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +123,57 @@ def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
 
 
+def across_tasks(first: str, second: str, paper: str) -> tuple[str, str, str, str]:
+    """Return verdict, seeds, evidence and error of a statement on what all models need on one task against another.
+
+    Parameters
+    ----------
+    first, second:
+        Tasks; the models are those published on the first.
+    paper:
+        What the paper expects on the first: "more" steps or "no fewer".
+    """
+    own = [read(folder).entry_curves() for folder in sorted((PUBLISHED / first).iterdir())]
+    pairs = []
+    for entry in sorted(own, key=lambda entry: sum(entry.parameters), reverse=True):
+        other = api.load(entry.label, task=second, published=True, runs="none")
+        n = len(entry.seeds)
+        assert (entry.seeds, other.seeds[:n]) == (tuple(range(n)), tuple(range(n)))
+        curves = [LearningCurves(e.curves[:n], e.steps_per_epoch, e.task) for e in (entry, other)]
+        pairs.append((entry, n, times_board(curves, ranking_of([other]).grid)))
+    adjusted = holm([board.p[0, 1] for _, _, board in pairs])
+    found = [
+        "not told apart" if p > 0.05 else "more" if board.difference[0, 1] > 0 else "fewer"
+        for p, (_, _, board) in zip(adjusted, pairs)
+    ]
+    evidence = "; ".join(
+        f"`{entry.label}` {percent(board.difference[0, 1])}, p {p:.4f}"
+        for p, (entry, _, board) in zip(adjusted, pairs)
+    )
+    if paper == "more":
+        text = f"holds for {found.count('more')} of {len(found)} models"
+        text = "holds" if set(found) == {"more"} else text
+    elif "fewer" in found:
+        text = f"does not hold for {found.count('fewer')} of {len(found)} models"
+    else:
+        text = "holds" if set(found) == {"more"} else "not told apart"
+    numbers = [str(n) for _, n, _ in pairs]
+    seeds = f"{numbers[0]} of each" if len(set(numbers)) == 1 else ", ".join(numbers)
+    return text, seeds, f"`{first}` against `{second}`: {evidence}", f".05 for {len(pairs)} models"
+
+
+def test_rows_across_tasks() -> None:
+    """Every model's mean time below threshold on one task against another, seeds 0, 1, ... of both."""
+    written, computed = [], []
+    for row in ROWS:
+        if match := ACROSS.match(row[4]):
+            written.append(tuple(row[2:]))
+            computed.append(across_tasks(match["first"], match["second"], EXPECTED[match["first"]]))
+    assert len(written) == len(EXPECTED)
+    changed = [" | ".join(now) for then, now in zip(written, computed) if then != now]
+    assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
+
+
 def test_rows_of_a_plan() -> None:
     """Evidence from a decision plan names pairs of it, each with its verdict."""
     found = plans.read(plans.PUBLISHED / "quantum-or-not")
@@ -158,6 +216,11 @@ def test_scores_at_the_end() -> None:
     )
     assert f"ends at {small:.3f} of the optimum" in TABLE
     assert f"end at {large:.3f} and {circuit:.3f} of the optimum" in TABLE
+    hard = [
+        np.median(read(folder).entry_curves().curves[:, -1])
+        for folder in (PUBLISHED / "beam6g-degree6").iterdir()
+    ]
+    assert f"all four models end at {min(hard):.3f} to {max(hard):.3f} of the optimum" in TABLE
 
 
 def test_rows_without_published_entries() -> None:
