@@ -92,6 +92,8 @@ PICTURES: dict[str, Picture] = {
     ),
     "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
+    "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
+    "study-shots-curves.png": Unpublished("study run shots --seeds 20 --epochs 30"),
     "study-fig1.png": Plot(
         "plot surface --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=64' "
         "--entry 'vqc-native qubits=14'",

@@ -86,8 +86,9 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         axes.set_xscale("log")
         axes.margins(x=0.2)
         axes.set_xlabel(f"Ŝ ({AXES[unit]})")
-        axes.xaxis.set_major_formatter(steps_text)
+        axes.xaxis.set_major_formatter(_tick)
         axes.xaxis.set_minor_formatter(_between_decades(*axes.get_xlim()))
+        axes.tick_params(axis="x", which="both", labelsize=7.5)
         style.tidy(axes)
     panels[0].set_yticks(
         heights, [f"{name}: {style.seeds_text(e)}" for name, e in zip(style.labels(entries), entries)]
@@ -108,6 +109,10 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
     return figure
 
 
+def _tick(value: float, position: object) -> str:
+    return steps_text(value).replace(" billion", "B")
+
+
 def _between_decades(low: float, high: float) -> Callable[[float, object], str]:
     """Return what labels ticks between powers of ten: all on a short axis, 2 and 5 on a longer one, else none."""
     decades = math.log10(high / low)
@@ -115,6 +120,6 @@ def _between_decades(low: float, high: float) -> Callable[[float, object], str]:
 
     def text(value: float, position: object) -> str:
         digit = round(value / 10 ** math.floor(math.log10(value) + 1e-9))
-        return steps_text(value) if digit in labeled else ""
+        return _tick(value, position) if digit in labeled else ""
 
     return text
