@@ -21,7 +21,6 @@ from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.times import ALPHA
-from qrlsuite.results import lookup
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import MIN_RUNS, AcrossTasks, across_tasks, horizon_shares, rliable_arrays
 from qrlsuite.statistics.grid import FloatArray
@@ -211,7 +210,7 @@ def collected(
         raise OptionError(f"--across: task {twice} is named twice")
     if len(tasks) < 2:
         raise OptionError(f"--across {' '.join(tasks)}: name two tasks or more; `qrlsuite runs` lists them")
-    lookup.check_tasks(runs, *tasks)
+    collect.check_tasks(runs, tasks, published)
     selected, refused = list[EntryCurves](), list[str]()
     for task in tasks:
         of_task, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)

@@ -58,6 +58,17 @@ def collect(
     return entries, refused
 
 
+def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
+    """Refuse a task that is neither registered nor has entries here, or among the published ones where they count.
+
+    Raises
+    ------
+    UnknownNameError
+        With the nearest name.
+    """
+    lookup.check_tasks(runs, *tasks, also=published_entries.PUBLISHED if published else None)
+
+
 def select(
     runs: Path,
     tasks: Collection[str] = (),

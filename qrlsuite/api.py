@@ -44,7 +44,7 @@ from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.studies import Drawn
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
-from qrlsuite.results import lookup, speed
+from qrlsuite.results import speed
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.studies import decided, decisions
 from qrlsuite.studies import runner as study_runner
@@ -104,7 +104,7 @@ def load(
     (100, 100)
     """
     folder = Path(runs)
-    lookup.check_tasks(folder, task)
+    collect.check_tasks(folder, _several(task), published)
     return collect.find(folder, entry, published, _several(task))
 
 
@@ -162,7 +162,7 @@ def board(
     [(1, 'ddqn mlp width=64'), (2, 'ddqn mlp width=16')]
     """
     folder, task_names = Path(runs), _several(tasks)
-    lookup.check_tasks(folder, *task_names)
+    collect.check_tasks(folder, task_names, published)
     selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
     return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
 
@@ -209,7 +209,7 @@ def costs(
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
     folder, task_names = Path(runs), _several(tasks)
-    lookup.check_tasks(folder, *task_names)
+    collect.check_tasks(folder, task_names, published)
     selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
     return by_cost.build(selected, by, alpha, left_out)
 

@@ -14,7 +14,6 @@ from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.experiment import task as task_files
 from qrlsuite.leaderboard import collect, pictures
 from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.results import lookup
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
@@ -98,7 +97,7 @@ def compose(
         return Composed(pictures.draw(kind, (), **settings))
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
-    lookup.check_tasks(runs, *tasks)
+    collect.check_tasks(runs, tasks, published)
     selected, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
     if seeds is not None:
         wanted = read_seeds(seeds)

@@ -64,15 +64,21 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     return entries
 
 
-def check_tasks(runs: Path, *tasks: str | None) -> None:
+def check_tasks(runs: Path, *tasks: str | None, also: Path | None = None) -> None:
     """Refuse the name of a task that is neither registered nor has a folder of results; None names no task.
+
+    Parameters
+    ----------
+    also:
+        A second folder of results.
 
     Raises
     ------
     UnknownNameError
         With the nearest name, or what there is.
     """
-    held = {path.name for path in runs.iterdir() if path.is_dir()} if runs.is_dir() else set()
+    folders = [folder for folder in (runs, also) if folder is not None and folder.is_dir()]
+    held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     for name in tasks:
         if name is None or name in held:
             continue

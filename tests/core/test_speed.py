@@ -13,9 +13,9 @@ import pytest
 import qrlsuite
 from qrlsuite import registry
 from qrlsuite.errors import TaskError
-from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.entry import Entry, from_record, resolve
 from qrlsuite.leaderboard import published
-from qrlsuite.options import Setting, parse_setting
+from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance, speed
 from qrlsuite.results.speed import Estimate, Speed, Speeds
 from qrlsuite.results.store import EntryStore
@@ -130,13 +130,7 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
         record = json.loads(file.read_text())
         if {provenance.device_kind(made) for made in record["published"]["provenance"]} != {"cpu"}:
             continue  # hours of a GPU are no core-hours
-        words = record["identity"]
-        settings = [
-            Setting(kind, name, value)
-            for kind in ("model", "algorithm")
-            for name, value in words[f"{kind}_options"].items()
-        ]
-        entry = resolve(record["task_name"], words["model"], words["algorithm"], settings)
+        entry = from_record(record, str(file))
         hours = record["published"]
         seconds = hours["core_hours"] * 3600 / hours["seeds"] / hours["epochs"]
         low, high = known.estimate(entry, min(hours["seeds"], 50)).range(1) or (0.0, 0.0)

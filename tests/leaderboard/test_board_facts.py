@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qrlsuite import api
 from qrlsuite.engine.worker import train_group
+from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board, collect, origin, published, report, tables
 from qrlsuite.leaderboard.curves import EntryCurves
@@ -195,3 +197,10 @@ def test_what_tuning_took_is_said() -> None:
     made = boards.of([replace(one, tuning=tuning), replace(two, tuning={"trials": None}), three])
     text = f"{one.label} (7 trials, 10,500,000 steps, 0.12 core-hours), {two.label} (budget not known)"
     assert f"settings found by tuning: {text}" in tables.markdown(made).split("  \n")
+
+
+def test_a_published_variant_of_a_task_is_known_by_its_name(tmp_path: Path) -> None:
+    (section,) = api.board("beam6g+7d1167f1", runs=tmp_path, published=True).sections
+    assert {row.entry.task for row in section.rows} == {"beam6g+7d1167f1"}
+    with pytest.raises(UnknownNameError, match="did you mean 'beam6g'"):
+        api.board("beam6g+7d1167f1", runs=tmp_path)
