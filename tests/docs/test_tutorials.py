@@ -52,6 +52,7 @@ def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("IPYTHONDIR", str(tmp_path_factory.mktemp("ipython")))
+        patch.delenv("VIRTUAL_ENV", raising=False)  # of a shell's other environment, which IPython warns of
         quiet = Config({"HistoryManager": {"enabled": False}})
         shell = InteractiveShell.instance(config=quiet, user_module=ModuleType("tutorial"))
         shell.display_formatter.active_types = shell.display_formatter.format_types  # as in a notebook
