@@ -81,8 +81,8 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
             axes.plot([max(low, per_step), high], [heights[k]] * 2, color=look.color, lw=1.6)
             axes.plot(max(point, per_step), heights[k], look.marker, color=look.color, ms=7, mec="white")
             if found.unsettled[0, 0]:
-                right = {"xytext": (6, 0), "textcoords": "offset points"}
-                axes.annotate("≥", (high, heights[k]), **right, va="center", fontsize=9)
+                at = (high, heights[k])
+                axes.annotate("≥", at, (6, 0), textcoords="offset points", va="center", fontsize=9)
         axes.set_xscale("log")
         axes.margins(x=0.2)
         axes.set_xlabel(f"Ŝ ({AXES[unit]})")
@@ -110,6 +110,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
 
 
 def _tick(value: float, position: object) -> str:
+    """Return a tick's label: `500k`, `2B` for two billion."""
     return steps_text(value).replace(" billion", "B")
 
 
