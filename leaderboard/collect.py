@@ -179,14 +179,22 @@ def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] 
     UnknownNameError
         If none or several match; the message says what to type.
     """
-    return max(_read_copies(runs, name, published, tasks), key=_weight)
+    return best(_read_copies(runs, name, published, tasks))
+
+
+def best(copies: Iterable[EntryCurves]) -> EntryCurves:
+    """Return the copy of an entry that gets furthest towards the task's shortest horizon, then that with more seeds."""
+    return max(copies, key=_weight)
 
 
 def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        everything = [e for e in lookup.stored(_folders(runs, published)) if not tasks or e.task in tasks]
+        stores = _folders(runs, published)
+        if published:
+            stores += entries(published_entries.UNRANKED)
+        everything = [e for e in lookup.stored(stores) if not tasks or e.task in tasks]
         unique = list({entry.key: entry for entry in everything}.values())
         key = lookup.choose(unique, name, _place(runs, tasks)).key
         folders = [entry.store for entry in everything if entry.key == key]
@@ -202,10 +210,10 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
 
 def _shown(copies: Sequence[EntryCurves]) -> list[EntryCurves]:
     """Return what is shown of an entry's copies: the better one; or both where the own one gets less far."""
-    own, best = copies[0], max(copies, key=_weight)
-    if own.source == "runs" and _weight(own)[0] < _weight(best)[0]:
-        return [own, replace(best, name=f"{best.name}-published", label=f"{best.label} (published)")]
-    return [best]
+    own, further = copies[0], best(copies)
+    if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
+        return [own, replace(further, name=f"{further.name}-published", label=f"{further.label} (published)")]
+    return [further]
 
 
 def _place(runs: Path, tasks: Collection[str]) -> str:

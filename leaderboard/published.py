@@ -34,7 +34,13 @@ from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
 PUBLISHED = Path(__file__).parent / "entries"
-"""The entries that come with the suite."""
+"""The entries that come with the suite and stand on its boards."""
+
+UNRANKED = Path(__file__).parent / "unranked"
+"""The others that come with the suite: each answers a study's question. A name or the study finds them, no board does.
+
+More entries on a board make each of its pairs harder to decide, so a board has those of one question.
+"""
 
 CURVES = "curves.parquet"
 SEEDS = "seeds.parquet"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,14 @@ from matplotlib.figure import Figure
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
-from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard import collect, pictures, published
 from qrlsuite.leaderboard.board import ranking_of
-from qrlsuite.leaderboard.collect import read_entry
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS
-from qrlsuite.studies.study import Member, PictureSection, Study
+from qrlsuite.studies.study import Member, PictureSection, Study, load
 
 Report = Callable[[str, int, int], None]
 NOTHING = "nothing is trained yet"
@@ -97,23 +96,58 @@ def check(study: Study) -> None:
                 options.build(backend, deployed.chosen(value), f"{location}.evaluation.deployed")
 
 
-def read(runs: Path, members: Sequence[Member]) -> dict[str, EntryCurves]:
+def read(runs: Path, members: Sequence[Member], with_published: bool = False) -> dict[str, EntryCurves]:
     """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
+
+    Parameters
+    ----------
+    with_published:
+        Of an entry that comes with the suite, too, the copy that gets further is read, then that with more seeds.
 
     Raises
     ------
     StoreError
         If an entry's folder is damaged.
     """
+    folders = [runs, *((published.PUBLISHED, published.UNRANKED) if with_published else ())]
     curves_by_name = {}
-    for member in members:
-        store = EntryStore.find(runs, member.entry)
-        if member.entry.name in curves_by_name or not (store.path / "entry.json").exists():
-            continue
-        curves = read_entry(store)
-        if curves is not None:
-            curves_by_name[member.entry.name] = curves
+    for entry in {member.entry.name: member.entry for member in members}.values():
+        stores = [EntryStore.find(folder, entry) for folder in folders]
+        found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
+        copies = [curves for curves in found if curves is not None]
+        if copies:
+            curves_by_name[entry.name] = collect.best(copies)
     return curves_by_name
+
+
+def entries_of(
+    name: str, runs: Path, with_published: bool = False, tasks: Collection[str] = ()
+) -> list[EntryCurves]:
+    """Return a study's entries, for a board of that study alone.
+
+    Parameters
+    ----------
+    name:
+        A study, or a study file's path.
+    with_published:
+        As for `read`.
+    tasks:
+        Only entries of these tasks; of all where empty.
+
+    Raises
+    ------
+    QrlSuiteError
+        If there is no such study, or no entry of it has a result; the message says what to type.
+    """
+    members = [m for m in load(name).members() if not tasks or m.entry.task.name in tasks]
+    if not members:
+        raise OptionError(f"study '{name}' has no entry of task {' or '.join(tasks)}")
+    found = list(read(runs, members, with_published).values())
+    if not found:
+        searched = f"{runs} and the published entries hold" if with_published else f"{runs} holds"
+        more = "" if with_published else "; --published shows those that come with the suite"
+        raise UnknownNameError(f"{searched} no entry of study '{name}' yet: qrlsuite study run {name}{more}")
+    return found
 
 
 def decided_pairs(entries: Iterable[EntryCurves]) -> tuple[int, int]:
@@ -142,11 +176,14 @@ def draw(
     members: Sequence[Member],
     runs: Path,
     report: Report | None = None,
+    with_published: bool = False,
 ) -> list[Drawn]:
     """Draw every picture of a study from the seeds finished so far.
 
     Parameters
     ----------
+    with_published:
+        As for `read`.
     report:
         Told of the progress of episodes that a picture needs: policy, played, total.
 
@@ -156,7 +193,7 @@ def draw(
         If an entry's folder is damaged.
     """
     check(study)
-    curves_by_name = read(runs, members)
+    curves_by_name = read(runs, members, with_published)
     drawn = []
     for picture in study.file.pictures:
         shown = [m for m in members if not picture.entries or m.group in picture.entries]
@@ -182,13 +219,17 @@ def draw(
     return drawn
 
 
-def write(study: Study, members: Sequence[Member], runs: Path, format_: str) -> list[Drawn]:
+def write(
+    study: Study, members: Sequence[Member], runs: Path, format_: str, with_published: bool = False
+) -> list[Drawn]:
     """Draw every picture of a study, and write those that can be drawn into the results folder.
 
     Parameters
     ----------
     format_:
         `png`, `pdf` or `svg`.
+    with_published:
+        As for `read`.
 
     Raises
     ------
@@ -196,7 +237,7 @@ def write(study: Study, members: Sequence[Member], runs: Path, format_: str) -> 
         If an entry's folder is damaged, or a file cannot be written.
     """
     written = []
-    for drawn in draw(study, members, runs):
+    for drawn in draw(study, members, runs, with_published=with_published):
         if drawn.figure is not None:
             path = runs / f"study-{study.name}-{drawn.name}.{format_}"
             write_atomically(path, pictures.encode(drawn.figure, format_))

@@ -117,6 +117,7 @@ def board(
     alpha: float = ALPHA,
     horizon: int | None = None,
     entries: Sequence[str | EntryCurves] = (),
+    study: str | None = None,
     min_seeds: int = 1,
 ) -> Leaderboard:
     """Rank entries by significant outperformance, task by task.
@@ -135,6 +136,8 @@ def board(
         Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
     entries:
         Rank these only: what `load` accepts, or what it returns.
+    study:
+        Rank the entries of this study only: its name, or a study file's path.
     min_seeds:
         Leave out entries with fewer seeds.
 
@@ -149,7 +152,8 @@ def board(
     UnknownNameError
         If a task, an entry or the rule is unknown, or no entry is left.
     OptionError
-        If the horizon is no whole number of epochs, or a paired rule meets entries of different seeds.
+        If the horizon is no whole number of epochs, a paired rule meets entries of different seeds, or both `entries`
+        and `study` are given.
     StoreError
         If there is no results folder, and `published` is false.
     PluginError
@@ -163,6 +167,7 @@ def board(
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
+    entries = _chosen(entries, study, folder, published, task_names)
     selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
     return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
 
@@ -176,6 +181,7 @@ def costs(
     alpha: float = ALPHA,
     horizon: int | None = None,
     entries: Sequence[str | EntryCurves] = (),
+    study: str | None = None,
     min_seeds: int = 1,
 ) -> CostBoard:
     """Rank entries by what their learning cost, task by task, within the same budget for all.
@@ -184,7 +190,7 @@ def costs(
     ----------
     by:
         `executions` (of circuits), `shots` or `core-hours`.
-    tasks, runs, published, alpha, horizon, entries, min_seeds:
+    tasks, runs, published, alpha, horizon, entries, study, min_seeds:
         As for `board`.
 
     Returns
@@ -198,7 +204,7 @@ def costs(
     UnknownNameError
         If a task or an entry is unknown, or no entry is left.
     OptionError
-        If there is no such cost, or the horizon is no whole number of epochs.
+        If there is no such cost, the horizon is no whole number of epochs, or both `entries` and `study` are given.
     StoreError
         If there is no results folder, and `published` is false.
 
@@ -210,6 +216,7 @@ def costs(
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
+    entries = _chosen(entries, study, folder, published, task_names)
     selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
     return by_cost.build(selected, by, alpha, left_out)
 
@@ -814,6 +821,17 @@ def _seconds(minutes: float | None) -> float | None:
     if minutes is not None and not 0 < minutes < float("inf"):
         raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
     return None if minutes is None else 60 * minutes
+
+
+def _chosen(
+    entries: Sequence[str | EntryCurves], study: str | None, runs: Path, published: bool, tasks: Sequence[str]
+) -> Sequence[str | EntryCurves]:
+    """Return the entries to rank: those named, or those of a study."""
+    if study is None:
+        return entries
+    if entries:
+        raise OptionError(f"--study {study} names the entries: leave --entry out")
+    return studies.entries_of(study, runs, published, tasks)
 
 
 def _several(names: str | Sequence[str] | None) -> Sequence[str]:

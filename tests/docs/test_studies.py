@@ -15,13 +15,16 @@ import pytest
 from qrlsuite import api, registry
 from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.board import ranking_of
-from qrlsuite.leaderboard.published import PUBLISHED, read
+from qrlsuite.leaderboard.published import PUBLISHED, UNRANKED, read
 from qrlsuite.leaderboard.times import percent
 from qrlsuite.statistics import Comparison, Direction, LearningCurves, Verdict, times_board
 from qrlsuite.statistics.standings import holm
 from qrlsuite.studies.decided import versus
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from qrlsuite.leaderboard.curves import EntryCurves
     from qrlsuite.leaderboard.times import TimeRanking
 
 PAGE = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
@@ -31,8 +34,10 @@ ROWS = [
     for line in TABLE.splitlines()
     if line.startswith("| ")
 ][1:]
-PAIR = re.compile(r"(?P<task>[\w+-]+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`")
-ACROSS = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`: ")
+PAIR = re.compile(
+    r"(?:study `(?P<study>[\w-]+)`, )?(?P<task>[\w+-]+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`"
+)
+EVERY_MODEL = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`(?: on `(?P<task>[^`]+)`)?: ")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
 
@@ -57,18 +62,23 @@ PAPER = {
     "ddqn mlp width=64 / ddqn vqc-native qubits=10": "fewer",
     "ddqn vqc-native qubits=10 / ddqn mlp width=64": "as many",
     "ddqn mlp width=16 lr=0.002 / ddqn mlp width=16": "no fewer",
+    "ddqn mlp width=64 / ddqn mlp width=64 depth=1": "fewer",
+    "ddqn mlp width=64 depth=3 / ddqn mlp width=64": "as many",
     "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
 }
 
-# What the paper expects of all models on one task, against `beam6g`.
+# What the paper expects of every model: on one task against another, or of one algorithm against another.
 EXPECTED = {"beam6g-degree6": "more", "beam6g+7d1167f1": "no fewer"}
 
 
 @pytest.fixture(scope="module")
-def boards() -> dict[str, TimeRanking]:
-    """The published boards by mean times, by task."""
-    names = sorted({match["task"] for row in ROWS if (match := PAIR.match(row[4]))})
-    return {name: api.board(name, published=True, runs="none").sections[0].times for name in names}
+def boards() -> dict[tuple[str | None, str], TimeRanking]:
+    """The published boards by mean times at the longest horizon, by study, where a row names one, and task."""
+    asked = {(match["study"], match["task"]) for row in ROWS if (match := PAIR.match(row[4]))}
+    return {
+        (study, task): api.board(task, study=study, published=True, runs="none").sections[-1].times
+        for study, task in asked
+    }
 
 
 def decided(board: TimeRanking, first: str, second: str) -> tuple[Direction, float]:
@@ -95,12 +105,12 @@ def verdict(board: TimeRanking, first: str, second: str, cells: Comparison) -> s
     return "holds"
 
 
-def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
+def test_rows_of_pairs(boards: dict[tuple[str | None, str], TimeRanking]) -> None:
     written, computed, pairs = [], [], set()
     for row in ROWS:
         if match := PAIR.match(row[4]):
             task, first, second = match["task"], match["first"], match["second"]
-            board = boards[task]
+            board = boards[match["study"], task]
             cells = api.compare(first, second, task=task, published=True, runs="none")
             total = sum(len(line) for line in cells.verdicts)
             evidence = (
@@ -123,23 +133,35 @@ def test_rows_of_pairs(boards: dict[str, TimeRanking]) -> None:
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
 
 
-def across_tasks(first: str, second: str, paper: str) -> tuple[str, str, str, str]:
-    """Return verdict, seeds, evidence and error of a statement on what all models need on one task against another.
+def published_pairs(first: str, second: str, task: str | None) -> Iterator[tuple[EntryCurves, EntryCurves]]:
+    """Yield every model on one task and on another, or with one algorithm and with another on `task`."""
+    if task is None:
+        for folder in (PUBLISHED / first).iterdir():
+            entry = read(folder).entry_curves()
+            yield entry, api.load(entry.label, task=second, published=True, runs="none")
+        return
+    found = api.board(task, study=first, published=True, runs="none")
+    for row in found.sections[-1].rows:
+        model = row.entry.label.removeprefix(f"{first} ")
+        yield row.entry, api.load(f"{second} {model}", task=task, published=True, runs="none")
+
+
+def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[str, str, str, str]:
+    """Return verdict, seeds, evidence and error of a statement about all models that are published in two places.
 
     Parameters
     ----------
-    first, second:
-        Tasks; the models are those published on the first.
+    first, second, task:
+        Two tasks, or two algorithms on a task; the first algorithm's entries are those of the study of its name.
     paper:
-        What the paper expects on the first: "more" steps or "no fewer".
+        What the paper expects of the first: "more" steps or "no fewer".
     """
-    own = [read(folder).entry_curves() for folder in sorted((PUBLISHED / first).iterdir())]
     pairs = []
-    for entry in sorted(own, key=lambda entry: sum(entry.parameters), reverse=True):
-        other = api.load(entry.label, task=second, published=True, runs="none")
-        n = len(entry.seeds)
+    found = published_pairs(first, second, task)
+    for entry, other in sorted(found, key=lambda pair: sum(pair[1].parameters), reverse=True):
+        n, length = len(entry.seeds), other.curves.shape[1]
         assert (entry.seeds, other.seeds[:n]) == (tuple(range(n)), tuple(range(n)))
-        curves = [LearningCurves(e.curves[:n], e.steps_per_epoch, e.task) for e in (entry, other)]
+        curves = [LearningCurves(e.curves[:n, :length], e.steps_per_epoch, e.task) for e in (entry, other)]
         pairs.append((entry, n, times_board(curves, ranking_of([other]).grid)))
     adjusted = holm([board.p[0, 1] for _, _, board in pairs])
     found = [
@@ -147,7 +169,7 @@ def across_tasks(first: str, second: str, paper: str) -> tuple[str, str, str, st
         for p, (_, _, board) in zip(adjusted, pairs)
     ]
     evidence = "; ".join(
-        f"`{entry.label}` {percent(board.difference[0, 1])}, p {p:.4f}"
+        f"`{entry.label if task is None else entry.label.removeprefix(first + ' ')}` {percent(board.difference[0, 1])}, p {p:.4f}"
         for p, (entry, _, board) in zip(adjusted, pairs)
     )
     if paper == "more":
@@ -159,16 +181,17 @@ def across_tasks(first: str, second: str, paper: str) -> tuple[str, str, str, st
         text = "holds" if set(found) == {"more"} else "not told apart"
     numbers = [str(n) for _, n, _ in pairs]
     seeds = f"{numbers[0]} of each" if len(set(numbers)) == 1 else ", ".join(numbers)
-    return text, seeds, f"`{first}` against `{second}`: {evidence}", f".05 for {len(pairs)} models"
+    place = "" if task is None else f" on `{task}`"
+    return text, seeds, f"`{first}` against `{second}`{place}: {evidence}", f".05 for {len(pairs)} models"
 
 
-def test_rows_across_tasks() -> None:
-    """Every model's mean time below threshold on one task against another, seeds 0, 1, ... of both."""
+def test_rows_of_every_model() -> None:
+    """Every model's mean time below threshold in one place against another, seeds 0, 1, ... of both."""
     written, computed = [], []
     for row in ROWS:
-        if match := ACROSS.match(row[4]):
+        if match := EVERY_MODEL.match(row[4]):
             written.append(tuple(row[2:]))
-            computed.append(across_tasks(match["first"], match["second"], EXPECTED[match["first"]]))
+            computed.append(every_model(**match.groupdict(), paper=EXPECTED[match["first"]]))
     assert len(written) == len(EXPECTED)
     changed = [" | ".join(now) for then, now in zip(written, computed) if then != now]
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
@@ -227,7 +250,8 @@ def test_rows_without_published_entries() -> None:
     """A row may say that an entry is not published for as long as it is not."""
     published = [
         f"{folder.parent.name}/{read(folder).entry_curves().label}"
-        for folder in sorted(PUBLISHED.glob("*/*/"))
+        for root in (PUBLISHED, UNRANKED)
+        for folder in sorted(root.glob("*/*/"))
     ]
     absent = [label for row in ROWS for label in re.findall(r"no `([^`]+)`", row[4])]
     assert absent

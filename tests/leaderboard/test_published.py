@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from qrlsuite import hookimpl, registry
+from qrlsuite import api, hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
@@ -463,3 +463,67 @@ def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
     there = published.read(export(entry, tmp_path / "entries")).entry_curves()
     for found in (entry, there):
         assert board.as_dict(board.build([found]))["sections"][0]["rows"][0]["tuning"] == {"steps": 7}
+
+
+STUDY = """
+format_version = 1
+name = "two"
+summary = "Two widths"
+
+[[entries]]
+name = "width"
+task = "beam6g"
+model = "mlp"
+grid = { width = [16, 64] }
+
+[[pictures]]
+kind = "bars"
+"""
+
+
+@pytest.fixture
+def two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A study of two published networks: width 64 stands on the board, width 16 does not."""
+    places = {"PUBLISHED": "mlp width=64", "UNRANKED": "mlp width=16"}
+    folders = [
+        api.load(label, task="beam6g", runs="none", published=True).folder for label in places.values()
+    ]
+    for place, there in zip(places, folders):
+        root = tmp_path / place.lower()
+        shutil.copytree(there, root / "beam6g" / there.name)
+        monkeypatch.setattr(published, place, root)
+    path = tmp_path / "two.toml"
+    path.write_text(STUDY)
+    return str(path)
+
+
+def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path: Path) -> None:
+    def labels(**choice: Any) -> list[str]:
+        found = api.board("beam6g", runs=tmp_path, published=True, **choice)
+        return sorted(row.entry.label for row in found.sections[0].rows)
+
+    small, large = "ddqn mlp width=16", "ddqn mlp width=64"
+    assert labels() == [large]
+    assert labels(entries=["mlp width=16"]) == [small]
+    assert labels(study=two) == [small, large]
+    with pytest.raises(QrlSuiteError, match=r"holds no entry of study .* --published shows"):
+        api.board("beam6g", runs=tmp_path, study=two)
+    with pytest.raises(QrlSuiteError, match="no entry of task cartpole"):
+        api.board("cartpole", runs=tmp_path, published=True, study=two)
+    with pytest.raises(QrlSuiteError, match="leave --entry out"):
+        labels(study=two, entries=["mlp"])
+    done = command("leaderboard", "--study", two, "--published", "--runs", str(tmp_path), "--format", "csv")
+    assert [line.partition(" mlp ")[2][:8] for line in done.stdout.splitlines()[1:]] == [
+        "width=64",
+        "width=16",
+    ]
+    assert command("leaderboard", "--study", two, "--across", "beam6g", "cartpole").exit_code
+    assert command("leaderboard", "verify").stdout.count("ok ") == 2
+
+
+def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    assert command("study", "draw", two, "--runs", str(runs)).exit_code
+    done = command("study", "draw", two, "--published", "--runs", str(runs))
+    assert "100 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
+    assert (runs / "study-two-picture.png").exists()

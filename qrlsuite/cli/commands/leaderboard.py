@@ -23,6 +23,7 @@ from qrlsuite.cli.arguments import (
     RuleOption,
     RunsOption,
     TaskOption,
+    names_of,
 )
 from qrlsuite.cli.commands import verify
 from qrlsuite.engine.terminal import table_console
@@ -66,6 +67,14 @@ def leaderboard(
     context: typer.Context,
     task: TaskOption = None,
     entry: EntryOption = None,
+    study: Annotated[
+        str | None,
+        typer.Option(
+            "--study",
+            help="Only the entries of this study (see `qrlsuite study list`), or of a study file.",
+            autocompletion=names_of("studies"),
+        ),
+    ] = None,
     horizon: HorizonOption = None,
     min_seeds: MinSeedsOption = 1,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
@@ -102,7 +111,7 @@ def leaderboard(
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all. Entries whose record does not hold it, or not so that it can be compared, have no rank.
 
-    Example: qrlsuite leaderboard --task beam6g --format markdown
+    Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
     if context.invoked_subcommand is not None:
         return
@@ -112,6 +121,8 @@ def leaderboard(
     if by is not By.steps and (across is not None or rule is not None):
         other = "--across" if across is not None else f"--rule {rule}"
         raise OptionError(f"--by {by.value}: leave {other} out, which counts in environment steps")
+    if across is not None and study is not None:
+        raise OptionError(f"--study {study}: leave --across out, or name the entries with --entry")
     if across is not None:
         _across(across, task, entry or [], horizon, min_seeds, format_, output, rule, alpha, published, runs)
         return
@@ -125,6 +136,7 @@ def leaderboard(
             alpha=alpha,
             horizon=horizon,
             entries=entry or (),
+            study=study,
             min_seeds=min_seeds,
         )
         if format_ is not Format.html:
@@ -138,6 +150,7 @@ def leaderboard(
         alpha=alpha,
         horizon=horizon,
         entries=entry or (),
+        study=study,
         min_seeds=min_seeds,
     )
     if format_ is Format.json:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite import options, registry
-from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
@@ -260,16 +260,17 @@ def draw(
     models: MapOption = None,
     only: OnlyOption = None,
     format_: OutOption = "png",
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Draw a study's pictures from finished seeds; trains nothing.
 
-    Example: qrlsuite study draw fig6 --format pdf
+    Example: qrlsuite study draw ppo --published --format pdf
     """
     _check_format(format_)
     study, members = _members(name, settings, models, only)
-    drawn = studies.write(study, members, runs, format_)
+    drawn = studies.write(study, members, runs, format_, published)
     if not json_output:
         _say(drawn)
     if not any(each.path for each in drawn):

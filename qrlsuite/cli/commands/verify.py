@@ -47,7 +47,8 @@ def verify(
 
     Example: qrlsuite leaderboard verify leaderboard/entries --rerun 2
     """
-    folders = [folder for path in paths or [published.PUBLISHED] for folder in checks.find(path)]
+    everything = [published.PUBLISHED, published.UNRANKED]
+    folders = [folder for path in paths or everything for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice
     verdicts = []
     with Progress(
