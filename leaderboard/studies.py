@@ -23,6 +23,8 @@ from qrlsuite.studies.study import Member, PictureSection, Study, load
 
 Report = Callable[[str, int, int], None]
 NOTHING = "nothing is trained yet"
+PLAYED = ("episodes", "deployed")
+"""What pictures show for which trained agents play."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def check(study: Study) -> None:
         options.build(specs.resolve(kind.options), picture.settings, f"{location}.settings")
         if kind.data is None and picture.entries:
             raise OptionError(f"{location}.entries: picture '{picture.kind}' shows no entries")
-        played = kind.data in ("episodes", "deployed")
+        played = kind.data in PLAYED
         if (picture.evaluation is not None) != played:
             rule = "needs" if played else "takes no"
             raise OptionError(f"{location}.evaluation: picture '{picture.kind}' {rule} evaluation")
@@ -177,6 +179,7 @@ def draw(
     runs: Path,
     report: Report | None = None,
     with_published: bool = False,
+    seeds: str | None = None,
 ) -> list[Drawn]:
     """Draw every picture of a study from the seeds finished so far.
 
@@ -184,6 +187,9 @@ def draw(
     ----------
     with_published:
         As for `read`.
+    seeds:
+        Draw these alone, of every entry (`20`, `0:20`), so that all have equal numbers; None means all. Pictures that
+        play episodes choose among all seeds, and are not drawn.
     report:
         Told of the progress of episodes that a picture needs: policy, played, total.
 
@@ -191,9 +197,13 @@ def draw(
     ------
     StoreError
         If an entry's folder is damaged.
+    OptionError
+        If an entry has not all of the seeds.
     """
     check(study)
     curves_by_name = read(runs, members, with_published)
+    if seeds is not None:
+        curves_by_name = {name: entry.with_seeds(seeds) for name, entry in curves_by_name.items()}
     drawn = []
     for picture in study.file.pictures:
         shown = [m for m in members if not picture.entries or m.group in picture.entries]
@@ -214,13 +224,22 @@ def draw(
             drawn.append(Drawn(picture.name, picture.kind, (), figure=figure))
         elif not entries:
             drawn.append(dataclasses.replace(head, problem=NOTHING))
+        elif seeds is not None and kind.data in PLAYED:
+            drawn.append(
+                dataclasses.replace(head, problem="it plays the best agents of all seeds: leave --seeds out")
+            )
         else:
             drawn.append(_attempt(picture, entries, head, report))
     return drawn
 
 
 def write(
-    study: Study, members: Sequence[Member], runs: Path, format_: str, with_published: bool = False
+    study: Study,
+    members: Sequence[Member],
+    runs: Path,
+    format_: str,
+    with_published: bool = False,
+    seeds: str | None = None,
 ) -> list[Drawn]:
     """Draw every picture of a study, and write those that can be drawn into the results folder.
 
@@ -228,16 +247,18 @@ def write(
     ----------
     format_:
         `png`, `pdf` or `svg`.
-    with_published:
-        As for `read`.
+    with_published, seeds:
+        As for `draw`.
 
     Raises
     ------
     StoreError
         If an entry's folder is damaged, or a file cannot be written.
+    OptionError
+        If an entry has not all of the seeds.
     """
     written = []
-    for drawn in draw(study, members, runs, with_published=with_published):
+    for drawn in draw(study, members, runs, with_published=with_published, seeds=seeds):
         if drawn.figure is not None:
             path = runs / f"study-{study.name}-{drawn.name}.{format_}"
             write_atomically(path, pictures.encode(drawn.figure, format_))

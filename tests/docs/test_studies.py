@@ -162,15 +162,16 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
         n, length = len(entry.seeds), other.curves.shape[1]
         assert (entry.seeds, other.seeds[:n]) == (tuple(range(n)), tuple(range(n)))
         curves = [LearningCurves(e.curves[:n, :length], e.steps_per_epoch, e.task) for e in (entry, other)]
-        pairs.append((entry, n, times_board(curves, ranking_of([other]).grid)))
+        label = entry.label.removeprefix(f"{first} ")
+        pairs.append((label, n, times_board(curves, ranking_of([other]).grid)))
     adjusted = holm([board.p[0, 1] for _, _, board in pairs])
     found = [
         "not told apart" if p > 0.05 else "more" if board.difference[0, 1] > 0 else "fewer"
         for p, (_, _, board) in zip(adjusted, pairs)
     ]
     evidence = "; ".join(
-        f"`{entry.label if task is None else entry.label.removeprefix(first + ' ')}` {percent(board.difference[0, 1])}, p {p:.4f}"
-        for p, (entry, _, board) in zip(adjusted, pairs)
+        f"`{label}` {percent(board.difference[0, 1])}, p {p:.4f}"
+        for p, (label, _, board) in zip(adjusted, pairs)
     )
     if paper == "more":
         text = f"holds for {found.count('more')} of {len(found)} models"

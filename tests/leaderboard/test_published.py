@@ -527,3 +527,8 @@ def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> No
     done = command("study", "draw", two, "--published", "--runs", str(runs))
     assert "100 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
     assert (runs / "study-two-picture.png").exists()
+    done = command("study", "draw", two, "--published", "--seeds", "20", "--runs", str(runs))
+    assert "20 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
+    words = ["study", "draw", two, "--published", "--seeds", "101", "--runs", str(runs)]
+    with pytest.raises(QrlSuiteError, match="has no complete run of seed 100"):
+        CliRunner().invoke(build(), words, catch_exceptions=False)

@@ -259,6 +259,13 @@ def draw(
     settings: SetOption = None,
     models: MapOption = None,
     only: OnlyOption = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            "--seeds",
+            help="Of every entry these alone: 20, 0:20 or 0,3,10:12; default: all that are finished.",
+        ),
+    ] = None,
     format_: OutOption = "png",
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
@@ -266,11 +273,13 @@ def draw(
 ) -> None:
     """Draw a study's pictures from finished seeds; trains nothing.
 
-    Example: qrlsuite study draw ppo --published --format pdf
+    S_hat of few seeds is another quantity than S_hat of many: --seeds 20 draws equal numbers.
+
+    Example: qrlsuite study draw degree --published --seeds 20 --format pdf
     """
     _check_format(format_)
     study, members = _members(name, settings, models, only)
-    drawn = studies.write(study, members, runs, format_, published)
+    drawn = studies.write(study, members, runs, format_, published, seeds)
     if not json_output:
         _say(drawn)
     if not any(each.path for each in drawn):
