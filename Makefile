@@ -27,7 +27,7 @@ test-long: install-dev
 # which this checkout differs from BASE.
 BASE ?= origin/main
 RERUN ?= 2
-ENTRIES ?= $(shell git diff --name-only --diff-filter=d $(BASE) -- leaderboard/entries | cut -d/ -f1-4 | sort -u)
+ENTRIES ?= $(shell git diff --name-only --diff-filter=d $(BASE) -- leaderboard/entries leaderboard/unranked | cut -d/ -f1-4 | sort -u)
 verify: install
 	@if [ -z "$(ENTRIES)" ]; then echo 'no entry differs from $(BASE)'; \
 	else $(BIN)/qrlsuite leaderboard verify $(ENTRIES) --rerun $(RERUN); fi

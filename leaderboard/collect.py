@@ -18,9 +18,12 @@ from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
+Key = tuple[str, str]
+"""An entry's task and name."""
+
 
 def collect(
-    runs: Path, task: str | None = None, published: bool = False
+    runs: Path, task: str | None = None, published: bool = False, only: Collection[Key] | None = None
 ) -> tuple[list[EntryCurves], list[str]]:
     """Read every entry below a folder of results or of published entries.
 
@@ -30,6 +33,8 @@ def collect(
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
         both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
         own copy gets less far towards the task's shortest horizon, both are shown.
+    only:
+        Read these alone, those among them that no board ranks, too; None reads all that boards rank.
 
     Returns
     -------
@@ -38,7 +43,14 @@ def collect(
     """
     good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
-    for store in _folders(runs, published, task):
+    stores = _folders(runs, published, task)
+    if only is not None:
+        stores += entries(published_entries.UNRANKED, task) if published else []
+        stores = [store for store in stores if (store.path.parent.name, store.path.name) in only]
+        absent = len(only) - len({(store.path.parent.name, store.path.name) for store in stores})
+        if absent:
+            refused.append(f"{absent} of the study's {len(only)} entries: nothing is trained yet")
+    for store in stores:
         try:
             entry = read(store)
         except QrlSuiteError as error:
@@ -47,15 +59,15 @@ def collect(
         if entry is None:
             continue
         good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
-    entries = []
+    collected = []
     for copies in good.values():
         shown = _shown(copies) if published else copies[-1:]
-        entries += shown
+        collected += shown
         for other in copies if published and len(shown) < len(copies) else ():
             if other is not shown[0]:
                 size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
                 refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
-    return entries, refused
+    return collected, refused
 
 
 def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
@@ -66,7 +78,7 @@ def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> 
     UnknownNameError
         With the nearest name.
     """
-    lookup.check_tasks(runs, *tasks, also=published_entries.PUBLISHED if published else None)
+    lookup.check_tasks(runs, *tasks, also=published_entries.folders() if published else ())
 
 
 def select(
@@ -76,6 +88,7 @@ def select(
     published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
+    only: Collection[Key] | None = None,
 ) -> tuple[list[EntryCurves], list[str]]:
     """Read the entries for a board or a picture.
 
@@ -83,7 +96,7 @@ def select(
     ----------
     tasks, names:
         The tasks and the entries (see `find`) to read; all where empty. Entries that were read stand as they are.
-    published:
+    published, only:
         As for `collect`.
     horizon:
         Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
@@ -111,7 +124,7 @@ def select(
     }
     entries, left_out = list(named.values()), list[str]()
     if not named:
-        entries, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published)
+        entries, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published, only)
         entries = [entry for entry in entries if not tasks or entry.task in tasks]
     n_read = len(entries)
     kept = []

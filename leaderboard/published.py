@@ -130,6 +130,11 @@ class PublishedEntry:
         )
 
 
+def folders() -> tuple[Path, ...]:
+    """Return the folders of all entries that come with the suite."""
+    return PUBLISHED, UNRANKED
+
+
 def is_published(folder: Path) -> bool:
     """Return whether a folder holds a published entry rather than runs."""
     return (folder / CURVES).exists()

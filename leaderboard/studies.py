@@ -111,7 +111,7 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
     StoreError
         If an entry's folder is damaged.
     """
-    folders = [runs, *((published.PUBLISHED, published.UNRANKED) if with_published else ())]
+    folders = [runs, *(published.folders() if with_published else ())]
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():
         stores = [EntryStore.find(folder, entry) for folder in folders]
@@ -122,34 +122,44 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
     return curves_by_name
 
 
-def entries_of(
-    name: str, runs: Path, with_published: bool = False, tasks: Collection[str] = ()
-) -> list[EntryCurves]:
-    """Return a study's entries, for a board of that study alone.
+def select(
+    name: str,
+    runs: Path,
+    tasks: Collection[str] = (),
+    with_published: bool = False,
+    horizon: int | None = None,
+    min_seeds: int = 1,
+) -> tuple[list[EntryCurves], list[str]]:
+    """Read a study's entries for a board of that study alone.
 
     Parameters
     ----------
     name:
         A study, or a study file's path.
-    with_published:
-        As for `read`.
-    tasks:
-        Only entries of these tasks; of all where empty.
+    tasks, with_published, horizon, min_seeds:
+        As for `collect.select`.
+
+    Returns
+    -------
+    tuple
+        The entries, and one line for each that was left out and why.
 
     Raises
     ------
     QrlSuiteError
         If there is no such study, or no entry of it has a result; the message says what to type.
     """
-    members = [m for m in load(name).members() if not tasks or m.entry.task.name in tasks]
-    if not members:
-        raise OptionError(f"study '{name}' has no entry of task {' or '.join(tasks)}")
-    found = list(read(runs, members, with_published).values())
-    if not found:
+    members = [member for member in load(name).members() if not tasks or member.entry.task.name in tasks]
+    keys = {(member.entry.task.name, member.entry.name) for member in members}
+    if not keys:
+        place = f" of task {' or '.join(tasks)}" if tasks else ""
+        raise OptionError(f"study '{name}' has no entry{place}")
+    selected, left_out = collect.select(runs, tasks, (), with_published, horizon, min_seeds, keys)
+    if not selected:
         searched = f"{runs} and the published entries hold" if with_published else f"{runs} holds"
         more = "" if with_published else "; --published shows those that come with the suite"
         raise UnknownNameError(f"{searched} no entry of study '{name}' yet: qrlsuite study run {name}{more}")
-    return found
+    return selected, left_out
 
 
 def decided_pairs(entries: Iterable[EntryCurves]) -> tuple[int, int]:
@@ -186,7 +196,7 @@ def draw(
     Parameters
     ----------
     with_published:
-        As for `read`.
+        As for `read`; pictures that play episodes show entries that were trained here.
     seeds:
         Draw these alone, of every entry (`20`, `0:20`), so that all have equal numbers; None means all. Pictures that
         play episodes choose among all seeds, and are not drawn.
@@ -201,14 +211,17 @@ def draw(
         If an entry has not all of the seeds.
     """
     check(study)
-    curves_by_name = read(runs, members, with_published)
+    own = read(runs, members)  # those who can play: agents are not published
+    curves_by_name = read(runs, members, with_published) if with_published else own
     if seeds is not None:
         curves_by_name = {name: entry.with_seeds(seeds) for name, entry in curves_by_name.items()}
     drawn = []
     for picture in study.file.pictures:
         shown = [m for m in members if not picture.entries or m.group in picture.entries]
         unique = {member.entry.name: member for member in shown}
-        present = [curves_by_name[name] for name in unique if name in curves_by_name]
+        kind = pictures.KINDS[picture.kind]
+        known = own if kind.data in PLAYED else curves_by_name
+        present = [known[name] for name in unique if name in known]
         longest = max((_steps(entry) for entry in present), default=0)
         entries = [entry for entry in present if _steps(entry) == longest]
         counts = {entry.name: len(entry.seeds) for entry in entries}
@@ -218,7 +231,6 @@ def draw(
             tuple((m.entry.task.name, m.entry.label, counts.get(name, 0)) for name, m in unique.items()),
             tuple((e.task, e.label, e.curves.shape[1]) for e in present if _steps(e) < longest),
         )
-        kind = pictures.KINDS[picture.kind]
         if kind.data is None:
             figure = pictures.draw(picture.kind, **picture.settings)
             drawn.append(Drawn(picture.name, picture.kind, (), figure=figure))

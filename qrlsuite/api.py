@@ -167,8 +167,7 @@ def board(
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
-    entries = _chosen(entries, study, folder, published, task_names)
-    selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
+    selected, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
     return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
 
 
@@ -216,8 +215,7 @@ def costs(
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
-    entries = _chosen(entries, study, folder, published, task_names)
-    selected, left_out = collect.select(folder, task_names, entries, published, horizon, min_seeds)
+    selected, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
     return by_cost.build(selected, by, alpha, left_out)
 
 
@@ -823,15 +821,21 @@ def _seconds(minutes: float | None) -> float | None:
     return None if minutes is None else 60 * minutes
 
 
-def _chosen(
-    entries: Sequence[str | EntryCurves], study: str | None, runs: Path, published: bool, tasks: Sequence[str]
-) -> Sequence[str | EntryCurves]:
-    """Return the entries to rank: those named, or those of a study."""
+def _selected(
+    runs: Path,
+    tasks: Sequence[str],
+    entries: Sequence[str | EntryCurves],
+    study: str | None,
+    published: bool,
+    horizon: int | None,
+    min_seeds: int,
+) -> tuple[list[EntryCurves], list[str]]:
+    """Return the entries of a board, those named or those of a study, and a line for each that was left out."""
     if study is None:
-        return entries
+        return collect.select(runs, tasks, entries, published, horizon, min_seeds)
     if entries:
         raise OptionError(f"--study {study} names the entries: leave --entry out")
-    return studies.entries_of(study, runs, published, tasks)
+    return studies.select(study, runs, tasks, published, horizon, min_seeds)
 
 
 def _several(names: str | Sequence[str] | None) -> Sequence[str]:

@@ -64,20 +64,20 @@ def stored(stores: Iterable[EntryStore]) -> list[Stored]:
     return entries
 
 
-def check_tasks(runs: Path, *tasks: str | None, also: Path | None = None) -> None:
+def check_tasks(runs: Path, *tasks: str | None, also: Iterable[Path] = ()) -> None:
     """Refuse the name of a task that is neither registered nor has a folder of results; None names no task.
 
     Parameters
     ----------
     also:
-        A second folder of results.
+        Further folders of results.
 
     Raises
     ------
     UnknownNameError
         With the nearest name, or what there is.
     """
-    folders = [folder for folder in (runs, also) if folder is not None and folder.is_dir()]
+    folders = [folder for folder in (runs, *also) if folder.is_dir()]
     held = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     for name in tasks:
         if name is None or name in held:

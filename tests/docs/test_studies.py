@@ -161,7 +161,10 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
     for entry, other in sorted(found, key=lambda pair: sum(pair[1].parameters), reverse=True):
         n, length = len(entry.seeds), other.curves.shape[1]
         assert (entry.seeds, other.seeds[:n]) == (tuple(range(n)), tuple(range(n)))
-        curves = [LearningCurves(e.curves[:n, :length], e.steps_per_epoch, e.task) for e in (entry, other)]
+        curves = [
+            LearningCurves(each.curves[:n, :length], each.steps_per_epoch, name)
+            for name, each in ((first, entry), (second, other))
+        ]
         label = entry.label.removeprefix(f"{first} ")
         pairs.append((label, n, times_board(curves, ranking_of([other]).grid)))
     adjusted = holm([board.p[0, 1] for _, _, board in pairs])

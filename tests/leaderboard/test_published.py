@@ -22,10 +22,11 @@ from qrlsuite import api, hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import collect, published, verify
+from qrlsuite.leaderboard import collect, published, studies, verify
 from qrlsuite.leaderboard.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
+from qrlsuite.studies.study import parse
 from tests.conftest import TINY, trainer
 
 EPOCHS = 3
@@ -446,6 +447,10 @@ def test_own_runs_of_a_published_entry_are_shown_once(
         ((9, 1), False),
         ((8, 3), True),
     ], "an own entry that is shorter stands beside the published one"
+    only = {("tiny", entries[0].name), ("tiny", "another")}
+    asked, refused = collect.collect(tmp_path / "short", published=True, only=only)
+    assert [entry.label for entry in asked] == [entry.label for entry in entries], "of a study, too"
+    assert refused == ["1 of the study's 2 entries: nothing is trained yet"]
     assert len(collect.collect(tmp_path / "nothing", published=True)[0]) == 1
 
 
@@ -512,6 +517,8 @@ def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path
         api.board("cartpole", runs=tmp_path, published=True, study=two)
     with pytest.raises(QrlSuiteError, match="leave --entry out"):
         labels(study=two, entries=["mlp"])
+    with pytest.raises(QrlSuiteError, match=r"study 'estimator' has no entry$"):
+        api.board(runs=tmp_path, published=True, study="estimator")
     done = command("leaderboard", "--study", two, "--published", "--runs", str(tmp_path), "--format", "csv")
     assert [line.partition(" mlp ")[2][:8] for line in done.stdout.splitlines()[1:]] == [
         "width=64",
@@ -532,3 +539,10 @@ def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> No
     words = ["study", "draw", two, "--published", "--seeds", "101", "--runs", str(runs)]
     with pytest.raises(QrlSuiteError, match="has no complete run of seed 100"):
         CliRunner().invoke(build(), words, catch_exceptions=False)
+
+
+def test_published_entries_play_no_episodes(two: str, tmp_path: Path) -> None:
+    text = Path(two).read_text().replace('kind = "bars"', 'kind = "histogram"\nevaluation = { best = 1 }')
+    study = parse(text, "two.toml")
+    (drawn,) = studies.draw(study, study.members(), tmp_path, with_published=True)
+    assert drawn.problem == "nothing is trained yet", "agents are not published"

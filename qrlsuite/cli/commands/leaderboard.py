@@ -158,7 +158,9 @@ def leaderboard(
         return
     for line in board.refused:
         typer.echo(f"left out: {line}", err=True)
-    if format_ is Format.html and _page(board, output, runs, [task] if task else [], published, costs=costs):
+    if format_ is Format.html and _page(
+        board, output, runs, _tasks_of(board, task, study), published, costs=costs
+    ):
         return
     if not board.sections:
         raise _empty(runs, task)
@@ -176,6 +178,13 @@ def leaderboard(
     for name, promise in board.rules.items() if format_ in (Format.table, Format.markdown) else ():
         if name != rules.DEFAULT:
             typer.echo(f"rule '{name}': {promise}")
+
+
+def _tasks_of(board: Leaderboard, task: str | None, study: str | None) -> list[str]:
+    """Return the tasks whose decision plans a page shows; none means all."""
+    if task is not None:
+        return [task]
+    return sorted({section.task for section in board.sections}) if study is not None else []
 
 
 def _empty(runs: Path, task: str | None) -> UnknownNameError:

@@ -47,8 +47,7 @@ def verify(
 
     Example: qrlsuite leaderboard verify leaderboard/entries --rerun 2
     """
-    everything = [published.PUBLISHED, published.UNRANKED]
-    folders = [folder for path in paths or everything for folder in checks.find(path)]
+    folders = [folder for path in paths or published.folders() for folder in checks.find(path)]
     number = secrets.randbelow(10**9) if choice is None else choice
     verdicts = []
     with Progress(
