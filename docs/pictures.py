@@ -30,7 +30,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture that a command draws from published entries; `--out` follows the command.
+    """A picture that a command draws from published entries: into `--out`, or a study's under its own name.
 
     Attributes
     ----------
@@ -94,23 +94,12 @@ PICTURES: dict[str, Picture] = {
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
     "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
     "study-shots-curves.png": Unpublished("study run shots --seeds 20 --epochs 30"),
-    "study-fig1.png": Plot(
-        "plot surface --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=64' "
-        "--entry 'vqc-native qubits=14'",
-        ("entries/beam6g/*",),
+    "study-degree-scaling.png": Plot(
+        "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")
     ),
-    "study-fig6.png": Plot(
-        "plot bars --task beam6g --published --seeds 30 --entry 'mlp width=16' --entry 'mlp width=32' "
-        "--entry 'mlp width=64' --entry 'vqc-native qubits=10' --entry 'vqc-native qubits=14'",
-        ("entries/beam6g/*",),
-    ),
-    "study-fig7.png": Plot(
-        "plot scaling --task beam6g --published --seeds 30 --set 'epsilons=[0.15]' --set 'deltas=[0.75]' "
-        "--entry 'mlp width=16' --entry 'mlp width=32' --entry 'mlp width=64' --entry 'mlp width=128' "
-        "--entry 'mlp width=256' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=8' "
-        "--entry 'vqc-native qubits=10' --entry 'vqc-native qubits=14'",
-        ("entries/beam6g/*",),
-    ),
+    "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
+    "study-fig6-bars.png": Plot("study draw fig6 --published --seeds 30", ("entries/beam6g/*",)),
+    "study-fig7-scaling.png": Plot("study draw fig7 --published --seeds 30", ("entries/beam6g/*",)),
     "study-ppo.png": Unpublished("study run ppo --seeds 10"),
 }
 
@@ -157,8 +146,12 @@ def main(chosen: Sequence[str]) -> None:
 
 def _run(command: str, out: Path) -> None:
     """Run a command of the suite, which sees published entries and no runs of its user."""
-    words = [sys.executable, "-m", "qrlsuite", *shlex.split(command), "--out", str(out)]
-    subprocess.run([*words, "--runs", str(out.parent / "runs")], check=True, stdout=subprocess.DEVNULL)
+    runs, of_study = out.parent / "runs", command.startswith("study draw ")
+    place = ["--runs", str(runs), *([] if of_study else ["--out", str(out)])]
+    words = [sys.executable, "-m", "qrlsuite", *shlex.split(command), *place]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    if of_study:
+        (runs / out.name).rename(out)
 
 
 def _mark(made: Path, mark: str, place: Path) -> None:
