@@ -68,7 +68,7 @@ PAPER = {
 }
 
 # What the paper expects of every model: on one task against another, or of one algorithm against another.
-EXPECTED = {"beam6g-degree6": "more", "beam6g+7d1167f1": "no fewer"}
+EXPECTED = {"beam6g-degree6": "more", "beam6g+7d1167f1": "no fewer", "ppo": "more"}
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +94,8 @@ def verdict(board: TimeRanking, first: str, second: str, cells: Comparison) -> s
     paper = PAPER[f"{first} / {second}"]
     if direction is Direction.NOT_TOLD_APART:
         return "not told apart"
+    if direction is Direction.TRADE_OFF:
+        return "a trade-off"
     if {"fewer": Direction.FEWER, "no fewer": Direction.MORE}.get(paper) is not direction:
         return "does not hold"
     if cells.count(Verdict.LOSS if paper == "fewer" else Verdict.WIN):
@@ -169,20 +171,20 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
         pairs.append((label, n, times_board(curves, ranking_of([other]).grid)))
     adjusted = holm([board.p[0, 1] for _, _, board in pairs])
     found = [
-        "not told apart" if p > 0.05 else "more" if board.difference[0, 1] > 0 else "fewer"
+        Direction.NOT_TOLD_APART if p > 0.05 else board.directions[0][1]
         for p, (_, _, board) in zip(adjusted, pairs)
     ]
     evidence = "; ".join(
-        f"`{label}` {percent(board.difference[0, 1])}, p {p:.4f}"
-        for p, (label, _, board) in zip(adjusted, pairs)
+        f"`{label}` {percent(board.difference[0, 1])}{', a trade-off' * (each is Direction.TRADE_OFF)}, p {p:.4f}"
+        for p, each, (label, _, board) in zip(adjusted, found, pairs)
     )
-    if paper == "more":
-        text = f"holds for {found.count('more')} of {len(found)} models"
-        text = "holds" if set(found) == {"more"} else text
-    elif "fewer" in found:
-        text = f"does not hold for {found.count('fewer')} of {len(found)} models"
+    against = sum(each in (Direction.FEWER, Direction.TRADE_OFF) for each in found)
+    if set(found) == {Direction.MORE}:
+        text = "holds"
+    elif paper == "more":
+        text = f"holds for {found.count(Direction.MORE)} of {len(found)} models"
     else:
-        text = "holds" if set(found) == {"more"} else "not told apart"
+        text = f"does not hold for {against} of {len(found)} models" if against else "not told apart"
     numbers = [str(n) for _, n, _ in pairs]
     seeds = f"{numbers[0]} of each" if len(set(numbers)) == 1 else ", ".join(numbers)
     place = "" if task is None else f" on `{task}`"
