@@ -16,6 +16,7 @@ from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.results import lookup
+from qrlsuite.results.lookup import Stored
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
 Key = tuple[str, str]
@@ -204,12 +205,15 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        stores = _folders(runs, published)
-        if published:
-            stores += entries(published_entries.UNRANKED)
-        everything = [e for e in lookup.stored(stores) if not tasks or e.task in tasks]
-        unique = list({entry.key: entry for entry in everything}.values())
-        key = lookup.choose(unique, name, _place(runs, tasks)).key
+        ranked = lookup.stored(_folders(runs, published))
+        everything = ranked + lookup.stored(entries(published_entries.UNRANKED) if published else [])
+        ranked, everything = (
+            [e for e in found if not tasks or e.task in tasks] for found in (ranked, everything)
+        )
+        try:
+            key = _choose(ranked, name, runs, tasks)
+        except UnknownNameError:  # then it is one that no board ranks
+            key = _choose(everything, name, runs, tasks)
         folders = [entry.store for entry in everything if entry.key == key]
     copies = [entry for entry in map(read, folders) if entry is not None]
     if not copies:
@@ -227,6 +231,11 @@ def _shown(copies: Sequence[EntryCurves]) -> list[EntryCurves]:
     if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
         return [own, replace(further, name=f"{further.name}-published", label=f"{further.label} (published)")]
     return [further]
+
+
+def _choose(among: Sequence[Stored], name: str, runs: Path, tasks: Collection[str]) -> tuple[str, str, str]:
+    """Return the key of the entry that has a name."""
+    return lookup.choose(list({entry.key: entry for entry in among}.values()), name, _place(runs, tasks)).key
 
 
 def _place(runs: Path, tasks: Collection[str]) -> str:

@@ -510,6 +510,7 @@ def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path
     small, large = "ddqn mlp width=16", "ddqn mlp width=64"
     assert labels() == [large]
     assert labels(entries=["mlp width=16"]) == [small]
+    assert labels(entries=["mlp width="]) == [large], "a beginning means an entry of the board, if it can"
     assert labels(study=two) == [small, large]
     with pytest.raises(QrlSuiteError, match=r"holds no entry of study .* --published shows"):
         api.board("beam6g", runs=tmp_path, study=two)
