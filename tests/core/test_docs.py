@@ -13,6 +13,7 @@ import pytest
 
 from qrlsuite import options, registry, specs
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.tuning.search import split_model
@@ -58,18 +59,23 @@ def application() -> tuple[Any, Any]:
 
 def parse(words: list[str]) -> str:
     """Parse a command line without running it; returns what is wrong with it: an unknown command, option or choice."""
+    return parsed(words)[0]
+
+
+def parsed(words: list[str]) -> tuple[str, dict[str, Any]]:
+    """Parse a command line without running it; returns what is wrong with it, and its arguments and options by name."""
     command, core = application()
     context = core.Context(command, info_name="qrlsuite")
     try:
         while hasattr(command, "commands") and words and not words[0].startswith("-"):
             name, command, words = command.resolve_command(context, list(words))
             context = core.Context(command, info_name=name, parent=context)
-        command.make_context(context.info_name, list(words), parent=context.parent)
+        made = command.make_context(context.info_name, list(words), parent=context.parent)
     except core.Exit:  # --version, --help
-        pass
+        return "", {}
     except core.UsageError as error:
-        return str(error.format_message() or type(error).__name__)
-    return ""
+        return str(error.format_message() or type(error).__name__), {}
+    return "", made.params
 
 
 def test_the_parser_finds_what_is_wrong() -> None:
@@ -113,6 +119,40 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
     ):
         settings = [parse_setting(value) for key, value in itertools.pairwise(words) if key == "--set"]
         resolve(named["--task"], named["--model"], named.get("--algorithm"), settings, named.get("--preset"))
+
+
+def examples() -> list[tuple[str, str]]:
+    """Return the commands of the pages, and those in the help of commands, that name published entries."""
+    from qrlsuite.cli.app import BUILT_IN, load
+
+    helps = [(f"{name} --help", load(target).help or "") for name, target in BUILT_IN.items()]
+    more = [
+        (name, line.strip())
+        for name, text in helps
+        for line in re.findall(r"qrlsuite [^;`]+", " ".join(text.split()).partition("Example")[2])
+    ]
+    return [
+        (place, line)
+        for place, line in [*commands(), *more]
+        if "--published" in line.partition("#")[0].split()
+    ]
+
+
+@pytest.mark.parametrize(("place", "line"), examples())
+def test_published_entries_in_examples_exist(place: str, line: str) -> None:
+    """A name that an example uses means one entry, whatever else is published."""
+    problem, values = parsed(shlex.split(line.partition("#")[0])[1:])
+    if problem:
+        return  # a sentence that leaves things out
+    task = values.get("task")
+    tasks = [task] if isinstance(task, str) else list(task or ())
+    named = (
+        [values.get(key) for key in ("first", "second")] if line.split()[1] in ("compare", "power") else []
+    )
+    for name in [*filter(None, named), *(values.get("entry") or ())]:
+        if name.isupper():
+            continue  # compare FIRST SECOND
+        assert collect.find(Path("none"), name, published=True, tasks=tasks)
 
 
 def test_every_command_is_documented() -> None:

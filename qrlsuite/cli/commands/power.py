@@ -19,7 +19,7 @@ from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.leaderboard import board, collect
 from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.results import lookup, speed
+from qrlsuite.results import speed
 from qrlsuite.results.speed import BASES
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import hours_text
@@ -54,9 +54,9 @@ def power(
     curves and judged by rule `times` at alpha = .05: all seeds at once, and by a plan as `qrlsuite decide` runs
     it.
 
-    Example: qrlsuite power "mlp width=64" --published
+    Example: qrlsuite power "mlp width=64" --task beam6g --published
     """
-    lookup.check_tasks(runs, task)
+    collect.check_tasks(runs, [task] if task else [], published)
     entries = [
         collect.find(runs, name, published, [task] if task else [])
         for name in (first, second)

@@ -12,11 +12,11 @@ import typer
 from qrlsuite import circuit, registry
 from qrlsuite.circuit import drawing, export
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
-from qrlsuite.cli.arguments import JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.catalog import describe, hooks
-from qrlsuite.leaderboard import pictures, rules
+from qrlsuite.leaderboard import collect, pictures, rules
 from qrlsuite.options import parse_setting
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore, entries, write_atomically
@@ -53,13 +53,14 @@ def show(
             help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane.",
         ),
     ] = None,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Show options with their defaults and meaning, a task's protocol, or how an entry was made.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4;
-    qrlsuite show ansatz iqp --format qasm3
+    qrlsuite show ansatz iqp --format qasm3; qrlsuite show "cartpole/reinforce mlp" --published
     """
     manual = _hook(name, second)
     if manual is not None:
@@ -69,14 +70,15 @@ def show(
     known = registry.load()
     kinds = [k for k in registry.KINDS if (kind in (None, k)) and target in known.entries[k]]
     if not kinds and kind is None:
-        folder = _entry_folder(runs, target)
+        folder = _entry_folder(runs, target, published)
         if folder is not None:
             content = outline(EntryStore(folder))
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not kinds:
         names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
-        raise UnknownNameError(f"nothing called '{target}'{nearest(target, names)}")
+        more = "; --published looks among the published entries, too" if kind is None else ""
+        raise UnknownNameError(f"nothing called '{target}'{nearest(target, names)}{more}")
     if len(kinds) > 1:
         singulars = " or ".join(f"`show {registry.SINGULAR[k]} {target}`" for k in kinds)
         raise UnknownNameError(f"'{target}' is several things; write {singulars}")
@@ -124,10 +126,18 @@ def _kind(first: str, second: str | None) -> tuple[str | None, str]:
     return singulars[first], second
 
 
-def _entry_folder(runs: Path, name: str) -> Path | None:
-    """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits."""
+def _entry_folder(runs: Path, name: str, published: bool) -> Path | None:
+    """Find an entry's folder by path, or by what it is called in the results folder; None where nothing fits.
+
+    Raises
+    ------
+    UnknownNameError
+        If several fit, or none of the published ones does.
+    """
     if (Path(name) / "entry.json").exists():
         return Path(name)
+    if published:
+        return collect.find(runs, name, published).folder
     if not runs.is_dir():
         return None
     stored = lookup.stored(entries(runs))

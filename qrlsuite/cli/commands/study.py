@@ -284,8 +284,9 @@ def draw(
         _say(drawn)
     if not any(each.path for each in drawn):
         reasons = sorted({each.problem for each in drawn})
+        more = "" if published else "; --published draws the entries that come with the suite"
         raise OptionError(
-            f"study '{study.name}' has no picture yet: {'; '.join(reasons)}: qrlsuite study run {name}"
+            f"study '{study.name}' has no picture yet: {'; '.join(reasons)}: qrlsuite study run {name}{more}"
         )
     if json_output:
         typer.echo(json.dumps({"name": study.name, "pictures": [each.as_dict() for each in drawn]}))
