@@ -24,6 +24,8 @@ from qrlsuite.studies.decided import versus
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
+
     from qrlsuite.leaderboard.curves import EntryCurves
     from qrlsuite.leaderboard.times import TimeRanking
 
@@ -64,6 +66,9 @@ PAPER = {
     "ddqn mlp width=16 lr=0.002 / ddqn mlp width=16": "no fewer",
     "ddqn mlp width=64 / ddqn mlp width=64 depth=1": "fewer",
     "ddqn mlp width=64 depth=3 / ddqn mlp width=64": "as many",
+    "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 ansatz=cx gate=xyz": "as many",
+    "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 ansatz=cz": "fewer",
+    "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 gate=xyz": "as many",
     "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
 }
 
@@ -238,6 +243,15 @@ def test_the_cut_of_cartpole() -> None:
     assert f"fewer in {won} cells, more in {lost} of {len(cut)} " in TABLE
 
 
+def _end(curves: NDArray[np.float64]) -> float:
+    return float(np.median(curves[:, -1]))
+
+
+def _spread(curves: NDArray[np.float64]) -> float:
+    """Return the median over runs of how scores of the last 20 epochs scatter."""
+    return float(np.median(curves[:, -20:].std(1)))
+
+
 def test_scores_at_the_end() -> None:
     small, large, circuit = (
         np.median(api.load(label, task="beam6g", published=True, runs="none").curves[:, -1])
@@ -245,6 +259,13 @@ def test_scores_at_the_end() -> None:
     )
     assert f"ends at {small:.3f} of the optimum" in TABLE
     assert f"end at {large:.3f} and {circuit:.3f} of the optimum" in TABLE
+    gates = [
+        api.load(f"ddqn vqc-native qubits=10{gate}", task="beam6g", published=True, runs="none").curves[:20]
+        for gate in (" gate=u3", "")
+    ]
+    ends, spreads = ([f(curves) for curves in gates] for f in (_end, _spread))
+    assert f"{ends[0]:.3f} of the optimum with `u3` and {ends[1]:.3f} with `rot`" in TABLE
+    assert f"scatter by {spreads[0]:.3f} and {spreads[1]:.3f}" in TABLE
     hard = [
         np.median(read(folder).entry_curves().curves[:, -1])
         for folder in (PUBLISHED / "beam6g-degree6").iterdir()
