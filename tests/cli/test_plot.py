@@ -28,7 +28,7 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
     def read(runs: Path, name: str, published: bool, tasks: Sequence[str]) -> list[EntryCurves]:
         return [next(entry for entry in found if name in entry.label)]
 
-    monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False: (found, []))
+    monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False, only=None: (found, []))
     monkeypatch.setattr(collect, "_read_copies", read)
     return found
 
