@@ -181,11 +181,15 @@ def test_a_narrow_page_shows_cards_and_sorts_them(opened: Open, page: str) -> No
 def test_print_shows_everything_in_light_colors(opened: Open, page: str) -> None:
     tab = opened(page, color_scheme="dark")
     tab.emulate_media(media="print")
-    assert tab.locator("details:not([open])").count() == 0
+    tab.locator("details:not([open])").first.wait_for(state="detached")  # the page is told shortly after
     assert tab.locator(".facts").first.is_visible()
     assert tab.locator("#board-0 .numbers").is_visible()
     assert not tab.locator("#theme").is_visible()
     plot = tab.locator("#board-0-curves .main-svg").first
+    for _ in range(1200):  # figures are drawn again
+        if "rgb(255, 255, 255)" in plot.get_attribute("style") and plot.bounding_box()["width"] <= 700:
+            break
+        tab.wait_for_timeout(50)
     assert "rgb(255, 255, 255)" in plot.get_attribute("style")
     assert plot.bounding_box()["width"] <= 700
     tab.emulate_media(media="screen")
