@@ -13,7 +13,7 @@ import pytest
 
 from qrlsuite import options, registry, specs
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard import collect, studies
 from qrlsuite.leaderboard.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.tuning.search import split_model
@@ -122,7 +122,7 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
 
 
 def examples() -> list[tuple[str, str]]:
-    """Return the commands of the pages, and those in the help of commands, that name published entries."""
+    """Return the commands with --published, on the pages and in the help of commands."""
     from qrlsuite.cli.app import BUILT_IN, load
 
     helps = [(f"{name} --help", load(target).help or "") for name, target in BUILT_IN.items()]
@@ -153,6 +153,9 @@ def test_published_entries_in_examples_exist(place: str, line: str) -> None:
         if name.isupper():
             continue  # compare FIRST SECOND
         assert collect.find(Path("none"), name, published=True, tasks=tasks)
+    study = values["name"] if line.split()[1] == "study" else values.get("study")
+    if study is not None and not study.isupper():
+        assert studies.select(study, Path("none"), tasks, with_published=True)[0]
 
 
 def test_every_command_is_documented() -> None:
