@@ -41,6 +41,7 @@ class _Clock:
     def __init__(self) -> None:
         self.epoch, self.epoch_began = -1, 0.0
         self.round, self.round_began = (-1, ""), 0.0
+        """How many are done, and the phase: `learning` once all rounds of training are, which PPO and REINFORCE do."""
         self.window: tuple[float, int] | None = None
         self.rate: float | None = None
         """Seconds per round, measured over the last few seconds of training: the first rounds only fill a memory."""
@@ -54,6 +55,8 @@ class _Clock:
         )
         if epoch != self.epoch:
             self.epoch, self.epoch_began, self.window = epoch, now, None
+        if phase == "training" and 0 < int(state.get("total") or 0) <= done:
+            phase = "learning"
         if (done, phase) != self.round:
             self.round, self.round_began = (done, phase), now
         if phase != "training" or not done:
@@ -63,9 +66,9 @@ class _Clock:
             self.rate, self.window = (now - began) / (done - before), (now, done)
 
     def seconds_per_round(self, now: float) -> float | None:
-        """Return what a round takes by now, at least what the current one has taken; None before training begins."""
+        """Return what a round takes by now, at least what the current one has taken; None outside of training."""
         if self.round[1] != "training":
-            return self.rate
+            return None
         waited = now - self.round_began
         return (
             max(self.rate, waited) if self.rate is not None else waited if waited >= WINDOW_SECONDS else None
@@ -123,9 +126,11 @@ class CostEstimate:
         if state.get("epoch_seconds"):
             return max(float(state["epoch_seconds"]), elapsed)
         a_round, total = clock.seconds_per_round(now), int(state.get("total") or 0)
-        if state.get("phase") == "training" and a_round is not None and total:
+        if a_round is not None and total:
             rest = (total - int(state.get("done") or 0)) * a_round
             return VALIDATION * (elapsed + rest)
+        if clock.round[1] == "learning":
+            return VALIDATION * elapsed if elapsed >= WINDOW_SECONDS else None
         if state.get("phase") == "validating":
             return VALIDATION * elapsed if clock.rate is not None else None
         return None
@@ -314,14 +319,14 @@ class RunDisplay:
         if left < 10:
             return
         a_round = self.estimate.slowest_round(now)
-        if epoch_done or a_round is None:
-            self.console.print(f"this will take about {duration(left)} here (measured on the first epoch)")
+        if epoch_done:
+            text = f"this will take about {duration(left)} here (measured on the first epoch)"
         else:
-            self.console.print(
-                f"no epoch is done yet: one round of steps and updates of a group takes {_short(a_round)}, all of it "
-                f"about {duration(left)} or more",
-                soft_wrap=True,
+            round_text = (
+                "" if a_round is None else f"one round of steps and updates of a group takes {_short(a_round)}, "
             )
+            text = f"no epoch is done yet: {round_text}all of it takes about {duration(left)} or more"
+        self.console.print(text, soft_wrap=True)
         if left > 3600:
             for advice in self._faster():
                 self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)

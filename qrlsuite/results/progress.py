@@ -38,7 +38,11 @@ class Progress:
 
 
 class ProgressFile:
-    """A group's progress on disk: written by its worker at most twice a second, read by any display."""
+    """A group's progress on disk, read by any display.
+
+    Its worker writes it at most twice a second, and always at the last round of a phase, after which there may be long
+    silence: PPO and REINFORCE learn when all rounds are played.
+    """
 
     def __init__(self, store: EntryStore, group: str) -> None:
         self.path = store.groups / group / "progress.json"
@@ -51,15 +55,15 @@ class ProgressFile:
         force: bool = False,
         places: slice = slice(None),
     ) -> None:
-        """Write the progress, unless it was just written.
+        """Write the progress; if it was just written, only where a phase ends.
 
         Parameters
         ----------
         places:
             Of the seeds in the group whose scores count here.
         """
-        now = time.monotonic()
-        if not force and now - self._written < 0.5:
+        now, last = time.monotonic(), progress.total and progress.done == progress.total
+        if not (force or last) and now - self._written < 0.5:
             return
         self._written = now
         scores = progress.seed_scores[places]

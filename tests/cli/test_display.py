@@ -15,7 +15,7 @@ from qrlsuite.engine.execution import Plan, summarize
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.tables import COLUMNS
 from qrlsuite.options import parse_setting
-from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 
@@ -83,6 +83,27 @@ def test_the_first_epoch_s_estimate_follows_its_slow_rounds() -> None:
     assert estimate.remaining({name: validating}, now=360.0) == pytest.approx(10 * 1.25 * 360 - 360)
 
 
+def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys, monkeypatch) -> None:
+    """PPO plays all rounds in a second and learns for the rest of the epoch, which tells nothing of a round."""
+    clock = [1000.0]
+    monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
+    display = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 500, groups=PAIR[:1]), 1)
+    for _ in range(25):
+        display.update({PAIR[0].id: {"phase": "training", "epoch": 0, "done": 200, "total": 200}})
+        clock[0] += 1.0
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "no epoch is done yet: all of it takes about 3.5 h or more" in shown, "500 x 1.25 x 20 s"
+    assert not display.endless
+
+
+def test_the_last_round_of_a_phase_is_always_on_disk(tmp_path: Path) -> None:
+    """What follows it may be long, and a display knows by it that no round is under way."""
+    file = ProgressFile(EntryStore(tmp_path), "g")
+    for done in range(1, 5):
+        file.write(Progress(phase="training", done=done, total=4))
+        assert file.read()["done"] == (4 if done == 4 else 1)
+
+
 def test_an_epoch_is_not_shorter_than_it_has_taken_so_far() -> None:
     estimate = CostEstimate(PAIR[:1], epochs=10, workers=1)
     state = {"phase": "training", "epoch": 1, "done": 1, "total": 100, "epoch_seconds": 30.0}
@@ -101,7 +122,7 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
         display.update({PAIR[0].id: state})
         clock[0] += 1.0
     shown = " ".join(capsys.readouterr().err.split())
-    assert "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it" in shown
+    assert "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it takes" in shown
     assert "faster: " in shown
     assert not display.endless
     late = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10_000, groups=PAIR[:1]), 1)
