@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import collect, pictures, published
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
@@ -19,6 +20,7 @@ from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.studies.runner import PendingEntry
 from qrlsuite.studies.study import Member, PictureSection, Study, load
 
 Report = Callable[[str, int, int], None]
@@ -114,12 +116,25 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
     folders = [runs, *(published.folders() if with_published else ())]
     curves_by_name = {}
     for entry in {member.entry.name: member.entry for member in members}.values():
-        stores = [EntryStore.find(folder, entry) for folder in folders]
-        found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
-        copies = [curves for curves in found if curves is not None]
-        if copies:
+        if copies := _copies(folders, entry):
             curves_by_name[entry.name] = collect.best(copies)
     return curves_by_name
+
+
+def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryCurves]:
+    stores = [EntryStore.find(folder, entry) for folder in folders]
+    found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
+    return [curves for curves in found if curves is not None]
+
+
+def published_seeds(items: Iterable[PendingEntry]) -> dict[str, int]:
+    """Return how many seeds of each entry come with the suite and reach its last epoch, by entry name."""
+    counts = {}
+    for item in items:
+        copies = _copies(published.folders(), item.plan.entry)
+        reached = [long for copy in copies if (long := copy.reaching(item.plan.epochs)) is not None]
+        counts[item.plan.entry.name] = max((len(copy.seeds) for copy in reached), default=0)
+    return counts
 
 
 def select(

@@ -323,7 +323,9 @@ class RunDisplay:
             text = f"this will take about {duration(left)} here (measured on the first epoch)"
         else:
             round_text = (
-                "" if a_round is None else f"one round of steps and updates of a group takes {_short(a_round)}, "
+                ""
+                if a_round is None
+                else f"one round of steps and updates of a group takes {_short(a_round)}, "
             )
             text = f"no epoch is done yet: {round_text}all of it takes about {duration(left)} or more"
         self.console.print(text, soft_wrap=True)

@@ -86,11 +86,18 @@ class PendingEntry:
 
 @dataclass(frozen=True, repr=False)
 class Overview(Shown):
-    """A table of a study's entries: finished seeds, missing seeds, and their estimated time."""
+    """A table of a study's entries: finished seeds, missing seeds, and their estimated time.
+
+    Attributes
+    ----------
+    published:
+        Of each entry, by its name, the seeds that come with the suite; None leaves them out.
+    """
 
     study: Study
     items: Sequence[PendingEntry]
     workers: int
+    published: Mapping[str, int] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -98,7 +105,11 @@ class Overview(Shown):
         known = [cost for cost in costs if cost is not None]
         return {
             **self.study.file.model_dump(mode="json", exclude={"format_version", "entries", "pictures"}),
-            "entries": [item.as_dict() for item in self.items],
+            "entries": [
+                item.as_dict()
+                | ({} if self.published is None else {"published": self.published[item.plan.entry.name]})
+                for item in self.items
+            ],
             "workers": self.workers,
             "core_hours_left": sum(known) / 3600,
             "core_hours_range": [seconds / 3600 for seconds in _total(self.items)],
@@ -128,10 +139,10 @@ class Overview(Shown):
 
     def _table(self) -> Table:
         table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-        for column in ("task", "entry", "seeds", "epochs", "core time left", "because"):
-            table.add_column(
-                column, justify="right" if column in ("seeds", "epochs") else "left", overflow="fold"
-            )
+        with_published = ("published",) if self.published is not None else ()
+        for column in ("task", "entry", "seeds", *with_published, "epochs", "core time left", "because"):
+            number = column in ("seeds", "published", "epochs")
+            table.add_column(column, justify="right" if number else "left", overflow="fold")
         for item in self.items:
             cost = item.seconds
             busy = f" (+{len(item.plan.busy)} at work)" if item.plan.busy else ""
@@ -139,6 +150,7 @@ class Overview(Shown):
                 item.plan.entry.task.name,
                 item.plan.entry.label,
                 f"{item.finished}/{len(item.plan.seeds)}{busy}",
+                *([] if self.published is None else [str(self.published[item.plan.entry.name] or "-")]),
                 str(item.plan.epochs),
                 "-" if cost == 0 else "?" if item.range is None else duration_range(*item.range),
                 "" if cost == 0 else item.estimate.basis,
@@ -172,10 +184,20 @@ class Status(Shown):
     ----------
     rows:
         A study, its entries, and of its pairs of entries those that are decided, and all that can be tested yet.
+    published:
+        As for `Overview`.
     """
 
     rows: Sequence[tuple[Study, Sequence[PendingEntry], tuple[int, int]]]
     workers: int
+    published: Mapping[str, int] | None = None
+
+    def _published(self, items: Sequence[PendingEntry]) -> dict[str, int]:
+        """Return how many entries and seeds of a study come with the suite; nothing where that is left out."""
+        if self.published is None:
+            return {}
+        counts = [self.published[item.plan.entry.name] for item in items]
+        return {"published": sum(map(bool, counts)), "published_seeds": sum(counts)}
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -187,6 +209,7 @@ class Status(Shown):
                     "complete": sum(item.complete for item in items),
                     "seeds": sum(len(item.plan.seeds) for item in items),
                     "finished": sum(item.finished for item in items),
+                    **self._published(items),
                     "pairs": pairs,
                     "decided": decided,
                     "core_hours_range": [seconds / 3600 for seconds in _total(items)],
@@ -206,7 +229,15 @@ class Status(Shown):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show a row per study, and the sum, in which an entry of several studies counts once."""
         table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-        for column in ("study", "entries complete", "seeds", "pairs decided", "core-hours left"):
+        with_published = ("published",) if self.published is not None else ()
+        for column in (
+            "study",
+            "entries complete",
+            "seeds",
+            *with_published,
+            "pairs decided",
+            "core-hours left",
+        ):
             table.add_column(column, justify="left" if column == "study" else "right", overflow="fold")
         for study, items, (decided, pairs) in self.rows:
             table.add_row(
@@ -215,12 +246,19 @@ class Status(Shown):
                 f"{sum(item.finished for item in items)} of {sum(len(item.plan.seeds) for item in items)}"
                 if items
                 else "-",
+                *([] if self.published is None else [_seeds_of_entries(**self._published(items))]),
                 f"{decided} of {pairs}" if pairs else "-",
                 _hours_left(items),
             )
         yield table
         yield Text(f"left, each entry once: {_left(self._once(), self.workers)}")
         yield Text("pairs: of entries with 20 seeds or more, by mean time below threshold at an error of 5%")
+
+
+def _seeds_of_entries(published: int, published_seeds: int) -> str:
+    if not published:
+        return "-"
+    return f"{counted(published_seeds, 'seed')} of {counted(published, 'entry')}"
 
 
 def _hours_left(items: Sequence[PendingEntry]) -> str:

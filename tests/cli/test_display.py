@@ -122,7 +122,9 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
         display.update({PAIR[0].id: state})
         clock[0] += 1.0
     shown = " ".join(capsys.readouterr().err.split())
-    assert "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it takes" in shown
+    assert (
+        "no epoch is done yet: one round of steps and updates of a group takes 20 s, all of it takes" in shown
+    )
     assert "faster: " in shown
     assert not display.endless
     late = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10_000, groups=PAIR[:1]), 1)

@@ -21,7 +21,7 @@ from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard import published, studies
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
@@ -528,6 +528,33 @@ def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
     said = say("status", "--seeds", "20", *words).stdout
     assert re.search(r"widths +2 of 3 +40 of 60 +0 of 1", said)
     assert re.search(r"left, each entry once: .*, and 1 entry of unknown cost", said)
+
+
+def test_published_seeds_are_counted_beside_one_s_own(tmp_path: Path) -> None:
+    words = ("--engine", "here", "--runs", str(tmp_path / "runs"))
+    (ppo,) = answer("status", "ppo", "--published", *words)["studies"]
+    networks = published.folders()[1] / "beam6g"
+    seeds = [published.read(folder).seeds for folder in networks.glob("ppo-mlp-*")]
+    assert (ppo["published"], ppo["published_seeds"]) >= (3, 60)
+    assert ppo["published_seeds"] >= sum(map(len, seeds))
+    assert ppo["pairs"] >= 3
+    assert ppo["finished"] == ppo["complete"] == 0, "published seeds are nobody's own"
+    assert re.search(
+        rf"{ppo['published_seeds']} seeds of {ppo['published']} entries",
+        say("status", "ppo", "--published", *words).stdout,
+    )
+    shown = {
+        entry["label"]: entry["published"]
+        for entry in answer("show", "ppo", "--published", *words)["entries"]
+    }
+    assert shown["ppo mlp width=16"] == 20
+    longer = answer("show", "ppo", "--published", "--epochs", "501", *words)["entries"]
+    assert not any(entry["published"] for entry in longer), "none of them reached epoch 501"
+    (row,) = [
+        line for line in say("show", "ppo", "--published", *words).stdout.splitlines() if "width=16" in line
+    ]
+    assert row.split()[:7] == ["beam6g", "ppo", "mlp", "width=16", "0/100", "20", "500"]
+    assert "published" not in answer("show", "ppo", *words)["entries"][0]
 
 
 def test_which_pairs_count() -> None:

@@ -70,6 +70,8 @@ def evaluate(
 ) -> None:
     """Play fresh episodes with an entry's best trained agents, and with reference policies.
 
+    Published entries are curves without agents, so train an entry to evaluate it (`qrlsuite run`).
+
     The best agents are chosen by their last validation score; these episodes are new, and the same for every
     policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer

@@ -118,18 +118,22 @@ def show(
     only: OnlyOption = None,
     engine: EngineOption = "local",
     workers: WorkersOption = None,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Show a study's entries: finished seeds, missing seeds, and the time the missing ones will take.
 
-    Example: qrlsuite study show fig7
+    Published seeds are counted beside those that you trained, which alone `qrlsuite study run` continues.
+
+    Example: qrlsuite study show fig7 --published
     """
     execution = execution_of(engine, workers)
     study, members = _members(name, settings, models, only)
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     items = runner.survey(members, runs, execution, speed.known(runs), seed_numbers, epochs)
-    overview = runner.Overview(study, items, execution.workers)
+    counts = studies.published_seeds(items) if published else None
+    overview = runner.Overview(study, items, execution.workers, counts)
     if json_output:
         typer.echo(json.dumps(overview.as_dict()))
     else:
@@ -143,12 +147,15 @@ def status(
     epochs: EpochsOption = None,
     engine: EngineOption = "local",
     workers: WorkersOption = None,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Show every study in a line: finished seeds, decided pairs of entries, and the core-hours of what is missing.
 
-    Example: qrlsuite study status
+    With --published, the published seeds have a column, and pairs of published entries count as well.
+
+    Example: qrlsuite study status --published
     """
     execution = execution_of(engine, workers)
     seed_numbers = None if seeds is None else parse_seeds(seeds)
@@ -158,8 +165,10 @@ def status(
         study = _load(name)
         members = study.members()
         items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
-        rows.append((study, items, studies.decided_pairs(studies.read(runs, members).values())))
-    overview = runner.Status(rows, execution.workers)
+        rows.append((study, items, studies.decided_pairs(studies.read(runs, members, published).values())))
+    every = [item for _, items, _ in rows for item in items]
+    counts = studies.published_seeds(every) if published else None
+    overview = runner.Status(rows, execution.workers, counts)
     if json_output:
         typer.echo(json.dumps(overview.as_dict()))
     else:
