@@ -153,8 +153,11 @@ def test_published_entries_in_examples_exist(place: str, line: str) -> None:
         if name.isupper():
             continue  # compare FIRST SECOND
         assert collect.find(Path("none"), name, published=True, tasks=tasks)
-    study = values["name"] if line.split()[1] == "study" else values.get("study")
-    if study is not None and not study.isupper():
+    named_studies = [
+        values.get("name" if line.split()[1] == "study" else "study"),
+        *(values.get("names") or ()),
+    ]
+    for study in [name for name in named_studies if name and not name.isupper()]:
         assert studies.select(study, Path("none"), tasks, with_published=True)[0]
 
 
