@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -97,12 +98,13 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
         colors = (colors + 2) % 6 if len(panels) > 1 else 0
     for each in axes[::columns]:
         each.set_ylabel("Ŝ (environment steps)")
-    figure.suptitle(
-        f"{_heading(entries)}: sample complexity against {_sizes(panels)}",
-        x=0.01,
-        ha="left",
-        fontsize="medium",
-    )
+    title = f"{_heading(entries)}: sample complexity against {_sizes(panels)}"
+    if len(panels) == 1:  # all cells have its lines: one legend outside covers none of them
+        style.legend(figure, title, [_handle(k, line) for k, line in enumerate(panels[0].lines)])
+    else:
+        figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+        for each in axes[:: grid.size]:
+            each.legend(facecolor="white", edgecolor="none", framealpha=0.9, fontsize=7.5)
     repeated = any(len(line.members) > len(line.sizes) for panel in panels for line in panel.lines)
     style.footnotes(
         figure,
@@ -191,8 +193,14 @@ def _draw_panel(
     axes.yaxis.set_major_formatter(steps_text)
     style.tidy(axes)
     axes.set_title(f"{title}: {_seeds(panel)}", fontsize=9, loc="left")
-    if cell == (0, 0):
-        axes.legend(facecolor="white", edgecolor="none", framealpha=0.9, fontsize=7.5)
+
+
+def _handle(k: int, line: _Line) -> Line2D:
+    """Return what a legend shows of the line at a place."""
+    look = style.style(k)
+    return Line2D(
+        [], [], color=look.color, ls=look.line, marker=look.marker, mec="white", label=style.plain(line.label)
+    )
 
 
 def _seeds(panel: _Panel) -> str:
