@@ -69,6 +69,8 @@ PAPER = {
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 ansatz=cx gate=xyz": "as many",
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 ansatz=cz": "fewer",
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 gate=xyz": "as many",
+    "ddqn vqc-native qubits=10 layers=6 / ddqn vqc-native qubits=10": "as many",
+    "ddqn vqc-native qubits=10 layers=6 / ddqn vqc-native qubits=14": "no fewer",
     "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
 }
 
