@@ -40,8 +40,8 @@ class Progress:
 class ProgressFile:
     """A group's progress on disk, read by any display.
 
-    Its worker writes it at most twice a second, and always at the last round of a phase, after which there may be long
-    silence: PPO and REINFORCE learn when all rounds are played.
+    Its worker writes it at most twice a second, and always at the last round of an epoch's training, after which there
+    may be long silence: PPO and REINFORCE learn when all rounds are played.
     """
 
     def __init__(self, store: EntryStore, group: str) -> None:
@@ -55,14 +55,15 @@ class ProgressFile:
         force: bool = False,
         places: slice = slice(None),
     ) -> None:
-        """Write the progress; if it was just written, only where a phase ends.
+        """Write the progress; if it was just written, only at the last round of training.
 
         Parameters
         ----------
         places:
             Of the seeds in the group whose scores count here.
         """
-        now, last = time.monotonic(), progress.total and progress.done == progress.total
+        now = time.monotonic()
+        last = progress.phase == "training" and 0 < progress.total <= progress.done
         if not (force or last) and now - self._written < 0.5:
             return
         self._written = now

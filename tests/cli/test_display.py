@@ -96,7 +96,7 @@ def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys,
     assert not display.endless
 
 
-def test_the_last_round_of_a_phase_is_always_on_disk(tmp_path: Path) -> None:
+def test_the_last_round_of_training_is_always_on_disk(tmp_path: Path) -> None:
     """What follows it may be long, and a display knows by it that no round is under way."""
     file = ProgressFile(EntryStore(tmp_path), "g")
     for done in range(1, 5):
