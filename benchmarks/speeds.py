@@ -46,8 +46,8 @@ DEEPER = [("beam6g", "ddqn", "vqc-native", {"qubits": qubits, "layers": 6}, 10) 
 ON_POLICY = [
     ("beam6g", "ppo", "mlp", {"width": 16, "depth": 2}, 20),
     ("beam6g", "ppo", "mlp", {"width": 64, "depth": 2}, 20),
-    ("beam6g", "ppo", "vqc-native", {"qubits": 6, "layers": 4}, 10),
-    ("beam6g", "ppo", "vqc-native", {"qubits": 10, "layers": 4}, 4),
+    ("beam6g", "ppo", "vqc-native", {"qubits": 6, "layers": 4}, 20),
+    ("beam6g", "ppo", "vqc-native", {"qubits": 10, "layers": 4}, 20),
 ]
 CARTPOLE = [
     ("cartpole", "reinforce", "mlp", {"width": 16, "depth": 1}, 50),

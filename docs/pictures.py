@@ -94,13 +94,17 @@ PICTURES: dict[str, Picture] = {
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
     "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
     "study-shots-curves.png": Unpublished("study run shots --seeds 20 --epochs 30"),
+    "study-ablation-layers.png": Plot(
+        "study draw ablation --published --seeds 20 --only layers",
+        ("entries/beam6g/ddqn-vqc-native-*", "unranked/beam6g/ddqn-vqc-native-*"),
+    ),
     "study-degree-scaling.png": Plot(
         "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")
     ),
     "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig6-bars.png": Plot("study draw fig6 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig7-scaling.png": Plot("study draw fig7 --published --seeds 30", ("entries/beam6g/*",)),
-    "study-ppo.png": Unpublished("study run ppo --seeds 10"),
+    "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
 }
 
 

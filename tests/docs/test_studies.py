@@ -71,6 +71,12 @@ PAPER = {
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 gate=xyz": "as many",
     "ddqn vqc-native qubits=10 layers=6 / ddqn vqc-native qubits=10": "as many",
     "ddqn vqc-native qubits=10 layers=6 / ddqn vqc-native qubits=14": "no fewer",
+    "ddqn vqc-native qubits=10 layers=5 / ddqn vqc-native qubits=10": "as many",
+    "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 layers=3": "as many",
+    "ddqn vqc-native qubits=8 layers=6 / ddqn vqc-native qubits=8": "as many",
+    "ppo vqc-native qubits=10 / ppo mlp width=16": "fewer",
+    "ppo vqc-native qubits=10 / ppo mlp width=32": "as many",
+    "ppo vqc-native qubits=10 / ppo mlp width=64": "no fewer",
     "reinforce vqc-native qubits=4 layers=1 / reinforce mlp width=16 depth=1": "as many",
 }
 
