@@ -60,17 +60,20 @@ class VerificationResult:
 
 
 def find(path: Path) -> list[Path]:
-    """Return the published entries at or below a folder, sorted.
+    """Return the absolute paths of the published entries at or below a folder, sorted.
+
+    An entry is checked against the names of the folders that it lies in, which `.` does not have.
 
     Raises
     ------
     QrlSuiteError
         If there is none.
     """
-    if (path / "entry.json").exists():
-        return [path]
+    place = path.absolute()
+    if (place / "entry.json").exists():
+        return [place]
     folders = sorted(
-        {p.parent for p in path.glob("*/*/entry.json")} | {p.parent for p in path.glob("*/entry.json")}
+        {p.parent for p in place.glob("*/*/entry.json")} | {p.parent for p in place.glob("*/entry.json")}
     )
     if not folders:
         raise QrlSuiteError(f"{path} holds no published entry: qrlsuite export ENTRY --out {path}")

@@ -425,6 +425,14 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
         CliRunner().invoke(build(), ["export", "--runs", str(tmp_path / "runs")], catch_exceptions=False)
 
 
+def test_an_entry_is_verified_from_inside_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for here, path in ((folder, "."), (folder.parent, folder.name), (folder.parents[1], ".")):
+        monkeypatch.chdir(here)
+        done = command("leaderboard", "verify", path)
+        assert done.exit_code == 0, done.stdout
+        assert f"{folder.parent.name}/{folder.name}" in done.stdout
+
+
 def test_nothing_complete_is_nothing_to_export(tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     with pytest.raises(QrlSuiteError, match="holds no complete entry: qrlsuite runs --runs"):
