@@ -91,6 +91,15 @@ EXPECTED = {
         for task in ("beam6g", "beam6g+7d1167f1")
         for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
     ],
+    "fidelity": [
+        text + change
+        for task, change in (
+            ("beam6g", ""),
+            ("beam6g+476ac3d2", ""),
+            ("beam6g", " buffer=1000 target_steps=1000"),
+        )
+        for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
+    ],
 }
 
 
