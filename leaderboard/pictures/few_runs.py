@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -51,7 +52,7 @@ class _Draws:
     def words(self, first: str, second: str) -> str:
         ahead = float((self.steps[0] < self.steps[1]).mean())
         behind = float((self.steps[0] > self.steps[1]).mean())
-        return f"ahead: {first} {ahead:.0%}, {second} {behind:.0%}, neither {1 - ahead - behind:.0%}"
+        return f"{first} ahead: {ahead:.0%}\n{second} ahead: {behind:.0%}, neither: {1 - ahead - behind:.0%}"
 
 
 def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
@@ -129,7 +130,7 @@ def _figure(
     n_few: int,
     n_many: int,
 ) -> Figure:
-    figure = Figure(figsize=(8.4, 5.2), layout="constrained")
+    figure = Figure(figsize=(8.4, 5.6), layout="constrained")
     panels = figure.subplot_mosaic([["a", "a", "b", "b", "c", "c"], ["d", "d", "d", "e", "e", "e"]])
     difference = few.steps[0] - few.steps[1]
     order = np.argsort(difference, kind="stable")
@@ -139,7 +140,7 @@ def _figure(
         samples = [entry.curves[runs[index]] for entry, runs in zip(sides, few.runs)]
         complexities = [int(steps[index]) for steps in few.steps]
         title = "a sample of" if key == "a" else "another sample of"
-        _learning(panels[key], sides, samples, grid, horizon, f"{title} {n_few} seeds", names, complexities)
+        _learning(panels[key], sides, samples, grid, horizon, f"{title} {n_few} seeds", complexities)
     everything = [entry.curves for entry in sides]
     whole = [
         int(complexity(learning_curves(entry).cut(horizon).values, grid, entry.steps_per_epoch)[0, 0])
@@ -148,16 +149,16 @@ def _figure(
     counts = sorted({len(entry.seeds) for entry in sides})
     title = f"all seeds ({' and '.join(map(str, counts))})"
     if len(entries) == 1:
-        _learning(panels["c"], sides[:1], everything[:1], grid, horizon, title, ["all"], whole[:1], color=2)
+        _learning(panels["c"], sides[:1], everything[:1], grid, horizon, title, whole[:1], color=2)
     else:
-        _learning(panels["c"], sides, everything, grid, horizon, title, names, whole)
+        _learning(panels["c"], sides, everything, grid, horizon, title, whole)
     for key in ("b", "c"):
         panels[key].sharey(panels["a"])
         panels[key].tick_params(labelleft=False)
     panels["a"].set_ylabel("score: mean, standard deviation", fontsize=8.5)
     step = entries[0].steps_per_epoch
     for key, drawn, size in (("d", few, n_few), ("e", many, n_many)):
-        _distribution(panels[key], drawn, horizon, step, names)
+        _distribution(panels[key], drawn, horizon, step)
         panels[key].set_title(f"{size} seeds each\n{drawn.words(*names)}", fontsize=8, loc="left")
     panels["e"].set_yticks([])
     level, delta = cells.levels(grid)[0], cells.probabilities(grid)[0]
@@ -166,7 +167,8 @@ def _figure(
         if len(entries) == 2
         else f"{style.labels(entries)[0]} against itself, other seeds"
     )
-    figure.suptitle(f"{style.heading(entries)}: {subject}", x=0.01, ha="left", fontsize="medium")
+    shown = [*names, "all seeds"] if len(entries) == 1 else names
+    style.legend(figure, f"{style.heading(entries)}: {subject}", [_line(*each) for each in enumerate(shown)])
     many_words = "resampled from all" if len(entries) == 2 else "halves of all"
     style.footnotes(
         figure,
@@ -190,32 +192,36 @@ def _learning(
     grid: Grid,
     horizon: int,
     title: str,
-    names: Sequence[str],
     complexities: Sequence[int],
     color: int = 0,
 ) -> None:
     """Draw mean and standard deviation of samples (n, T), as papers with few seeds do."""
-    for k, (entry, values, name, steps) in enumerate(zip(entries, samples, names, complexities)):
+    for k, (entry, values) in enumerate(zip(entries, samples)):
         look = style.style(k + color)
         shown = values[:, : horizon // entry.steps_per_epoch]
         at = np.arange(1, shown.shape[1] + 1) * entry.steps_per_epoch
         mean, spread = shown.mean(axis=0), shown.std(axis=0)
         axes.fill_between(at, mean - spread, mean + spread, color=look.color, alpha=0.15, lw=0)
-        axes.plot(at, mean, color=look.color, ls=look.line, lw=1.5, label=f"{name}: Ŝ = {steps_text(steps)}")
+        axes.plot(at, mean, color=look.color, ls=look.line, lw=1.5)
     axes.axhline(grid.thresholds[0], color="#505050", lw=0.9, ls=":")
-    axes.set_title(title, fontsize=8.5, loc="left")
+    axes.set_title(f"{title}\nŜ = {' and '.join(map(steps_text, complexities))}", fontsize=8.5, loc="left")
     axes.xaxis.set_major_formatter(steps_text)
     axes.set_xlim(0, horizon)
     axes.tick_params(labelsize=8)
     style.tidy(axes)
-    axes.legend(frameon=False, fontsize=7.5, loc="lower right")
 
 
-def _distribution(axes: Axes, drawn: _Draws, horizon: int, step: int, names: Sequence[str]) -> None:
+def _line(place: int, name: str) -> Line2D:
+    """Return what the legend shows of the entry, or the set of seeds, at a place."""
+    look = style.style(place)
+    return Line2D([], [], color=look.color, ls=look.line, lw=1.5, label=name)
+
+
+def _distribution(axes: Axes, drawn: _Draws, horizon: int, step: int) -> None:
     """Draw both distributions of S_hat over the samples."""
     width = step * max(1, round(horizon / step / 50))
     edges = np.arange(-0.5 * step, horizon + width + step, width)
-    for k, (steps, name) in enumerate(zip(drawn.steps, names)):
+    for k, steps in enumerate(drawn.steps):
         look = style.style(k)
         share = np.histogram(steps, edges)[0] / len(steps)
         axes.stairs(
@@ -227,7 +233,7 @@ def _distribution(axes: Axes, drawn: _Draws, horizon: int, step: int, names: Seq
             hatch=("", "////")[k],
             lw=0,
         )
-        axes.stairs(share, edges, color=look.color, ls=look.line, lw=1.4, label=name)
+        axes.stairs(share, edges, color=look.color, ls=look.line, lw=1.4)
     axes.set_xlabel("Ŝ (environment steps)", fontsize=8.5)
     axes.set_xlim(0, horizon + width)
     axes.set_ylim(bottom=0)
@@ -236,4 +242,3 @@ def _distribution(axes: Axes, drawn: _Draws, horizon: int, step: int, names: Seq
     axes.tick_params(labelsize=8)
     style.tidy(axes)
     axes.spines["left"].set_visible(False)
-    axes.legend(frameon=False, fontsize=7.5)

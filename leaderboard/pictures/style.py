@@ -91,10 +91,17 @@ def tidy(axes: Axes) -> None:
 
 
 def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
-    """Return what legends call entries: without the algorithm where all share it, never twice the same."""
+    """Return what legends call entries: without the algorithm where all share it, never twice the same.
+
+    An ansatz that no option chose is named where there is room for it.
+    """
     algorithms = {entry.algorithm for entry in entries}
+
+    def name(entry: EntryCurves, text: str) -> str:
+        return text.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else text
+
     short = [
-        entry.legend.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else entry.legend
+        legend if len(legend := name(entry, entry.legend)) <= longest else name(entry, entry.label)
         for entry in entries
     ]
     return [
