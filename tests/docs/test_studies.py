@@ -74,6 +74,8 @@ PAPER = {
     "ddqn vqc-native qubits=10 layers=5 / ddqn vqc-native qubits=10": "as many",
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=10 layers=3": "as many",
     "ddqn vqc-native qubits=8 layers=6 / ddqn vqc-native qubits=8": "as many",
+    "ddqn vqc-native qubits=8 layers=5 / ddqn vqc-native qubits=8": "as many",
+    "ddqn vqc-native qubits=8 / ddqn vqc-native qubits=8 layers=3": "as many",
     "ppo vqc-native qubits=10 / ppo mlp width=16": "fewer",
     "ppo vqc-native qubits=10 / ppo mlp width=32": "as many",
     "ppo vqc-native qubits=10 / ppo mlp width=64": "no fewer",
