@@ -13,16 +13,18 @@ import numpy as np
 import pytest
 
 from qrlsuite import api, registry
+from qrlsuite.errors import UnknownNameError
 from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.published import PUBLISHED, UNRANKED, read
 from qrlsuite.leaderboard.times import percent
-from qrlsuite.statistics import Comparison, Direction, LearningCurves, Verdict, times_board
+from qrlsuite.results.text import steps_text
+from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoard, Verdict, times_board
 from qrlsuite.statistics.standings import holm
 from qrlsuite.studies.decided import versus
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from qrlsuite.leaderboard.times import TimeRanking
 
 PAGE = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
+FIDELITY = (Path(__file__).parents[2] / "docs" / "fidelity.md").read_text()
 TABLE = PAGE.partition("\n## The paper's statements\n")[2].partition("\n## ")[0]
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
@@ -187,6 +190,39 @@ def published_pairs(first: str, second: str, task: str | None) -> Iterator[tuple
         yield row.entry, api.load(f"{second} {model}", task=task, published=True, runs="none")
 
 
+def each_model(
+    found: Iterable[tuple[EntryCurves, EntryCurves]], first: str, second: str
+) -> list[tuple[str, TimesBoard, Direction, str]]:
+    """Compare the entries of each pair by `times`, with Holm's correction over the pairs.
+
+    Returns
+    -------
+    Label, board, direction and `+14%, more at epsilon 0.1, p 0.0004` of each pair, the largest model first.
+    """
+    found = sorted(found, key=lambda pair: sum(pair[1].parameters), reverse=True)
+    pairs = []
+    for entry, other in found:
+        n, length = min(len(entry.seeds), len(other.seeds)), other.curves.shape[1]
+        assert entry.seeds[:n] == other.seeds[:n] == tuple(range(n))
+        curves = [
+            LearningCurves(each.curves[:n, :length], each.steps_per_epoch, name)
+            for name, each in ((first, entry), (second, other))
+        ]
+        grid = ranking_of([other]).grid
+        boards = [times_board(curves, grid, alpha) for alpha in (0.05, 0.05 / len(found))]
+        pairs.append((other.label, *boards))
+    adjusted = holm([board.p[0, 1] for _, board, _ in pairs])
+    levels = tuple(f"{float(level):g}" for level in grid.levels)
+    compared = []
+    for p, (label, board, strict) in zip(adjusted, pairs):
+        at, where = Direction.NOT_TOLD_APART, ""
+        if p <= 0.05:
+            at, where = strict.directions[0][1], places(strict.signs[0, 1], grid.level_name, levels)
+            at = board.directions[0][1] if at is Direction.NOT_TOLD_APART else at
+        compared.append((label, board, at, f"{percent(board.difference[0, 1])}{where}, p {p:.4f}"))
+    return compared
+
+
 def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[str, str, str, str]:
     """Return verdict, seeds, evidence and error of a statement about all models that are published in two places.
 
@@ -197,31 +233,9 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
     paper:
         What the paper expects of the first: "more" steps or "no fewer".
     """
-    found = sorted(
-        published_pairs(first, second, task), key=lambda pair: sum(pair[1].parameters), reverse=True
-    )
-    pairs = []
-    for entry, other in found:
-        n, length = len(entry.seeds), other.curves.shape[1]
-        assert (entry.seeds, other.seeds[:n]) == (tuple(range(n)), tuple(range(n)))
-        curves = [
-            LearningCurves(each.curves[:n, :length], each.steps_per_epoch, name)
-            for name, each in ((first, entry), (second, other))
-        ]
-        grid = ranking_of([other]).grid
-        boards = [times_board(curves, grid, alpha) for alpha in (0.05, 0.05 / len(found))]
-        pairs.append((entry.label.removeprefix(f"{first} "), n, *boards))
-    adjusted = holm([board.p[0, 1] for _, _, board, _ in pairs])
-    levels = tuple(f"{float(level):g}" for level in grid.levels)
-    directions, words = [], []
-    for p, (label, _, board, strict) in zip(adjusted, pairs):
-        at, where = Direction.NOT_TOLD_APART, ""
-        if p <= 0.05:
-            at, where = strict.directions[0][1], places(strict.signs[0, 1], grid.level_name, levels)
-            at = board.directions[0][1] if at is Direction.NOT_TOLD_APART else at
-        directions.append(at)
-        words.append(f"`{label}` {percent(board.difference[0, 1])}{where}, p {p:.4f}")
-    evidence = "; ".join(words)
+    compared = each_model(published_pairs(first, second, task), first, second)
+    directions = [direction for _, _, direction, _ in compared]
+    evidence = "; ".join(f"`{label.removeprefix(f'{second} ')}` {text}" for label, _, _, text in compared)
     against = sum(each in (Direction.FEWER, Direction.TRADE_OFF) for each in directions)
     if set(directions) == {Direction.MORE}:
         text = "holds"
@@ -229,10 +243,10 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
         text = f"holds for {directions.count(Direction.MORE)} of {len(directions)} models"
     else:
         text = f"does not hold for {against} of {len(directions)} models" if against else "not told apart"
-    numbers = [str(n) for _, n, *_ in pairs]
+    numbers = [str(board.n_runs[0]) for _, board, _, _ in compared]
     seeds = f"{numbers[0]} of each" if len(set(numbers)) == 1 else ", ".join(numbers)
     place = "" if task is None else f" on `{task}`"
-    return text, seeds, f"`{first}` against `{second}`{place}: {evidence}", f".05 for {len(pairs)} models"
+    return text, seeds, f"`{first}` against `{second}`{place}: {evidence}", f".05 for {len(compared)} models"
 
 
 def test_rows_of_every_model() -> None:
@@ -245,6 +259,33 @@ def test_rows_of_every_model() -> None:
     assert len(written) == len(EXPECTED)
     changed = [" | ".join(now) for then, now in zip(written, computed) if then != now]
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
+
+
+def test_what_the_released_rejection_and_the_text_change() -> None:
+    """The table of docs/fidelity.md: M of each model, and how much longer it is with another setting."""
+    models = [
+        f"ddqn {model}" for model in ("mlp width=16", "mlp width=32", "mlp width=64", "vqc-native qubits=10")
+    ]
+    lines = []
+    for title, task, change in (
+        ("the released rejection of paths", "beam6g+476ac3d2", ""),
+        ("the text's buffer and copies", "beam6g", " buffer=1000 target_steps=1000"),
+    ):
+        pairs = []
+        for model in models:
+            usual = api.load(model, task="beam6g", published=True, runs="none")
+            try:
+                pairs.append((api.load(f"{model}{change}", task=task, published=True, runs="none"), usual))
+            except UnknownNameError:
+                continue
+        for label, board, _, text in each_model(pairs, title, "ours"):
+            changed, usual = (steps_text(mean.mean, digits=3) for mean in board.means)
+            seeds = board.n_runs[0]
+            lines.append(
+                f"| {title} | {label.removeprefix('ddqn ')} | {seeds} | {usual} | {changed} | {text} |"
+            )
+    missing = [line for line in lines if line not in FIDELITY]
+    assert not missing, "rows of docs/fidelity.md, as they should be:\n" + "\n".join(missing)
 
 
 def test_rows_of_a_plan() -> None:
