@@ -143,8 +143,9 @@ STUDIES = (
     "shots",
     "stacking",
     "fidelity",
+    "buffer",
 )
-ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz", "stacking", "fidelity")
+ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz", "stacking", "fidelity", "buffer")
 """Studies whose pictures are of kinds that others have, too."""
 SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
 """Grids of sizes, and what they become."""

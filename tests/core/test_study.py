@@ -91,6 +91,11 @@ EXPECTED = {
         for task in ("beam6g", "beam6g+7d1167f1")
         for text in mlps("ddqn", (16, 32, 64), task) + vqcs("ddqn", (10,), task)
     ],
+    "buffer": [
+        text + change
+        for change in ("", " buffer=10000")
+        for text in mlps("ddqn", (16, 32, 64)) + vqcs("ddqn", (10,))
+    ],
     "fidelity": [
         text + change
         for task, change in (
