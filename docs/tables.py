@@ -21,7 +21,7 @@ from qrlsuite.studies.decided import DecisionOutcome, by_question, difference_te
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "quantum-or-not.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "quantum-or-not.md", ROOT / "docs" / "fidelity.md")
 TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*\n*")
 
 Rows = Iterator[Sequence[str]]
