@@ -43,6 +43,7 @@ PAIR = re.compile(
     r"(?:study `(?P<study>[\w-]+)`, )?(?P<task>[\w+-]+): `(?P<first>[^`]+)` against `(?P<second>[^`]+)`"
 )
 EVERY_MODEL = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`(?: on `(?P<task>[^`]+)`)?: ")
+PLAN = re.compile(r"plan \[([\w-]+)\]")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
 
@@ -290,13 +291,15 @@ def test_what_the_released_rejection_and_the_text_change() -> None:
 
 def test_rows_of_a_plan() -> None:
     """Evidence from a decision plan names pairs of it, each with its verdict."""
-    found = plans.read(plans.PUBLISHED / "quantum-or-not")
-    verdicts = {versus(pair): pair.verdict for pair in found.pairs}
-    rows = [row for row in ROWS if row[4].startswith("plan [quantum-or-not]")]
-    said = {match["pair"]: match["verdict"] for row in rows for match in PLANNED.finditer(row[4])}
-    assert len(said) == sum(row[4].count(" / ") for row in rows) > 0
-    assert said == {pair: verdicts[pair] for pair in said}
-    assert {row[5] for row in rows} == {f".05 for {len(found.pairs)} pairs"}
+    rows = [(match[1], row) for row in ROWS if (match := PLAN.match(row[4]))]
+    assert {name for name, _ in rows} == {"quantum-or-not", "paper-settings"}
+    for name, row in rows:
+        found = plans.read(plans.PUBLISHED / name)
+        verdicts = {versus(pair): pair.verdict for pair in found.pairs}
+        said = {match["pair"]: match["verdict"] for match in PLANNED.finditer(row[4])}
+        assert len(said) == row[4].count(" / ") > 0
+        assert said == {pair: verdicts[pair] for pair in said}
+        assert row[5] == f".05 for {len(found.pairs)} pairs"
 
 
 def test_few_runs() -> None:
