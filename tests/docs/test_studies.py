@@ -54,6 +54,9 @@ PAPER = {
     "ddqn vqc-native qubits=8 / ddqn mlp width=16": "fewer",
     "ddqn vqc-native qubits=6 / ddqn mlp width=16": "fewer",
     "ddqn vqc-native qubits=10 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=16 buffer=10000": "fewer",
+    "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=32 buffer=10000": "as many",
+    "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=64 buffer=10000": "as many",
     "ddqn vqc-native qubits=10 / ddqn mlp width=32": "as many",
     "ddqn vqc-native qubits=14 / ddqn mlp width=16": "fewer",
     "ddqn vqc-native qubits=14 / ddqn mlp width=64": "as many",
@@ -271,6 +274,7 @@ def test_what_the_released_rejection_and_the_text_change() -> None:
     for title, task, change in (
         ("the released rejection of paths", "beam6g+476ac3d2", ""),
         ("the text's buffer and copies", "beam6g", " buffer=1000 target_steps=1000"),
+        ("a buffer of 10,000", "beam6g", " buffer=10000"),
     ):
         pairs = []
         for model in models:
