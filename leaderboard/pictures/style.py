@@ -97,13 +97,12 @@ def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
     """
     algorithms = {entry.algorithm for entry in entries}
 
-    def name(entry: EntryCurves, text: str) -> str:
-        return text.removeprefix(f"{entry.algorithm} ") if len(algorithms) == 1 else text
+    def short_name(entry: EntryCurves) -> str:
+        start = f"{entry.algorithm} " if len(algorithms) == 1 else ""
+        whole = entry.legend.removeprefix(start)
+        return whole if len(whole) <= longest else entry.label.removeprefix(start)
 
-    short = [
-        legend if len(legend := name(entry, entry.legend)) <= longest else name(entry, entry.label)
-        for entry in entries
-    ]
+    short = [short_name(entry) for entry in entries]
     return [
         plain(text if short.count(text) == 1 else f"{entry.name.rpartition('-')[2]} {text}", longest)
         for text, entry in zip(short, entries)
