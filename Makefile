@@ -54,7 +54,7 @@ site: docs
 	$(BIN)/linkchecker --no-status --no-warnings site/index.html site/board.html
 
 # Every picture of docs/images that shows published entries (docs/pictures.py lists all, with their commands), and the
-# tables of published plans.
+# tables of published boards and plans.
 pictures: install-dev
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python docs/tables.py

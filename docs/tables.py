@@ -1,10 +1,11 @@
-"""The tables of published decision plans in README and docs: `make pictures` writes them anew.
+"""The tables of published boards and decision plans in README and docs: `make pictures` writes them anew.
 
-A comment names the plan and the kind of the table that follows it:
+A comment names the task or plan and the kind of the table that follows it:
 
+    <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
 
-A number behind it leaves only so many questions.
+A number behind the kind of a plan's table leaves only so many questions.
 """
 
 from __future__ import annotations
@@ -14,15 +15,25 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-from qrlsuite.leaderboard import plans
+from qrlsuite import api
+from qrlsuite.leaderboard import plans, tables
 from qrlsuite.leaderboard.plans import PublishedDecision
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.studies.decided import DecisionOutcome, by_question, difference_text, versus
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "quantum-or-not.md", ROOT / "docs" / "fidelity.md")
-TABLE = re.compile(r"(?<=<!-- table: )([\w-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*\n*")
+PAGES = [
+    ROOT / page
+    for page in (
+        "README.md",
+        "docs/fidelity.md",
+        "docs/leaderboard.md",
+        "docs/quantum-or-not.md",
+        "leaderboard/README.md",
+    )
+]
+TABLE = re.compile(r"(?<=<!-- table: )([\w+-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*\n*")
 
 Rows = Iterator[Sequence[str]]
 
@@ -73,11 +84,49 @@ def entries(outcome: DecisionOutcome, questions: int | None) -> Rows:
             )
 
 
-KINDS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
+def tiers(task: str) -> Rows:
+    """A board by significant outperformance; (†): settings chosen after seeing runs on protocol seeds."""
+    section = api.board(task, published=True, runs="none").sections[-1]
+    shown = ("tier", "rests on", "entry", "parameters", "seeds", "S_hat (5%-95%)", "score")
+    yield shown
+    for row in section.rows:
+        cells = dict(zip(tables.COLUMNS, tables.cells(section, row)))
+        cells["entry"] += " (†)" * row.entry.on_protocol_seeds
+        yield [cells[name] for name in shown]
+
+
+def times(task: str) -> Rows:
+    """A board by mean time below threshold, with the tiers beside it."""
+    section = api.board(task, published=True, runs="none").sections[-1]
+    depths = {row.entry.label: tables.tier_text(row) for row in section.rows}
+    shown = ("rank", "", "entry", "M (95%)", "above the first (95%)")
+    yield *shown, "tier"
+    for row in section.times.rows:
+        cells = dict(zip(section.times.columns(), section.times.cells(row)))
+        yield *(cells[name] for name in shown), depths[row.entry.label]
+
+
+def executions(task: str) -> Rows:
+    """The entries that execute circuits, by what these cost."""
+    [section] = api.costs(task, by="executions", published=True, runs="none").sections
+    shown = ("rank", "entry", "per step", "S_hat (5%-95%)", "M (95%)")
+    yield shown
+    for row in section.rows:
+        if not row.price.problem:
+            cells = dict(zip(section.columns(), section.cells(row)))
+            yield [cells[name] for name in shown]
+
+
+OF_PLANS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
 }
+OF_BOARDS: dict[str, Callable[[str], Rows]] = {"tiers": tiers, "times": times, "executions": executions}
+
+
+def _padded(cell: str) -> str:
+    return f" {cell} ".replace("\\", "\\\\").replace("|", "\\|") if cell else " "
 
 
 @cache
@@ -87,15 +136,16 @@ def published(name: str) -> DecisionOutcome:
 
 
 def filled(text: str) -> str:
-    """Return a page with every table as the published plans now give it."""
+    """Return a page with every table as the published entries and plans now give it."""
 
     def table(found: re.Match[str]) -> str:
-        plan, kind, questions = found.groups()
-        header, *rows = KINDS[kind](published(plan), int(questions) if questions else None)
+        name, kind, questions = found.groups()
+        if kind in OF_BOARDS:
+            header, *rows = OF_BOARDS[kind](name)
+        else:
+            header, *rows = OF_PLANS[kind](published(name), int(questions) if questions else None)
         lines = [header, ["---"] * len(header), *rows]
-        body = "\n".join(
-            "|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines
-        )
+        body = "\n".join("|" + "|".join(map(_padded, line)) + "|" for line in lines)
         asked = found[0].partition(" -->")[0]
         return f"{asked} -->\n\n{body.replace(' --- ', '---')}\n\n"
 

@@ -20,7 +20,7 @@ tables = load("tables")
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
-def test_tables_are_what_the_plans_decide(page: Path) -> None:
+def test_tables_are_what_the_published_files_say(page: Path) -> None:
     text = page.read_text()
     assert tables.TABLE.search(text)
     assert tables.filled(text) == text, "run `make pictures`"

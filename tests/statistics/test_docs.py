@@ -10,20 +10,15 @@ import pytest
 
 import qrlsuite.statistics
 from qrlsuite import registry
-from qrlsuite.leaderboard.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
-    LearningCurves,
     Outcome,
     PairDecision,
     Spending,
     Verdict,
     nominal_levels,
-    outperformance,
-    times_board,
 )
-from tests.statistics.conftest import SURFACE
 
 PAGE = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
 
@@ -77,20 +72,6 @@ def test_decisions_on_the_page_are_those_of_the_code() -> None:
     for decided in Decided:
         pair = PairDecision("A", "B", decided, 100, interval=(0, 0.12))
         assert f"`{pair.verdict}`" in PAGE.replace("above x percent", "above 12 percent")
-
-
-def test_the_published_board_on_the_page_is_that_of_the_code() -> None:
-    entries = [read(folder).entry_curves() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
-    curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries]
-    board = times_board(curves, SURFACE)
-    tiers = {entry.name: entry.tier for entry in outperformance(curves, SURFACE).ranking.entries}
-    for index in board.order:
-        mean, (best, worst) = board.means[index], board.ranks[index]
-        low, high = mean.interval
-        ranks = f"{best} to {worst}"
-        name = board.names[index]
-        assert f"| {name} | {tiers[name]} | {mean.mean:.0f} | {low:.0f} to {high:.0f} |" in PAGE
-        assert f"{100 * mean.at_cap.mean():.2f}% | {ranks} |" in PAGE
 
 
 def test_public_names_exist_and_are_documented() -> None:
