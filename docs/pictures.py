@@ -82,8 +82,8 @@ PICTURES: dict[str, Picture] = {
     "quantum-or-not-entries.png": Plot(f"decide plot {PLAN} --entries", PLAN_FILES),
     "quantum-or-not-pairs.png": Plot(f"decide plot {PLAN}", PLAN_FILES),
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
-    "report-times.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1104, "By mean time below threshold"),
-    "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1240),
+    "report-times.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1290, "By mean time below threshold"),
+    "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
@@ -100,6 +100,10 @@ PICTURES: dict[str, Picture] = {
     ),
     "study-degree-scaling.png": Plot(
         "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")
+    ),
+    "study-fidelity-text.png": Plot(
+        "study draw fidelity --published --only text",
+        ("unranked/beam6g/*",),
     ),
     "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig6-bars.png": Plot("study draw fig6 --published --seeds 30", ("entries/beam6g/*",)),
