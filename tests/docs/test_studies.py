@@ -47,6 +47,7 @@ EVERY_MODEL = re.compile(r"`(?P<first>[^`]+)` against `(?P<second>[^`]+)`(?: on 
 PLAN = re.compile(r"plan \[([\w-]+)\]")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
+TEXT = " buffer=1000 target_steps=1000"
 
 # What the paper expects of the first entry of a pair: that it needs fewer steps than the second, as many, or no fewer.
 PAPER = {
@@ -61,8 +62,8 @@ PAPER = {
     "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=32 buffer=10000": "as many",
     "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=64 buffer=10000": "as many",
     "ddqn vqc-native qubits=10 / ddqn mlp width=32": "as many",
-    "ddqn vqc-native qubits=10 buffer=1000 target_steps=1000 / ddqn mlp width=16 buffer=1000 target_steps=1000": "fewer",
-    "ddqn vqc-native qubits=10 buffer=1000 target_steps=1000 / ddqn mlp width=32 buffer=1000 target_steps=1000": "as many",
+    f"ddqn vqc-native qubits=10{TEXT} / ddqn mlp width=16{TEXT}": "fewer",
+    f"ddqn vqc-native qubits=10{TEXT} / ddqn mlp width=32{TEXT}": "as many",
     "ddqn vqc-native qubits=14 / ddqn mlp width=16": "fewer",
     "ddqn vqc-native qubits=14 / ddqn mlp width=64": "as many",
     "ddqn vqc-native qubits=14 / ddqn vqc-native qubits=10": "fewer",
@@ -73,7 +74,7 @@ PAPER = {
     "ddqn mlp width=256 / ddqn mlp width=64": "no fewer",
     "ddqn vqc-native qubits=8 / ddqn vqc-native qubits=6": "fewer",
     "ddqn vqc-native qubits=10 / ddqn vqc-native qubits=8": "fewer",
-    "ddqn mlp width=64 buffer=1000 target_steps=1000 / ddqn vqc-native qubits=10 buffer=1000 target_steps=1000": "fewer",
+    f"ddqn mlp width=64{TEXT} / ddqn vqc-native qubits=10{TEXT}": "fewer",
     "ddqn vqc-native qubits=12 / ddqn vqc-native qubits=10": "fewer",
     "ddqn vqc-native qubits=14 / ddqn vqc-native qubits=12": "fewer",
     "ddqn mlp width=64 / ddqn vqc-native qubits=10": "fewer",
