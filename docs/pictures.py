@@ -87,9 +87,6 @@ PICTURES: dict[str, Picture] = {
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
-    "study-antennas.png": Unpublished(
-        "study run antennas --seeds 10 --only mlp --only a2 --only a3"  # the circuit on ten of twenty placements
-    ),
     "study-deploy-errors.png": Unpublished("study run deploy --seeds 20"),
     "study-deploy-shots.png": Unpublished("study run deploy --seeds 20"),
     "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
@@ -97,6 +94,9 @@ PICTURES: dict[str, Picture] = {
     "study-ablation-layers.png": Plot(
         "study draw ablation --published --seeds 20 --only layers",
         ("entries/beam6g/ddqn-vqc-native-*", "unranked/beam6g/ddqn-vqc-native-*"),
+    ),
+    "study-antennas-scaling.png": Plot(
+        "study draw antennas --published --seeds 20", ("unranked/beam6g-a?-?/*",)
     ),
     "study-degree-scaling.png": Plot(
         "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")

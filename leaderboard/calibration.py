@@ -188,11 +188,11 @@ def choose(
     """
     lookup.check_tasks(runs, task)
     lines: list[str] = []
+    tasks = [task] if task else []
     if names:
-        tasks = [task] if task else []
         entries = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
     else:
-        entries, refused = collect.collect(runs, task, published=published)
+        entries, refused = collect.collect(runs, tasks, published=published)
         lines += refused
     lines += [f"{entry.label}: a single seed has no spread" for entry in entries if len(entry.seeds) < 2]
     entries = [entry for entry in entries if len(entry.seeds) >= 2]

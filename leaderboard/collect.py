@@ -24,18 +24,21 @@ Key = tuple[str, str]
 
 
 def collect(
-    runs: Path, task: str | None = None, published: bool = False, only: Collection[Key] | None = None
+    runs: Path, tasks: Collection[str] = (), published: bool = False, only: Collection[Key] | None = None
 ) -> tuple[list[EntryCurves], list[str]]:
     """Read every entry below a folder of results or of published entries.
 
     Parameters
     ----------
+    tasks:
+        Read the entries of these; of all where empty. Of no meaning beside `only`.
     published:
         Read the published entries that come with the suite, too. `runs` need not exist then. An entry that is in
         both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
         own copy gets less far towards the task's shortest horizon, both are shown.
     only:
-        Read these alone, those among them that no board ranks, too; None reads all that boards rank.
+        Read these alone, the unranked among them, too. None reads all that boards rank, and the unranked entries of
+        a task that is named and has no others.
 
     Returns
     -------
@@ -44,9 +47,10 @@ def collect(
     """
     good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
-    stores = _folders(runs, published, task)
-    if only is not None:
-        stores += entries(published_entries.UNRANKED, task) if published else []
+    if only is None:
+        stores = _folders(runs, published, tasks)
+    else:
+        stores = _folders(runs, published) + (entries(published_entries.UNRANKED) if published else [])
         stores = [store for store in stores if (store.path.parent.name, store.path.name) in only]
         absent = len(only) - len({(store.path.parent.name, store.path.name) for store in stores})
         if absent:
@@ -125,7 +129,7 @@ def select(
     }
     entries, left_out = list(named.values()), list[str]()
     if not named:
-        entries, left_out = collect(runs, next(iter(tasks)) if len(tasks) == 1 else None, published, only)
+        entries, left_out = collect(runs, tasks, published, only)
         entries = [entry for entry in entries if not tasks or entry.task in tasks]
     n_read = len(entries)
     kept = []
@@ -250,15 +254,24 @@ def _weight(entry: EntryCurves) -> tuple[int, int, int]:
     return min(epochs, enough), len(entry.seeds), epochs
 
 
-def _folders(runs: Path, published: bool, task: str | None = None) -> list[EntryStore]:
-    """Return the entries' folders: those in the results folder, and with `published` the published ones."""
+def _folders(runs: Path, published: bool, tasks: Collection[str] = ()) -> list[EntryStore]:
+    """Return the entries' folders: those in the results folder, and with `published` the published ones.
+
+    Those are what boards rank. Of a task that is named and has none of them they are the unranked ones.
+    """
     if not runs.is_dir() and not published:
         raise StoreError(
             f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another, and `qrlsuite "
             "leaderboard --published` shows what comes with the suite"
         )
-    stores = entries(runs, task) if runs.is_dir() else []
-    return stores + (entries(published_entries.PUBLISHED, task) if published else [])
+    stores = []
+    named: Sequence[str | None] = sorted(tasks) or [None]
+    for task in named:
+        stores += entries(runs, task) if runs.is_dir() else []
+        if published:
+            ranked = entries(published_entries.PUBLISHED, task)
+            stores += ranked or (entries(published_entries.UNRANKED, task) if task else [])
+    return stores
 
 
 def read(store: EntryStore) -> EntryCurves | None:

@@ -37,9 +37,10 @@ PUBLISHED = Path(__file__).parent / "entries"
 """The entries that come with the suite and stand on its boards."""
 
 UNRANKED = Path(__file__).parent / "unranked"
-"""The others that come with the suite: each answers a study's question. A name or the study finds them, no board does.
+"""The others that come with the suite: each answers a study's question. A board ranks them only when it is asked.
 
-More entries on a board make each of its pairs harder to decide, so a board has those of one question.
+It is asked by the study, by an entry's name, or by a task that has no other entries. More entries on a board make each
+of its pairs harder to decide, so a board has those of one question.
 """
 
 CURVES = "curves.parquet"

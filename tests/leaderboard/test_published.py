@@ -537,6 +537,21 @@ def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path
     assert command("leaderboard", "verify").stdout.count("ok ") == 2
 
 
+def test_a_task_that_is_named_and_has_unranked_entries_only_shows_them(
+    two: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setattr(published, "PUBLISHED", tmp_path / "empty")
+
+    def labels(tasks: str | list[str] | None) -> list[str]:
+        found = api.board(tasks, runs=tmp_path / "none", published=True)
+        return [row.entry.label for section in found.sections for row in section.rows]
+
+    assert labels("beam6g") == labels(["beam6g", "cartpole"]) == ["ddqn mlp width=16"]
+    assert labels(None) == []
+    assert len(api.board("beam6g", runs=tmp_path / "none", published=True, study=two).sections[0].rows) == 1
+
+
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     assert command("study", "draw", two, "--runs", str(runs)).exit_code

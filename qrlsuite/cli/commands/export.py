@@ -65,14 +65,13 @@ def export(
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
     lookup.check_tasks(runs, task)
+    tasks = [task] if task else []
     if everything:
-        selected, refused = collect.collect(runs, task)
+        selected, refused = collect.collect(runs, tasks)
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
     else:
-        selected = [
-            collect.find(runs, name, tasks=[task] if task else []) for name in dict.fromkeys(entries or [])
-        ]
+        selected = [collect.find(runs, name, tasks=tasks) for name in dict.fromkeys(entries or [])]
     written = []
     for entry in selected:
         try:
