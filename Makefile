@@ -46,7 +46,7 @@ tutorials: install-dev
 	cd $(VENV)/tutorials && PYTHONPATH=$(abspath $(VENV))/tutorials/site PIP_TARGET=$(abspath $(VENV))/tutorials/site \
 	  PIP_NO_BUILD_ISOLATION=0 PIP_NO_DEPS=1 $(abspath $(BIN))/python -c "import glob, nbclient, nbformat; [nbformat.write( \
 	  nbclient.execute(nbformat.read(path, 4), record_timing=False, coalesce_streams=True), path) \
-	  for path in glob.glob('*.ipynb')]"
+	  for path in sorted(glob.glob('*.ipynb'))]"
 	cp $(VENV)/tutorials/*.ipynb docs/tutorials
 
 # The documentation, and the leaderboard of published entries beside it, in one folder whose links are all checked.

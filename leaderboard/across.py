@@ -195,7 +195,7 @@ def collected(
     ----------
     tasks:
         Two or more.
-    names, shipped, horizon, min_seeds:
+    names, published, horizon, min_seeds:
         As for `qrlsuite.leaderboard.collect.select`; every name must be found on every task.
 
     Raises

@@ -16,7 +16,6 @@ from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
-from qrlsuite.results import lookup
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
@@ -173,6 +172,8 @@ def choose(
     ----------
     names:
         The entries (see `qrlsuite.leaderboard.collect.find`); all of the task where empty.
+    task, published:
+        As for `qrlsuite.leaderboard.collect.collect`; None where the entries belong to one task.
 
     Returns
     -------
@@ -186,9 +187,9 @@ def choose(
     OptionError
         If the entries belong to several tasks.
     """
-    lookup.check_tasks(runs, task)
-    lines: list[str] = []
     tasks = [task] if task else []
+    collect.check_tasks(runs, tasks, published)
+    lines: list[str] = []
     if names:
         entries = [collect.find(runs, name, published, tasks) for name in dict.fromkeys(names)]
     else:

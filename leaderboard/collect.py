@@ -37,8 +37,7 @@ def collect(
         both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
         own copy gets less far towards the task's shortest horizon, both are shown.
     only:
-        Read these alone, the unranked among them, too. None reads all that boards rank, and the unranked entries of
-        a task that is named and has no others.
+        Read these alone, the unranked among them, too. None reads what boards rank.
 
     Returns
     -------
@@ -50,9 +49,9 @@ def collect(
     if only is None:
         stores = _folders(runs, published, tasks)
     else:
-        stores = _folders(runs, published) + (entries(published_entries.UNRANKED) if published else [])
-        stores = [store for store in stores if (store.path.parent.name, store.path.name) in only]
-        absent = len(only) - len({(store.path.parent.name, store.path.name) for store in stores})
+        stores = _folders(runs, published, everything=True)
+        stores = [store for store in stores if (_task(store), store.path.name) in only]
+        absent = len(only) - len({(_task(store), store.path.name) for store in stores})
         if absent:
             refused.append(f"{absent} of the study's {len(only)} entries: nothing is trained yet")
     for store in stores:
@@ -209,15 +208,17 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        ranked = lookup.stored(_folders(runs, published))
-        everything = ranked + lookup.stored(entries(published_entries.UNRANKED) if published else [])
-        ranked, everything = (
-            [e for e in found if not tasks or e.task in tasks] for found in (ranked, everything)
-        )
+        ranked = lookup.stored(_folders(runs, published, tasks))
+        everything = lookup.stored(_folders(runs, published, tasks, everything=True))
         try:
             key = _choose(ranked, name, runs, tasks)
-        except UnknownNameError:  # then it is one that no board ranks
-            key = _choose(everything, name, runs, tasks)
+        except UnknownNameError as error:
+            try:  # it may be one that no board ranks
+                key = _choose(everything, name, runs, tasks)
+            except UnknownNameError:
+                if lookup.fitting(ranked, name):  # the shorter list of choices
+                    raise error from None
+                raise
         folders = [entry.store for entry in everything if entry.key == key]
     copies = [entry for entry in map(read, folders) if entry is not None]
     if not copies:
@@ -254,24 +255,38 @@ def _weight(entry: EntryCurves) -> tuple[int, int, int]:
     return min(epochs, enough), len(entry.seeds), epochs
 
 
-def _folders(runs: Path, published: bool, tasks: Collection[str] = ()) -> list[EntryStore]:
-    """Return the entries' folders: those in the results folder, and with `published` the published ones.
+def _folders(
+    runs: Path, published: bool, tasks: Collection[str] = (), everything: bool = False
+) -> list[EntryStore]:
+    """Return the folders of what boards rank: the entries in the results folder, and with `published` those published.
 
-    Those are what boards rank. Of a task that is named and has none of them they are the unranked ones.
+    Where a task has no published entries but unranked ones, its board ranks these, if the task is named or has
+    entries in the results folder.
+
+    Parameters
+    ----------
+    tasks:
+        Of these tasks only; of all where empty.
+    everything:
+        All unranked entries, too.
     """
     if not runs.is_dir() and not published:
         raise StoreError(
             f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another, and `qrlsuite "
             "leaderboard --published` shows what comes with the suite"
         )
-    stores = []
-    named: Sequence[str | None] = sorted(tasks) or [None]
-    for task in named:
-        stores += entries(runs, task) if runs.is_dir() else []
-        if published:
-            ranked = entries(published_entries.PUBLISHED, task)
-            stores += ranked or (entries(published_entries.UNRANKED, task) if task else [])
-    return stores
+    stores = entries(runs) if runs.is_dir() else []
+    if published:
+        ranked = entries(published_entries.PUBLISHED)
+        asked = {*tasks, *map(_task, stores)} - set(map(_task, ranked))
+        unranked = entries(published_entries.UNRANKED)
+        stores += ranked + [store for store in unranked if everything or _task(store) in asked]
+    return [store for store in stores if not tasks or _task(store) in tasks]
+
+
+def _task(store: EntryStore) -> str:
+    """Return the name of the folder of an entry's task."""
+    return store.path.parent.name
 
 
 def read(store: EntryStore) -> EntryCurves | None:

@@ -39,8 +39,9 @@ PUBLISHED = Path(__file__).parent / "entries"
 UNRANKED = Path(__file__).parent / "unranked"
 """The others that come with the suite: each answers a study's question. A board ranks them only when it is asked.
 
-It is asked by the study, by an entry's name, or by a task that has no other entries. More entries on a board make each
-of its pairs harder to decide, so a board has those of one question.
+It is asked by a study or an entry's name. And where all published entries of a task are unranked, they are on its board
+if the task is named, or has entries of one's own. More entries on a board make each of its pairs harder to decide, so a
+board has those of one question.
 """
 
 CURVES = "curves.parquet"

@@ -127,7 +127,8 @@ def board(
     tasks:
         A task or several; None means all.
     runs, published:
-        As for `load`.
+        As for `load`. Published entries that answer the question of one study are not ranked beside others of their
+        task: name the study.
     rule:
         What counts as significant: a name of `qrlsuite list significance-tests`; None means each task's own.
     alpha:

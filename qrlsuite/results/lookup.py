@@ -102,17 +102,22 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
     UnknownNameError
         If none or several match; the message says what to type.
     """
-    fitting = [e for e in among if name in _names(e)]
-    fitting = fitting or [e for e in among if any(known.startswith(name) for known in _names(e))]
-    if not fitting:
+    found = fitting(among, name)
+    if not found:
         alike = [e for e in among if mentions(e, name)]
         if not alike:
             labels = {_short(e) for e in among}
             raise UnknownNameError(f"no entry '{name}' in {searched}{nearest(name, labels)}")
         raise UnknownNameError(f"no entry begins with '{name}'; did you mean {_choices(alike, among)}?")
-    if len(fitting) > 1:
-        raise UnknownNameError(f"'{name}' may be any of {_choices(fitting, among)}: write one of these")
-    return fitting[0]
+    if len(found) > 1:
+        raise UnknownNameError(f"'{name}' may be any of {_choices(found, among)}: write one of these")
+    return found[0]
+
+
+def fitting(among: Sequence[N], name: str) -> list[N]:
+    """Return the entries that a name may mean, as `choose` does."""
+    whole = [e for e in among if name in _names(e)]
+    return whole or [e for e in among if any(known.startswith(name) for known in _names(e))]
 
 
 def mentions(entry: Named, word: str) -> bool:

@@ -22,7 +22,7 @@ from qrlsuite import api, hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import collect, published, studies, verify
+from qrlsuite.leaderboard import calibration, collect, published, studies, verify
 from qrlsuite.leaderboard.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
@@ -510,7 +510,9 @@ def two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(path)
 
 
-def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path: Path) -> None:
+def test_beside_ranked_entries_unranked_ones_are_found_by_name_and_by_study_only(
+    two: str, tmp_path: Path
+) -> None:
     def labels(**choice: Any) -> list[str]:
         found = api.board("beam6g", runs=tmp_path, published=True, **choice)
         return sorted(row.entry.label for row in found.sections[0].rows)
@@ -537,19 +539,46 @@ def test_unranked_entries_are_found_by_name_and_by_study_only(two: str, tmp_path
     assert command("leaderboard", "verify").stdout.count("ok ") == 2
 
 
-def test_a_task_that_is_named_and_has_unranked_entries_only_shows_them(
+def test_a_task_whose_published_entries_are_all_unranked_has_a_board_of_them(
     two: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "empty").mkdir()
     monkeypatch.setattr(published, "PUBLISHED", tmp_path / "empty")
+    runs = tmp_path / "runs"
+    runs.mkdir()
 
     def labels(tasks: str | list[str] | None) -> list[str]:
-        found = api.board(tasks, runs=tmp_path / "none", published=True)
+        found = api.board(tasks, runs=runs, published=True)
+        assert not found.refused
         return [row.entry.label for section in found.sections for row in section.rows]
 
-    assert labels("beam6g") == labels(["beam6g", "cartpole"]) == ["ddqn mlp width=16"]
-    assert labels(None) == []
-    assert len(api.board("beam6g", runs=tmp_path / "none", published=True, study=two).sections[0].rows) == 1
+    small = "ddqn mlp width=16"
+    assert labels("beam6g") == labels(["beam6g", "cartpole", "beam6g"]) == [small]
+    assert labels(None) == [], "neither named nor with entries of one's own"
+    assert len(api.board("beam6g", runs=runs, published=True, study=two).sections[0].rows) == 1
+    api.train("beam6g", model="mlp", options={"width": 8}, seeds=2, epochs=1, runs=runs, progress=False)
+    own = "ddqn mlp width=8"
+    assert sorted(labels("beam6g")) == sorted(labels(None)) == [small, own]
+    assert api.load("mlp width=16", runs=runs, published=True).label == small
+    with pytest.raises(QrlSuiteError, match="'mlp' may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"):
+        api.load("mlp", task="beam6g", runs=runs, published=True)
+    assert len(api.board("beam6g", runs=runs, published=True, study=two).refused) == 1, "width 64 is absent"
+
+
+def test_calibration_takes_a_published_variant_of_a_task(tmp_path: Path) -> None:
+    entries, refused = calibration.choose(tmp_path, (), "beam6g+7d1167f1", published=True)
+    assert {entry.task for entry in entries} == {"beam6g+7d1167f1"}
+    assert not refused
+    with pytest.raises(QrlSuiteError, match="unknown task"):
+        calibration.choose(tmp_path, (), "beam6g+7d1167f1")
+
+
+def test_an_ambiguous_name_lists_ranked_entries_where_some_fit(tmp_path: Path) -> None:
+    with pytest.raises(QrlSuiteError, match=r"may be any of .*'beam6g/ddqn mlp width=64': write") as raised:
+        api.load("mlp width=64", runs=tmp_path, published=True)
+    assert "beam6g-a5-0" not in str(raised.value)
+    with pytest.raises(QrlSuiteError, match="'ppo mlp' may be any of 'ppo mlp width=16'"):
+        api.load("ppo mlp", runs=tmp_path, published=True)
 
 
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
