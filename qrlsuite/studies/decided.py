@@ -326,8 +326,8 @@ def needs_text(study: DecisionStudy, needs: Mapping[str, Any] | None) -> str:
     if about is None:
         return requirement
     last = study.plan.looks[-1]
-    seeds = f"{about}" if about <= 10 * last else f"over {10 * last}"
-    return f"{requirement}; about {seeds} if the difference stays as it is now"
+    seeds = f"about {about}" if about <= 10 * last else f"over {10 * last}"
+    return f"{requirement}; {seeds} if the difference stays as it is now"
 
 
 def _about(span: Hours | None) -> str:
