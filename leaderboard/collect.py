@@ -47,7 +47,7 @@ def collect(
     good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
     if only is None:
-        stores = _folders(runs, published, tasks)
+        stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
     else:
         stores = _folders(runs, published, everything=True)
         stores = [store for store in stores if (_task(store), store.path.name) in only]
@@ -210,6 +210,9 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
     else:
         ranked = lookup.stored(_folders(runs, published, tasks))
         everything = lookup.stored(_folders(runs, published, tasks, everything=True))
+        ranked, everything = (
+            [e for e in found if not tasks or e.task in tasks] for found in (ranked, everything)
+        )
         try:
             key = _choose(ranked, name, runs, tasks)
         except UnknownNameError as error:
@@ -266,7 +269,7 @@ def _folders(
     Parameters
     ----------
     tasks:
-        Of these tasks only; of all where empty.
+        Those that are named; the folders of all tasks are returned.
     everything:
         All unranked entries, too.
     """
@@ -281,7 +284,7 @@ def _folders(
         asked = {*tasks, *map(_task, stores)} - set(map(_task, ranked))
         unranked = entries(published_entries.UNRANKED)
         stores += ranked + [store for store in unranked if everything or _task(store) in asked]
-    return [store for store in stores if not tasks or _task(store) in tasks]
+    return stores
 
 
 def _task(store: EntryStore) -> str:
