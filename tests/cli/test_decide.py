@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -677,3 +678,12 @@ def test_a_published_plan_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) 
 def test_a_file_goes_before_a_published_plan_of_its_name(refused: Refused) -> None:
     Path("quantum-or-not").write_text("x = 1")
     assert "quantum-or-not" in refused("show", "quantum-or-not")
+
+
+@pytest.mark.parametrize(("seeds", "said"), [(157, "about 157 if the"), (601, "over 600 if the")])
+def test_far_more_seeds_than_planned_are_not_counted(seeds: int, said: str) -> None:
+    study: Any = SimpleNamespace(ended=False, plan=SimpleNamespace(looks=(20, 40, 60)))
+    needs = {"level": 0.0021, "seeds": 40, "seeds_at_this_difference": seeds}
+    assert (
+        decided.needs_text(study, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
+    )

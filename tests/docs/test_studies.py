@@ -534,12 +534,11 @@ def harder(placements: Placements) -> list[str]:
     grid = ranking_of(placements[MODELS[0], 3][:1]).grid
     for model in MODELS:
         few, many = mean_times(placements, model).reshape(len(ANTENNAS), 5)[[1, 2]].mean(1)
-        easy, hard = (
-            times_below(
-                api.load(f"ddqn {model}", task=task, published=True, runs="none").curves[:20], grid, 2000
-            ).mean()
+        entries = (
+            api.load(f"ddqn {model}", task=task, published=True, runs="none")
             for task in ("beam6g", "beam6g-degree6")
         )
+        easy, hard = (times_below(entry.curves[:20], grid, entry.steps_per_epoch).mean() for entry in entries)
         rises.append((many / few - 1, hard / easy - 1))
     antennas, degrees = ([percent(each) for each in column] for column in zip(*rises))
     evidence = (
