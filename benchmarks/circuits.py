@@ -2,6 +2,7 @@
 
     python benchmarks/circuits.py --qubits 4 6 8 10 --plot circuits.png
     python benchmarks/circuits.py --bound
+    python benchmarks/circuits.py --gates --qubits 10
     python benchmarks/circuits.py --device cuda
 
 With `--bound`: the native simulator alone, every built-in ansatz, 10 seeds together, as a share of the processor's
@@ -9,6 +10,9 @@ bound: of what a loop of fused multiply-adds on the same vectors reaches, measur
 as in a plain list of gates: 28 operations per amplitude pair that a block of rotations touches (80 backward), 2 per
 amplitude and Hadamard (4 backward), nothing for CNOT and CZ. Shares are medians: of the kernels forward, backward and
 both, and of the whole call from torch.
+
+With `--gates`: every built-in ansatz on PennyLane's default.qubit and on the native simulator, called in turn. Ratios
+are to `rot` in the same structure on the same simulator; above 1 is slower.
 
 With `--device cuda`: the native simulator on a GPU, 100 seeds together (50 of 12 qubits, 30 of 14), by the clock,
 against one core of the machine that the GPU is in.
@@ -232,6 +236,32 @@ def print_shares(qubits: list[int], layers: int, seconds: float) -> None:
             print(f"{f'{name} {gate}':>10}{n:>8}{cells}", flush=True)
 
 
+def print_gates(qubits: list[int], layers: int, seconds: float) -> None:
+    """Print milliseconds of every built-in ansatz, and how much slower each is than `rot` in its structure."""
+    for n in qubits:
+        calls = {
+            (backend, *pair): torch_call(
+                ansatz(pair[0], qubits=n, layers=layers, gate=pair[1]), backend, torch.float32
+            )
+            for pair in NINE
+            for backend in ("pennylane", "native")
+        }
+        for call in calls.values():
+            call()
+        rounds: list[list[float]] = []
+        began = time.process_time()
+        while len(rounds) < 5 or time.process_time() - began < seconds * len(calls):
+            rounds.append([1e3 * seconds_of(call) for call in calls.values()])
+        row = dict(zip(calls, np.median(rounds, axis=0).tolist()))
+        print(f"n = {n}{'PennyLane default.qubit':>34}{'native':>26}")
+        for name, gate in NINE:
+            cells = "".join(
+                f"{row[b, name, gate]:>16.3g} ms ({row[b, name, gate] / row[b, name, 'rot']:.2f})"
+                for b in ("pennylane", "native")
+            )
+            print(f"{f'{name} {gate}':>12}{cells}", flush=True)
+
+
 def print_gpu(qubits: list[int], layers: int, seconds: float, device: str) -> None:
     """Print milliseconds of a population on a GPU, by the clock, and of the same work on one core."""
     print(f"{'qubits':>6} {'seeds':>5} {device:>10} {'one core':>10} {'ratio':>6}")
@@ -265,6 +295,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="native and PennyLane only")
     parser.add_argument("--plot", help="draw milliseconds against qubits to this file")
     parser.add_argument("--bound", action="store_true", help="shares of the processor's bound, native alone")
+    parser.add_argument("--gates", action="store_true", help="every built-in ansatz against its `rot`")
     parser.add_argument("--device", help="cuda: the native simulator there, against one core")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -273,6 +304,9 @@ def main() -> None:
         return
     if arguments.bound:
         print_shares(arguments.qubits, arguments.layers, arguments.seconds)
+        return
+    if arguments.gates:
+        print_gates(arguments.qubits, arguments.layers, arguments.seconds)
         return
     table: dict[str, dict[int, float]] = {}
     for n in arguments.qubits:
