@@ -178,8 +178,9 @@ class DecisionPlan:
     def __post_init__(self) -> None:
         if len(self.entries) < 2:
             raise OptionError(f"entries = {list(self.entries)}: a decision needs two or more")
-        if len(set(self.entries)) != len(self.entries):
-            raise OptionError(f"entries = {list(self.entries)}: a name is repeated")
+        for index, name in enumerate(self.entries):
+            if name in self.entries[:index]:
+                raise OptionError(f"entries: the name '{name}' is repeated")
         for look in self.looks:
             whole(look, "looks", at_least=2)
         if not self.looks or any(after <= before for before, after in zip(self.looks, self.looks[1:])):

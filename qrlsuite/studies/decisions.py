@@ -333,7 +333,7 @@ class DecisionStudy:
     def __init__(self, file: PlanFile, source: str, runs: Path) -> None:
         self.file, self.source, self.runs = file, source, runs
         self.folder = runs / FOLDER / file.name
-        planned = []
+        planned: list[Entry] = []
         for index, each in enumerate(file.entries):
             settings = [setting("options", word, value) for word, value in each.options.items()]
             try:
@@ -345,6 +345,11 @@ class DecisionStudy:
                     f"{source}: entries.{index}.hash is '{each.hash}', these options make '{entry.hash}' here: it is "
                     "another entry than was planned; write a new plan with `qrlsuite decide new`"
                 )
+            for before, other in enumerate(planned):
+                if other.hash == entry.hash:
+                    raise OptionError(
+                        f"{source}: entries.{before} and entries.{index} are the same, '{entry.label}': leave one out"
+                    )
             tuning = entry.tuning if each.tuning is None else each.tuning.plain()
             planned.append(replace(entry, plan=file.hash, tuning=tuning))
         names = tuple(each.name or name for each, name in zip(file.entries, _names(planned)))

@@ -399,7 +399,10 @@ TWO = (*NEW, "mlp width=16", "mlp width=4")
     ("words", "message"),
     [
         ((*NEW, "mlp"), "1 of two or more entries: write each as"),
-        ((*NEW, "mlp", "mlp width=16", "ddqn mlp width=16"), "a name is repeated"),
+        (
+            (*NEW, "mlp", "mlp width=16", "ddqn mlp width=16"),
+            "entries.1 and entries.2 are the same, 'ddqn mlp width=16': leave one out",
+        ),
         ((*NEW, "mlp", "mpl"), "unknown model 'mpl'; did you mean 'mlp'"),
         ((*NEW, "mlp", "mlp widht=4"), "did you mean 'width'"),
         ((*NEW, "mlp", "width=4 mlp"), "entry 'width=4 mlp': write 'MODEL NAME=VALUE ...'"),
@@ -568,7 +571,7 @@ def test_the_picture_of_entries_has_the_shortest_mean_time_first(refused: Refuse
         ('"mlp width=8", "wide"', '"narrow", "wide"', "a pair is repeated"),
         ('"mlp width=8", "wide"', '"wide"', "questions.1.pairs.0"),
         ('[["wide", "narrow"]]', "[]", "questions.0.pairs"),
-        ('name = "narrow"', 'name = "wide"', "a name is repeated"),
+        ('name = "narrow"', 'name = "wide"', "the name 'wide' is repeated"),
         ('name = "narrow"', 'name = "\\u001b[31m"', "entries.2.name"),
     ],
 )

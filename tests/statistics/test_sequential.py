@@ -216,7 +216,7 @@ def test_degenerate_pairs_are_closed() -> None:
     ("options", "message"),
     [
         ({"entries": ("a",)}, "a decision needs two or more"),
-        ({"entries": ("a", "a")}, "a name is repeated"),
+        ({"entries": ("a", "a")}, "the name 'a' is repeated"),
         ({"looks": (40, 20)}, r"looks = \[40, 20\]: each must be at more runs"),
         ({"looks": ()}, "looks"),
         ({"looks": (10, 20)}, "the first is below 20 runs.*give a reason"),
