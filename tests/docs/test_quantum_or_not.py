@@ -13,7 +13,11 @@ from tests.docs import load
 PAGE = (Path(__file__).parents[2] / "docs" / "quantum-or-not.md").read_text()
 PROSE = " ".join(PAGE.split())
 NAMES = sorted(folder.name for folder in plans.PUBLISHED.iterdir())
-ELSEWHERE = {"paper-settings": "fidelity.md", "paper-settings-circuit": "fidelity.md"}
+ELSEWHERE = {
+    "paper-settings": "fidelity.md",
+    "paper-settings-circuit": "fidelity.md",
+    "paper-settings-ppo": "fidelity.md",
+}
 """Plans of another page."""
 
 tables = load("tables")

@@ -347,7 +347,12 @@ def test_what_the_released_rejection_and_the_text_change() -> None:
 def test_rows_of_a_plan() -> None:
     """Evidence from a decision plan names pairs of it, each with its verdict."""
     rows = [(match[1], row) for row in ROWS if (match := PLAN.match(row[4]))]
-    assert {name for name, _ in rows} == {"quantum-or-not", "paper-settings", "paper-settings-circuit"}
+    assert {name for name, _ in rows} == {
+        "quantum-or-not",
+        "paper-settings",
+        "paper-settings-circuit",
+        "paper-settings-ppo",
+    }
     for name, row in rows:
         found = plans.read(plans.PUBLISHED / name)
         verdicts = {versus(pair): pair.verdict for pair in found.pairs}
