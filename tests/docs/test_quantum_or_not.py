@@ -14,6 +14,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "quantum-or-not.md").read_text()
 PROSE = " ".join(PAGE.split())
 NAMES = sorted(folder.name for folder in plans.PUBLISHED.iterdir())
 ELSEWHERE = {
+    "cartpole-sizes": "fidelity.md",
     "paper-settings": "fidelity.md",
     "paper-settings-circuit": "fidelity.md",
     "paper-settings-ppo": "fidelity.md",

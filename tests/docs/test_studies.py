@@ -352,6 +352,7 @@ def test_rows_of_a_plan() -> None:
         "paper-settings",
         "paper-settings-circuit",
         "paper-settings-ppo",
+        "cartpole-sizes",
     }
     for name, row in rows:
         found = plans.read(plans.PUBLISHED / name)
