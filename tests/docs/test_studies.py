@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from qrlsuite.leaderboard.curves import EntryCurves
     from qrlsuite.leaderboard.times import TimeRanking
+    from qrlsuite.statistics.sequential import PairDecision
 
     Placements = dict[tuple[str, int], list[EntryCurves]]
 
@@ -52,6 +53,7 @@ PLAN = re.compile(r"plan \[([\w-]+)\]")
 PLANNED = re.compile(r"`(?P<pair>[^`/]+ / [^`/]+)`: (?P<verdict>[^;|]+?)(?=;| \||$)")
 RETUNED = " lr=0.002"
 TEXT = " buffer=1000 target_steps=1000"
+SLIGHTLY = "holds; whether *slightly* is not decided"
 FEW_CELLS = "only in that most cells show no difference"
 
 # What the paper expects of the first entry of a pair: that it needs fewer steps than the second, as many (in most
@@ -64,6 +66,11 @@ PAPER = {
     "ddqn vqc-native qubits=12 / ddqn mlp width=16": "fewer",
     "ddqn vqc-native qubits=10 / ddqn mlp width=16 lr=0.002": "fewer",
     "ddqn vqc-native qubits=12 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=14 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=8 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=6 / ddqn mlp width=16 lr=0.002": "fewer",
+    "ddqn vqc-native qubits=10 layers=6 / ddqn mlp width=64": "as many",
+    "ddqn vqc-native qubits=10 layers=5 / ddqn mlp width=64": "as many",
     "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=16 buffer=10000": "fewer",
     "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=32 buffer=10000": "as many",
     "ddqn vqc-native qubits=10 buffer=10000 / ddqn mlp width=64 buffer=10000": "as many",
@@ -165,7 +172,7 @@ def verdict(board: TimeRanking, first: str, second: str, cells: Comparison) -> s
         )
         return FEW_CELLS if most else "does not hold"
     if paper == "slightly more":
-        return "holds, but for *slightly*" if direction is Direction.MORE and not wins else "does not hold"
+        return SLIGHTLY if direction is Direction.MORE and not wins else "does not hold"
     if {"fewer": Direction.FEWER, "no fewer": Direction.MORE}.get(paper) is not direction:
         return "does not hold"
     if losses if paper == "fewer" else wins:
@@ -269,9 +276,10 @@ def every_model(first: str, second: str, task: str | None, paper: str) -> tuple[
         text = "holds"
     elif paper == "more":
         text = f"holds for {directions.count(Direction.MORE)} of {len(directions)} models"
-        shown = {each[3] for each in compared if each[2] is Direction.MORE}
-        where = {match[1] for each in shown if (match := re.search("more at (epsilon [^,]+), p", each))}
-        text += f", at {where.pop()} alone" if len(where) == 1 < len(shown) else ""
+        shown = [each for _, _, direction, each in compared if direction is Direction.MORE]
+        where = {each.partition("more at ")[2].partition(", p ")[0] for each in shown}
+        if len(where) == 1 < len(shown) and re.fullmatch("epsilon [^,]+", *where):
+            text += f", at {where.pop()} alone"
     else:
         text = f"does not hold for {against} of {len(directions)} models" if against else "not told apart"
     numbers = [str(board.n_runs[0]) for _, board, _, _ in compared]
@@ -360,7 +368,31 @@ def test_rows_of_a_plan() -> None:
         said = {match["pair"]: match["verdict"] for match in PLANNED.finditer(row[4])}
         assert len(said) == row[4].count(" / ") > 0
         assert said == {pair: verdicts[pair] for pair in said}
+        if row[2].endswith(" percent"):
+            sizes = [
+                f"{100 * abs(pair.difference):.0f}" for pair in found.pairs if _other_is_better(pair, said)
+            ]
+            assert re.findall(r"(?:by|and) (\d+)(?= and| percent)", row[2]) == sizes
         assert row[5] == f".05 for {len(found.pairs)} pairs"
+
+
+def _other_is_better(pair: PairDecision, said: dict[str, str]) -> bool:
+    return said.get(versus(pair)) == f"{pair.second} needs fewer"
+
+
+def test_the_bias_of_few_runs() -> None:
+    """Numbers of the row on bias, from the table of docs/statistics.md."""
+    table = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
+    found = {
+        (network, int(runs)): np.array([float(cell) for cell in cells.split(" | ")])
+        for network, runs, cells in re.findall(r"^\| (width\d+) \| (\d+) \| (.*) \|$", table, re.M)
+    }
+    off = {
+        runs: max(abs(found[name, runs] / found[name, 1000] - 1).max() for name in ("width16", "width64"))
+        for runs in (5, 100)
+    }
+    said = f"at most {100 * off[100]:.0f} percent from that of 1000, the one of 5 runs by up to {100 * off[5]:.0f} "
+    assert said in TABLE
 
 
 def test_few_runs() -> None:
