@@ -678,6 +678,12 @@ def test_a_published_plan_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) 
     assert Path("own", "decisions", "widths").is_dir()
 
 
+def test_a_plan_that_is_not_there(refused: Refused) -> None:
+    assert "'quantum-or-no'; did you mean 'quantum-or-not'?" in refused("status", "quantum-or-no")
+    Path("quantum-or-no.toml").write_text("x = 1")
+    assert "'quantum-or-no'; did you mean 'quantum-or-no.toml'?" in refused("run", "quantum-or-no")
+
+
 def test_a_file_goes_before_a_published_plan_of_its_name(refused: Refused) -> None:
     Path("quantum-or-not").write_text("x = 1")
     assert "quantum-or-not" in refused("show", "quantum-or-not")

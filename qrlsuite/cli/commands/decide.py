@@ -22,7 +22,7 @@ from qrlsuite.cli.training import (
     execution_of,
 )
 from qrlsuite.engine.terminal import command, table_console
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.leaderboard import pictures, plans
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import write_atomically
@@ -268,10 +268,21 @@ def end(path: PlanArgument, runs: RunsOption = Path("runs")) -> None:
 
 
 def _published(path: Path) -> Path | None:
-    """Return the folder of a plan that comes with the suite, where its name was given and no path."""
+    """Return the folder of a plan that comes with the suite, where its name was given and no path.
+
+    Raises
+    ------
+    UnknownNameError
+        If nothing has that name, neither a published plan nor a file.
+    """
     folder = plans.PUBLISHED / path
-    named = len(path.parts) == 1 and not path.exists() and plans.is_published(folder)
-    return folder if named else None
+    if len(path.parts) != 1 or path.suffix == ".toml" or path.exists():
+        return None
+    if plans.is_published(folder):
+        return folder
+    file = path.with_name(f"{path.name}.toml")
+    known = [file.name] if file.exists() else [each.name for each in plans.PUBLISHED.iterdir()]
+    raise UnknownNameError(f"no file and no published plan is named '{path}'{nearest(path.name, known)}")
 
 
 def _outcome(path: Path, runs: Path) -> DecisionOutcome:
