@@ -13,6 +13,7 @@ from typer.main import get_command
 import qrlsuite
 from qrlsuite import registry
 from qrlsuite.cli.extensions import add_commands
+from qrlsuite.errors import OptionError
 from qrlsuite.specs import resolve
 
 
@@ -42,8 +43,7 @@ BUILT_IN = {
     for command in (
         LazyCommand("demo", "Train two small models and compare them: 5 minutes.", f"{_ROOM}.demo:demo"),
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
-        LazyCommand("status", "Show what is running, waiting and stopped.", f"{_ROOM}.status:status"),
-        LazyCommand("runs", "List the results folder: entries, seeds, size.", f"{_ROOM}.runs:runs"),
+        LazyCommand("runs", "List the results folder, and what is running in it.", f"{_ROOM}.runs:app"),
         LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
         LazyCommand("compare", "Compare two entries cell by cell, and in words.", f"{_ROOM}.compare:compare"),
         LazyCommand(
@@ -77,6 +77,9 @@ BUILT_IN = {
     )
 }
 
+RENAMED = {"status": "runs"}
+"""Commands of earlier versions, and what does their work now."""
+
 
 @functools.cache
 def load(command: LazyCommand) -> Any:
@@ -97,6 +100,8 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return name, command and the remaining arguments, importing a built-in command."""
+        if args[0] in RENAMED and args[0] not in self.commands:
+            raise OptionError(f"`qrlsuite {args[0]}` is now `qrlsuite {RENAMED[args[0]]}`")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load(BUILT_IN[name]) if name in BUILT_IN else command, rest
 

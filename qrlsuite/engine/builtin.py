@@ -40,7 +40,7 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
     register(
         EngineSpec(
             name="slurm",
-            summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite status`",
+            summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite runs`",
             factory="qrlsuite.engine.slurm:SlurmEngine",
             options="qrlsuite.engine.slurm:SlurmOptions",
             extras={"submitit": "pip install 'qrlsuite[slurm]'"},

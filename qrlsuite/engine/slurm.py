@@ -207,7 +207,7 @@ class SlurmEngine:
         array = ids[0].partition("_")[0]
         plural = "s" * (len(ids) > 1)
         return EngineOutcome(
-            submitted=f"submitted {len(ids)} task{plural} as SLURM job {array}; `qrlsuite status` shows how far they "
+            submitted=f"submitted {len(ids)} task{plural} as SLURM job {array}; `qrlsuite runs` shows how far they "
             f"are, `scancel {array}` stops them with everything saved, the same command submits what is missing then"
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,8 @@ class EntryStatus:
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
-            "task": self.entry.task,
-            "entry": self.entry.name,
-            "label": self.entry.label,
-            "seeds": dict(self.entry.seeds),
-            "problems": list(self.entry.problems),
+            **dataclasses.asdict(self.entry),
+            "folder": str(self.entry.folder),
             "queue_problem": self.queue_problem,
             "groups": [
                 {

@@ -243,14 +243,14 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
             ([*words, "--task", "beam6h", "--runs", "."], "unknown task 'beam6h'; did you mean 'beam6g'")
             for words in (
                 ["leaderboard"],
-                ["status"],
                 ["runs"],
                 ["runs", "gc"],
                 ["calibrate"],
                 ["plot", "curves"],
             )
         ],
-        (["status", "--task", "/etc"], "unknown task '/etc'"),
+        (["runs", "--task", "/etc"], "unknown task '/etc'"),
+        (["status"], "`qrlsuite status` is now `qrlsuite runs`"),
         (["plot", "estimator", "--task", "beam6g"], "picture 'estimator' shows no results: leave --task out"),
         (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),
         (

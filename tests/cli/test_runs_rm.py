@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from qrlsuite.cli.app import build
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, write_json
 
@@ -80,14 +80,21 @@ def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
 def test_mistakes_say_what_to_type(two: tuple[Path, Path], tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     for words, kind, message in (
-        (("rm",), OptionError, "name the entries to delete"),
         (("rm", "mpl width=8", "--yes"), UnknownNameError, "did you mean 'mlp width=8'"),
         (("rm", "mlp", "--yes"), UnknownNameError, "may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"),
         (("rm", "mlp width=8", "mlp", "--yes"), UnknownNameError, "may be any of"),
-        (("gc", "mlp"), OptionError, "takes no entry"),
-        (("mr",), OptionError, "did you mean 'rm'"),
     ):
         said = call(runs, *words)
         assert isinstance(said.exception, kind), words
         assert message in str(said.exception)
+    for words, message in (
+        (("rm",), "Missing argument 'ENTRY...'"),
+        (("gc", "mlp"), "unexpected extra argument"),
+        (("mr",), "No such command 'mr'"),
+    ):
+        assert message in call(runs, *words).output
+    misplaced = CliRunner().invoke(build(), ["runs", "--task", "tiny", "gc"])
+    assert "after the action: qrlsuite runs gc" in str(misplaced.exception)
+    there = CliRunner().invoke(build(), ["runs", "gc"], env={"QRLSUITE_RUNS": str(runs)})
+    assert there.exit_code == 0, "a variable is not misplaced"
     assert all(path.exists() for path in two)

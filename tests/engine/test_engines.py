@@ -210,7 +210,7 @@ def test_status_tells_what_waits_from_what_has_left_the_queue(
     squeue.chmod(0o755)
 
     def say(*words: str) -> str:
-        command = ["status", "--runs", str(entry.parent.parent), *words]
+        command = ["runs", "--runs", str(entry.parent.parent), *words]
         return CliRunner().invoke(build(), command, catch_exceptions=False).output
 
     monkeypatch.setenv("PATH", str(squeue.parent))
@@ -226,7 +226,7 @@ def test_status_tells_what_waits_from_what_has_left_the_queue(
     (row,) = json.loads(say("--json"))
     assert row["seeds"] == {"submitted": 3, "finished": 1}, "our own files are believed"
     assert "squeue is not found" in row["queue_problem"]
-    assert "may have left the queue, which was not asked: there is no SLURM on this machine" in say()
+    assert "the queue was not asked, seeds may have left it: there is no SLURM on this machine" in say()
 
 
 def test_squeue_is_asked_once_for_many_entries(

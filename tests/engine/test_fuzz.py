@@ -125,8 +125,6 @@ def answers(entry: Path, runs: Path) -> None:
     for words in (
         ["runs"],
         ["runs", "--json"],
-        ["status"],
-        ["status", "--json"],
         ["runs", "gc"],
         ["leaderboard"],
         ["leaderboard", "--format", "json"],

@@ -55,7 +55,7 @@ def test_a_full_disk(disk: Path, words: list[str], train: Callable[..., Path]) -
     assert full.returncode == 2
     assert "finished epochs are kept" in only_line(full)
     assert "No space left on device" in only_line(full)
-    for command in ("runs", "status", "leaderboard"):
+    for command in ("runs", "leaderboard"):
         answer(command, "--runs", str(disk / "runs"))
     remount(disk, "size=20m")
     resumed = qrlsuite(*words, *runs, "--epochs", "60")
@@ -89,7 +89,7 @@ def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
     other = qrlsuite(*words[:-4], "--set", "width=8", *runs)
     assert other.returncode == 2
     assert "Read-only file system; the old file is unchanged" in only_line(other)
-    for command in (["runs"], ["status"], ["leaderboard"], ["runs", "gc"]):
+    for command in (["runs"], ["leaderboard"], ["runs", "gc"]):
         answer(*command, *runs)
     with pytest.raises(StoreError, match="Read-only file system"):
         answer("runs", "gc", "--yes", *runs)
@@ -216,7 +216,7 @@ def test_a_folder_copied_while_it_was_at_work(words: list[str], tmp_path: Path) 
     assert waits.returncode == 0
     assert "2 seeds are being trained by" in waits.stderr
     assert "nothing is left to do here" in waits.stderr
-    assert "node17" in answer("status", "--runs", str(tmp_path / "there"))
+    assert "node17" in answer("runs", "--runs", str(tmp_path / "there"))
     claim.unlink()
     assert qrlsuite(*more).returncode == 0
     assert store.finished([0, 1], 3) == {0, 1}

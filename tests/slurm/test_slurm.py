@@ -118,7 +118,7 @@ def test_canceled_killed_and_timed_out_tasks_all_finish_once(
     again = run(tmp_path, "--engine", "slurm", "--json", epochs=epochs)
     assert json.loads(again.stdout)["seeds"] == 0, "what is queued is not submitted twice"
     status = subprocess.run(
-        [sys.executable, "-m", "qrlsuite", "status", "--json"],
+        [sys.executable, "-m", "qrlsuite", "runs", "--json"],
         capture_output=True,
         text=True,
         check=True,

@@ -1,93 +1,104 @@
-"""`qrlsuite runs`: list the results folder; `runs gc` removes checkpoints no longer needed, `runs rm` entries."""
+"""`qrlsuite runs`: what the results folder holds and how far it is; `runs gc` and `runs rm` remove parts of it."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
 from qrlsuite.engine.api import Queues
+from qrlsuite.engine.status import survey
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.errors import OptionError
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import entries
-from qrlsuite.results.survey import STATUSES, EntrySurvey, delete, garbage, look, remove, survey
+from qrlsuite.results.survey import STATUSES, EntrySurvey, delete, garbage, look, remove
 from qrlsuite.results.text import duration, size_text
 
+app = typer.Typer(invoke_without_command=True)
 
+
+@app.callback()
 def runs(
-    action: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[gc|rm]", help="gc: remove the checkpoints of finished groups. rm: delete entries."
-        ),
-    ] = None,
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[ENTRY]...", help="For rm: its name or label, or the beginning of one, after [TASK/]."
-        ),
-    ] = None,
+    context: typer.Context,
     task: TaskOption = None,
-    yes: Annotated[
-        bool,
-        typer.Option(
-            "--yes",
-            help="With gc: remove; without --yes, gc only lists. With rm: do not ask for confirmation.",
-        ),
-    ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """List the results folder: task, entry, seeds by status, epochs, size on disk, last activity.
 
-    `rm` asks before it deletes, and deletes no entry that is being trained.
+    Under an entry stand its groups of seeds that run, wait or stopped, from any machine that sees the folder.
+    Workers are not disturbed. Where seeds were submitted to a queue, the queue is asked whether it still has them.
 
     Examples: qrlsuite runs --task beam6g; qrlsuite runs rm "mlp width=64" --task beam6g
     """
-    lookup.check_tasks(runs, task)
-    if action == "rm":
-        _delete(runs, task, names or [], yes, json_output)
+    if context.invoked_subcommand is not None:
+        action = context.invoked_subcommand
+        for name in context.params:
+            if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
+                raise OptionError(
+                    f"put options after the action: qrlsuite runs {action} --task TASK --runs DIR"
+                )
         return
-    if names:
-        raise OptionError(f"`qrlsuite runs {action}` takes no entry: leave '{names[0]}' out")
-    if action == "gc":
-        _collect_garbage(runs, task, yes, json_output)
-        return
-    if action is not None:
-        raise OptionError(f"`qrlsuite runs` has no action '{action}'{nearest(action, ['gc', 'rm'])}")
-    if yes:
-        raise OptionError("--yes belongs to `qrlsuite runs gc` and `qrlsuite runs rm`")
-    _list(runs, task, json_output)
-
-
-def _list(folder: Path, task: str | None, json_output: bool) -> None:
-
-    summaries = survey(folder, task)
+    statuses = survey(runs, task)
     if json_output:
-        rows = [{**dataclasses.asdict(entry), "folder": str(entry.folder)} for entry in summaries]
-        typer.echo(json.dumps(rows))
+        typer.echo(json.dumps([status.as_dict() for status in statuses]))
         return
-    for entry in summaries:
-        for problem in entry.problems:
-            typer.echo(f"damaged: {problem}", err=True)
-    if not summaries:
-        typer.echo(f"{folder} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
+    for status in statuses:
+        for problem in status.entry.problems:
+            typer.echo(f"damaged: {printable(problem)}", err=True)
+    if not statuses:
+        typer.echo(f"{runs} holds no entry{f' of task {task}' if task else ''} yet: qrlsuite run")
         return
     now = time.time()
     table = [
         ("task", "entry", "label", "seeds", "epochs", "size", "last activity"),
-        *(_row(e, now) for e in summaries),
+        *(_row(status.entry, now) for status in statuses),
     ]
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
-    for row in table:
-        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in table]
+    typer.echo(lines[0])
+    for line, entry_status in zip(lines[1:], statuses):
+        typer.echo("\n".join([line, *map(printable, _unfinished(entry_status.as_dict()))]))
+
+
+@app.command("gc")
+def collect_garbage(
+    task: TaskOption = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Remove them; without it they are only listed.")] = False,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Remove the checkpoints of finished groups: curves and agents stay, but cannot be extended by more epochs.
+
+    Example: qrlsuite runs gc --yes
+    """
+    lookup.check_tasks(runs, task)
+    _collect_garbage(runs, task, yes, json_output)
+
+
+@app.command("rm")
+def delete_entries(
+    names: Annotated[
+        list[str],
+        typer.Argument(metavar="ENTRY...", help="Its name or label, or the beginning of one, after [TASK/]."),
+    ],
+    task: TaskOption = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Delete entries with all their seeds. It asks first, and deletes no entry that is being trained.
+
+    Example: qrlsuite runs rm "mlp width=64" --task beam6g
+    """
+    lookup.check_tasks(runs, task)
+    _delete(runs, task, names, yes, json_output)
 
 
 def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
@@ -103,6 +114,27 @@ def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
         size_text(entry.size),
         f"{duration(max(0.0, now - entry.last_activity))} ago",
     )
+
+
+def _unfinished(row: dict[str, Any]) -> list[str]:
+    """Return a line for each group of an entry that has not finished."""
+    lines = []
+    if row["queue_problem"]:
+        lines.append(f"  the queue was not asked, seeds may have left it: {row['queue_problem']}")
+    for group in row["groups"]:
+        parts = [f"  {group['state']:<9}"]
+        parts += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
+        parts += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
+        parts += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
+        if isinstance(group["median_score"], int | float):
+            parts.append(f"median score {group['median_score']:.3f}")
+        if group["seconds_left"] is not None and group["state"] == "running":
+            parts.append(f"{duration(group['seconds_left'])} left")
+        parts += [group["where"]] if group["where"] != "nobody" else []
+        parts += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
+        parts += [str(group["error"])] if group["error"] else []
+        lines.append("  ".join(parts))
+    return lines
 
 
 def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: bool) -> None:
@@ -132,8 +164,6 @@ def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: boo
 
 def _delete(folder: Path, task: str | None, names: list[str], yes: bool, json_output: bool) -> None:
 
-    if not names:
-        raise OptionError("name the entries to delete: qrlsuite runs lists them")
     stored = lookup.stored(entries(folder, task))
     searched = f"{folder}, task {task}" if task else folder
     chosen = list(dict.fromkeys(lookup.choose(stored, name, searched).store for name in names))
