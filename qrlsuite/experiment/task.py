@@ -334,16 +334,71 @@ def parse(text: str, source: str) -> Task:
     TaskError
         Listing every problem with its path in the file.
     """
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"{source}: not valid TOML: {error}") from None
+    data = _whole(text, source)
     try:
         file = TaskFile.model_validate(data)
     except pydantic.ValidationError as error:
         problems = [*options.file_problems(error, TaskFile), *_environment_problems(data.get("environment"))]
         raise TaskError(f"{source}: " + "; ".join(problems)) from None
     return Task(file, source)
+
+
+def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return a file's content; where it has `extends = TASK`, that task's, with this file's values in place of its own.
+
+    Tables are merged key by key. Every other value, a list too, replaces the one of the extended task.
+
+    Parameters
+    ----------
+    below:
+        The tasks whose files lead here by `extends`.
+
+    Raises
+    ------
+    TaskError
+        If a file is not TOML or cannot be read, or a task extends an unknown task or itself.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TaskError(f"{source}: not valid TOML: {error}") from None
+    if "extends" not in data:
+        return data
+    name = data.pop("extends")
+    if not isinstance(name, str):
+        raise TaskError(f'{source}: extends = {name!r}: name a task, as in extends = "beam6g"')
+    if name in below:
+        raise TaskError(f"{source}: a task extends itself: {' -> '.join([*below, name])}")
+    try:
+        path = Path(registry.task(name).path)
+    except UnknownNameError as error:
+        raise TaskError(f"{source}: extends: {error}") from None
+    return _merged(_whole(_read(path), path.name, (*below, name)), data)
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return nested tables with the values of `changes` in place of those of `base`."""
+    tables = {
+        key: _merged(base[key], value)
+        for key, value in changes.items()
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+    }
+    return {**base, **changes, **tables}
+
+
+def _read(path: Path) -> str:
+    """Return a task file's text.
+
+    Raises
+    ------
+    TaskError
+        If it cannot be read, or is not UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TaskError(f"task file {path} cannot be read: {reason}") from None
 
 
 def _environment_problems(section: Any) -> list[str]:
@@ -382,9 +437,4 @@ def load(name: str) -> Task:
 
         return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
     path = Path(name) if name.endswith(".toml") else Path(registry.task(name).path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise TaskError(f"task file {path} cannot be read: {reason}") from None
-    return parse(text, path.name)
+    return parse(_read(path), path.name)

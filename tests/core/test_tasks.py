@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment import entry, task
+from qrlsuite.hookspecs import hookimpl
 from tests.conftest import TINY
 
 
@@ -138,3 +140,58 @@ def test_other_environment_options_make_another_task(tmp_path: Path) -> None:
     assert other.hash != base.hash
     assert other.name == f"tiny+{other.hash[:8]}"
     assert base.with_environment({"degree": 3}).name == "tiny"
+
+
+def test_tasks_that_extend_beam6g_are_those_they_were_when_their_files_were_whole() -> None:
+    names = [name for name in registry.load().names("tasks") if name.startswith("beam6g-")]
+    assert len(names) == 24
+    assert task.digest({name: task.load(name).hash for name in names}) == "9ceffffafc875806"
+
+
+def test_a_task_extends_another() -> None:
+    head = 'format_version = 1\nextends = "beam6g-degree4"\nname = "longer"\nsummary = "Longer"\n'
+    base, longer = task.load("beam6g-degree4"), task.parse(f"{head}[environment.options]\nsteps = 300\n", "t")
+    assert longer.file.environment.options == {**base.file.environment.options, "degree": 4, "steps": 300}
+    assert longer.file.presets == base.file.presets
+    assert (longer.name, longer.hash == base.hash) == ("longer", False)
+    assert task.parse(head, "t").hash == base.hash, "a name is no part of the definition"
+    assert task.parse(f"{head}[ranking]\nepsilons = [0.5]\n", "t").file.ranking.epsilons == [0.5], (
+        "lists are whole"
+    )
+
+
+@pytest.mark.parametrize(
+    ("extends", "message"),
+    [
+        ('"beam6h"', "t.toml: extends: unknown task 'beam6h'; did you mean 'beam6g'"),
+        ("3", "t.toml: extends = 3: name a task"),
+    ],
+)
+def test_what_cannot_be_extended_is_named(extends: str, message: str) -> None:
+    with pytest.raises(TaskError, match=message):
+        task.parse(
+            f"{TINY.replace('format_version = 1', f'format_version = 1{chr(10)}extends = {extends}')}",
+            "t.toml",
+        )
+
+
+class Circle:
+    """Registers two tasks that extend each other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @hookimpl
+    def register_tasks(self, register: Callable[[specs.TaskSpec], None]) -> None:
+        for name, other in (("one", "two"), ("two", "one")):
+            path = self.folder / f"{name}.toml"
+            path.write_text(f'extends = "{other}"\nname = "{name}"\n')
+            register(specs.TaskSpec(name=name, summary="A circle", path=str(path)))
+
+
+def test_tasks_that_extend_each_other_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fresh = registry.create(strict=True)
+    fresh.add_plugin(Circle(tmp_path), "circle")
+    monkeypatch.setattr(registry, "load", lambda: fresh)
+    with pytest.raises(TaskError, match=r"one\.toml: a task extends itself: two -> one -> two"):
+        task.load("one")

@@ -18,8 +18,8 @@ from qrlsuite.experiment import task
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.gymlanes import GymLanes, quick_name
 from qrlsuite.hookspecs import hookimpl
+from qrlsuite.plugins.environments.beam6g.placements import placement
 from qrlsuite.results.store import EntryStore
-from qrlsuite.tasks import variants
 from qrlsuite.training import group
 from qrlsuite.training.trainer import build_envs
 from tests.commands import qrlsuite
@@ -27,7 +27,6 @@ from tests.conftest import results
 from tests.environments.strangers import HERE
 
 ROOT = Path(__file__).parents[2]
-TASKS = Path(variants.__file__).parent
 PRESETS = [
     (name, preset, algorithm, family)
     for name in registry.load().names("tasks")
@@ -77,27 +76,13 @@ def test_cartpole_is_as_the_benchmark_says() -> None:
     assert file.default_algorithm == "reinforce"
 
 
-@pytest.mark.parametrize("name", variants.files())
-def test_the_variants_of_beam6g_are_what_the_script_writes(name: str) -> None:
-    assert (TASKS / name).read_text(encoding="utf-8") == variants.files()[name], (
-        "run python -m qrlsuite.tasks.variants"
-    )
-
-
-def test_a_base_file_of_another_form_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    base = tmp_path / "beam6g.toml"
-    base.write_text((TASKS / "beam6g.toml").read_text().replace("steps = 200", "steps = 100"))
-    monkeypatch.setattr(variants, "_BASE", base)
-    with pytest.raises(ValueError, match=r"beam6g.toml: .*steps = 200.* matches 0 times, not once"):
-        variants.files()
-
-
 def test_all_twenty_placements_are_there_and_differ() -> None:
     names = [name for name in registry.load().names("tasks") if re.fullmatch(r"beam6g-a\d-\d", name)]
     assert names == [f"beam6g-a{antennas}-{index}" for antennas in (2, 3, 4, 5) for index in range(5)]
     assert len({task.load(name).hash for name in names}) == 20
     for name in names:
-        assert len(task.load(name).environment_options.antennas) == int(name[8])
+        drawn = placement(int(name[8]), int(name[10]))
+        assert task.load(name).file.environment.options["antennas"] == json.loads(json.dumps(drawn))
         assert "ours" in task.load(name).file.summary
 
 
@@ -150,7 +135,7 @@ def test_tasks_without_a_file_that_cannot_be(env_id: str, message: str) -> None:
 
 
 def test_a_task_file_names_an_unknown_id_with_its_path(tmp_path: Path) -> None:
-    text = (TASKS / "acrobot.toml").read_text().replace("Acrobot-v1", "Acrobat-v1")
+    text = Path(registry.task("acrobot").path).read_text().replace("Acrobot-v1", "Acrobat-v1")
     with pytest.raises(
         QrlSuiteError, match=r"t.toml: environment.options: id = 'Acrobat-v1': .*'Acrobot-v1'"
     ):
