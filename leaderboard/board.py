@@ -539,6 +539,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "settings": entry.settings,
         "seeds": len(entry.seeds),
         "unfinished_seeds": len(entry.left_out),
+        "diverged_seeds": list(entry.diverged),
         "provisional": row.provisional,
         "sample_complexity": row.reference.steps,
         "interval": [row.reference.low, row.reference.high],

@@ -367,6 +367,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
                 "finished": run.finished,
                 "hours": run.seconds / 3600,
                 "executions": run.executions,
+                "diverged": run.diverged,
             }
             for run in runs
         },

@@ -72,7 +72,7 @@ class EntryCurves(Shown):
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     records:
         By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
-        `executions` that it took.
+        `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
     """
 
     name: str
@@ -151,6 +151,12 @@ class EntryCurves(Shown):
             executions=sum(int(record["executions"]) for record in records.values()),
         )
 
+    @property
+    def diverged(self) -> tuple[int, ...]:
+        """The seeds with agents whose numbers were not finite within the curves' epochs."""
+        first = {seed: self.records.get(seed, {}).get("diverged") for seed in self.seeds}
+        return tuple(seed for seed, epoch in first.items() if epoch and epoch <= self.curves.shape[1])
+
     def to_table(self) -> pyarrow.Table:
         """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.
 
@@ -180,7 +186,9 @@ class EntryCurves(Shown):
             "entry": f"{self.label} ({self.name})",
             "parameters": (f"{classical} + {quantum} quantum" if quantum else f"{classical}")
             + self.fixed_text,
-            "seeds": f"{n_runs}" + (f", {len(self.left_out)} unfinished left out" if self.left_out else ""),
+            "seeds": f"{n_runs}"
+            + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")
+            + (f", {len(self.diverged)} diverged" if self.diverged else ""),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
             "core-hours": f"{self.hours:.2f}",

@@ -110,6 +110,14 @@ def notes(section: Section) -> list[str]:
             "settings found by tuning: "
             + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
         )
+    diverged = [row.entry for row in section.rows if row.entry.diverged]
+    if diverged:
+        lines.append(
+            "diverged (numbers of the agents are no longer finite), ranked with the scores that they had: "
+            + ", ".join(
+                f"{entry.label} ({len(entry.diverged)} of {len(entry.seeds)} seeds)" for entry in diverged
+            )
+        )
     lines += unequal_tuning(section)
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:

@@ -289,6 +289,7 @@ class RunDisplay:
             left = min(left, max(0.0, self.deadline - now))
         done, completed, epochs = 0.0, 0, []
         scores: list[float] = []
+        diverged = 0
         for group in self.groups:
             state = snapshot.get(group.id, {})
             epoch = int(state.get("epoch") or group.epoch)
@@ -299,11 +300,13 @@ class RunDisplay:
             completed += len(group.seeds) * (state.get("phase") == "finished")
             epochs.append(epoch)
             scores += state.get("seed_scores") or []
+            diverged += sum(state.get("seed_diverged") or [])
         parts = [
             f"seeds {completed}/{sum(len(g.seeds) for g in self.groups)}",
             f"epoch {min(epochs)}/{self.epochs}",
         ]
         parts += [f"median score {statistics.median(scores):.3f}"] if scores else []
+        parts += [f"{diverged} diverged"] if diverged else []
         parts += [f"{duration(left)} left"] if left is not None else ["measuring"]
         text = "  ".join(parts)
         if self.bar.shown:
@@ -371,6 +374,12 @@ class RunDisplay:
             f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
         )
         self.console.print(f"{counted(summary['seeds'], 'seed')} complete{score_text}")
+        if summary["diverged"]:
+            self.console.print(
+                f"{summary['diverged']} of them diverged: numbers of their agents are no longer finite. They stay in "
+                "the results with the scores that they had; a smaller learning rate is the usual cure",
+                soft_wrap=True,
+            )
         protocol_seeds = self.entry.task.file.protocol.seeds
         if summary["seeds"] < protocol_seeds:
             self.console.print(f"provisional: the task's protocol asks for {protocol_seeds} seeds")

@@ -329,7 +329,8 @@ def summarize(work: Plan) -> dict[str, Any]:
     """Return what a finished (or partly finished) plan amounts to by now, as plain values."""
     store, epochs = work.store, work.epochs
     curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
-    complete = [curve.curve[:epochs] for curve in curves.values() if len(curve.scores) >= epochs]
+    runs = [run for run in curves.values() if len(run.scores) >= epochs]
+    complete = [run.curve[:epochs] for run in runs]
     return {
         "task": work.entry.task.name,
         "entry": work.entry.name,
@@ -338,6 +339,7 @@ def summarize(work: Plan) -> dict[str, Any]:
         "seeds": len(complete),
         "epochs": epochs,
         "median_score": float(np.median([curve[-1] for curve in complete])) if complete else None,
+        "diverged": sum(run.diverged is not None and run.diverged <= epochs for run in runs),
     }
 
 

@@ -27,13 +27,15 @@ class Progress:
     median_score: float | None = None
     seed_scores: list[float] = field(default_factory=list)
     """Each seed's score after `epoch`, for a median over all groups."""
+    seed_diverged: list[bool] = field(default_factory=list)
+    """Whether numbers of each seed's agent are no longer finite after `epoch`."""
     epoch_seconds: float | None = None
     warnings: list[str] = field(default_factory=list)
     """What the user should know although nothing failed: a tracker that was left out."""
 
-    def finished_epoch(self, epoch: int, seed_scores: list[float]) -> None:
-        """Take in that an epoch has finished, with every seed's score after it."""
-        self.epoch, self.seed_scores = epoch, seed_scores
+    def finished_epoch(self, epoch: int, seed_scores: list[float], seed_diverged: list[bool]) -> None:
+        """Take in that an epoch has finished, with every seed's score after it and whether it has diverged."""
+        self.epoch, self.seed_scores, self.seed_diverged = epoch, seed_scores, seed_diverged
         self.median_score = statistics.median(seed_scores)
 
 
@@ -67,9 +69,10 @@ class ProgressFile:
         if not (force or last) and now - self._written < 0.5:
             return
         self._written = now
-        scores = progress.seed_scores[places]
+        scores, diverged = progress.seed_scores[places], progress.seed_diverged[places]
         median = statistics.median(scores) if scores else None
-        shown = {**asdict(progress), "seed_scores": scores, "median_score": median, "error": error}
+        changed = {"seed_scores": scores, "seed_diverged": diverged, "median_score": median, "error": error}
+        shown = {**asdict(progress), **changed}
         content = json.dumps(shown).encode()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

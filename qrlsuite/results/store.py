@@ -191,6 +191,8 @@ class SeedRun:
     executions:
         Circuit executions of training, gradients and validation together. A circuit that is sampled with many shots
         is executed once.
+    diverged:
+        The first epoch after which numbers of the agent were not finite; None where they always were.
     """
 
     seed: int
@@ -199,6 +201,7 @@ class SeedRun:
     seconds: float
     executions: int
     clocked: bool = False
+    diverged: int | None = None
 
     @property
     def finished(self) -> bool:
@@ -358,7 +361,8 @@ class SeedStore:
             )
         shaped = scores if rows else np.empty((0, 0), np.float32)
         seconds, clocked = self._timed()
-        return SeedRun(self.seed, record, shaped, seconds, self._executions(rows), clocked)
+        diverged = next((int(row["epoch"]) for row in rows if row.get("diverged") is True), None)
+        return SeedRun(self.seed, record, shaped, seconds, self._executions(rows), clocked, diverged)
 
     def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
         total = 0

@@ -37,6 +37,8 @@ def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
             line[name] = value if math.isfinite(value) else None
         if epoch.executions[s]:
             line["executions"] = epoch.executions[s]
+        if epoch.diverged[s]:
+            line["diverged"] = True
         lines.append(line)
     return lines
 
@@ -311,7 +313,9 @@ class GroupRun:
         lines, timing = lines_of(epoch), timing_of(epoch, len(self.trainer.seeds))
         for files, places in self.parts():
             files.record(lines[places], timing)
-        self.progress.finished_epoch(epoch.number, epoch.scores.mean(axis=1).tolist())
+        self.progress.finished_epoch(
+            epoch.number, epoch.scores.mean(axis=1).tolist(), epoch.diverged.tolist()
+        )
         self.report(self.progress)
 
     def _save(self) -> None:

@@ -265,6 +265,8 @@ class Epoch:
         Circuit executions of each seed by name, validation included; empty without circuits.
     seconds:
         Wall time of training and validation, and on a processor its time, of the whole group.
+    diverged:
+        (S,): whether a number of the seed's policy is not finite after the epoch, or a metric of it is infinite.
     """
 
     number: int
@@ -272,6 +274,7 @@ class Epoch:
     scores: Floats
     executions: list[dict[str, int]]
     seconds: dict[str, float]
+    diverged: NDArray[np.bool_]
 
 
 class Trainer:
@@ -389,7 +392,15 @@ class Trainer:
         if self.device.type == "cpu":
             seconds["cpu"] = time.process_time() - processor
         self.epoch += 1
-        return Epoch(self.epoch, metrics, episodes.scores.reshape(self.S, self.V), executions, seconds)
+        scores = episodes.scores.reshape(self.S, self.V)
+        return Epoch(self.epoch, metrics, scores, executions, seconds, self._diverged(metrics))
+
+    def _diverged(self, metrics: dict[str, Floats]) -> NDArray[np.bool_]:
+        """Return, per seed, whether a number of its policy is not finite or a metric is infinite (NaN: no value)."""
+        found = np.any([np.isinf(values) for values in metrics.values()], axis=0)
+        for tensor in self.algorithm.policy_state().values():
+            found |= ~torch.isfinite(tensor.detach()).reshape(self.S, -1).all(1).cpu().numpy()
+        return np.asarray(found, np.bool_)
 
     def validate(self, epoch: int) -> Floats:
         """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V).
