@@ -24,7 +24,7 @@ from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import speed
-from qrlsuite.results.claims import living
+from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
@@ -206,7 +206,7 @@ def plan(
     requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
     last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
     store = EntryStore.find(runs, entry)
-    busy = {seed for claim in living(store) for seed in claim.seeds} | execution.engine.queued(store)
+    busy = {seed for claim in certain(store) for seed in claim.seeds} | execution.engine.queued(store)
     busy &= set(requested)
     left = sorted(set(requested) - busy)
     missing = plan_groups(store, left, last, execution.workers)
@@ -275,7 +275,7 @@ def train(
         check_memory(work, execution)
     fresh = not work.store.path.exists()
     EntryStore.create(work.runs, work.entry)
-    holders = sorted({f"process {claim.pid} on {claim.host}" for claim in living(work.store)})
+    holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
     display.begin(execution.submits, holders)
     if not work.groups:
         return EngineOutcome()

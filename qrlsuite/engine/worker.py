@@ -90,6 +90,9 @@ def train_group(
         for path, file in files.items():
             file.write(progress, error, force, places.get(path, slice(0)))
 
+    def held() -> bool:
+        return all(claim.refresh() for claim in claims)
+
     state = Progress(epochs=epochs)
     taken: SeedsClaimedError | None = None
     try:
@@ -104,7 +107,7 @@ def train_group(
             for group in plan_groups(store, seeds, epochs, workers=1):
                 parts.setdefault(group.epoch, []).append((store, group.seeds))
         for _, [(store, own), *further] in sorted(parts.items()):
-            run = GroupRun(store.entry(), store, own, epochs, device, report, further)
+            run = GroupRun(store.entry(), store, own, epochs, device, report, further, held)
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()

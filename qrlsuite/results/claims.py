@@ -1,16 +1,17 @@
 """Claims: files that keep two workers from training the same seed; a dead worker's claim is taken over.
 
-A claim is a file with host, process and seeds. Its holder refreshes the file's time every few seconds. On the
-holder's own host a claim lives exactly as long as the process. Elsewhere it is suspect when the file system's own
-clock says that it was not refreshed for `ABANDONED` seconds, or will only be refreshed in the future; that clock may
-have jumped, so a suspect claim is then watched for `WATCH` seconds of this process's monotonic clock, and taken over
-only if nobody refreshes it meanwhile.
+A claim is a file with machine, process and seeds. Its holder refreshes the file's time every few seconds. On the
+holder's own machine, known by host name, boot and installation, a claim lives exactly as long as the process. Elsewhere
+it is suspect when the file system's own clock says that it was not refreshed for `ABANDONED` seconds, or will only be
+refreshed in the future; that clock may have jumped, so a suspect claim is then watched for `WATCH` seconds of this
+process's monotonic clock, and taken over only if nobody refreshes it meanwhile.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import json
 import os
 import secrets
@@ -48,6 +49,7 @@ class Claim:
     host: str
     pid: int
     namespace: str
+    machine: str
     started: str
     token: str
     seeds: tuple[int, ...]
@@ -83,8 +85,8 @@ class Claim:
 
     @property
     def local(self) -> bool:
-        """Whether the holder runs where this process can see it: same host, same process numbers."""
-        return (self.host, self.namespace) == (socket.gethostname(), _namespace())
+        """Whether the holder runs where this process can see it: same machine, same process numbers."""
+        return (self.host, self.namespace, self.machine) == (socket.gethostname(), _namespace(), _machine())
 
     def release(self) -> None:
         """Give the seeds back, if they are still held."""
@@ -111,6 +113,20 @@ def _process_start(pid: int) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return started.stdout.strip() or "unknown"
+
+
+@functools.cache
+def _machine() -> str:
+    """Return what tells machines of one host name apart: this boot and the installation; "" where neither is known.
+
+    Process numbers mean something else after a boot, and the namespace of a machine's own processes has the same number
+    on every Linux.
+    """
+    parts = []
+    for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"):
+        with contextlib.suppress(OSError):
+            parts.append(Path(path).read_text().strip())
+    return " ".join(parts)
 
 
 def _namespace() -> str:
@@ -168,6 +184,7 @@ def _read(path: Path) -> Claim | None:
             host=str(content["host"]),
             pid=int(content["pid"]),
             namespace=str(content.get("namespace", "")),
+            machine=str(content.get("machine", "not recorded")),  # by earlier versions
             started=str(content["started"]),
             token=str(content["token"]),
             seeds=tuple(int(seed) for seed in content["seeds"]),
@@ -264,11 +281,13 @@ def _acquire_free(
         host=socket.gethostname(),
         pid=os.getpid(),
         namespace=_namespace(),
+        machine=_machine(),
         started=_process_start(os.getpid()) or "unknown",
         token=token,
         seeds=tuple(int(seed) for seed in seeds),
     )
-    content = {name: getattr(claim, name) for name in ("host", "pid", "namespace", "started", "token")}
+    written = ("host", "pid", "namespace", "machine", "started", "token")
+    content = {name: getattr(claim, name) for name in written}
     claim.path.write_text(json.dumps({**content, "seeds": list(claim.seeds)}))
     return claim
 

@@ -16,6 +16,7 @@ and a torn last line is dropped. Nothing is ever pickled.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -279,13 +280,16 @@ class SeedStore:
     def cut(self, epoch: int) -> int:
         """Drop every line newer than an epoch, and torn last lines; a table newer than it becomes lines again.
 
+        Where two workers wrote at once, lines may be there twice or be missing: the first of each epoch is kept, up to
+        the first that is missing.
+
         Returns
         -------
         int
             The number of epochs that are left: fewer than `epoch` where some are gone.
         """
         drop_torn_line(self.timings)
-        rows = [row for row in self.epochs() if row["epoch"] <= epoch]
+        rows = self._contiguous(epoch)
         last = int(read_table(self.table, decimals=False)[-1]["epoch"]) if self.table.exists() else 0
         if last > epoch:
             write_atomically(self.lines, b"".join(json_line(row) for row in rows))
@@ -293,6 +297,16 @@ class SeedStore:
         elif self.lines.exists():
             write_atomically(self.lines, b"".join(json_line(row) for row in rows if row["epoch"] > last))
         return len(rows)
+
+    def _contiguous(self, last: int) -> list[dict[str, Any]]:
+        """Return the record of each epoch from 1 to `last`, or to the one before the first that is missing."""
+        by_epoch: dict[int, dict[str, Any]] = {}
+        table = read_table(self.table, True) if self.table.exists() else []
+        for path, rows in ((self.table, table), (self.lines, read_lines(self.lines))):
+            for row in rows:
+                by_epoch.setdefault(_epoch(row, path), row)
+        numbers = itertools.takewhile(by_epoch.__contains__, range(1, last + 1))
+        return [by_epoch[number] for number in numbers]
 
     def sync(self) -> None:
         """Force appended lines to the disk: called before a checkpoint that supersedes them is written."""

@@ -10,7 +10,7 @@ import datetime
 import math
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -211,6 +211,8 @@ class GroupRun:
     others:
         Folders of further entries, each with the seeds of it that are at this epoch too: they are trained in the same
         population, and left as if each had been trained alone.
+    held:
+        Whether the seeds are still this process's own; nothing is written any more once they are not.
 
     Attributes
     ----------
@@ -234,8 +236,9 @@ class GroupRun:
         device: str = "cpu",
         report: Report = lambda progress: None,
         others: Sequence[tuple[store.EntryStore, Sequence[int]]] = (),
+        held: Callable[[], bool] = lambda: True,
     ) -> None:
-        self.epochs = epochs
+        self.epochs, self.held = epochs, held
         parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
         self.trainer = Trainer(
             [own for own, _, part in parts for _ in part],
@@ -257,7 +260,7 @@ class GroupRun:
         KeyboardInterrupt
             After an interruption, with everything saved.
         EnvironmentFailure, StoreError
-            If the environment raises, or results cannot be written; finished epochs stay.
+            If the environment raises, or results cannot be written or are another worker's; finished epochs stay.
         """
         with Interruptible() as guard:
             try:
@@ -310,6 +313,11 @@ class GroupRun:
 
     def _record(self, epoch: Epoch) -> None:
         """Append one line per seed, and show the progress."""
+        if not self.held():
+            raise StoreError(
+                "another worker has taken these seeds over, and goes on from their last checkpoint: nothing more is "
+                "written here"
+            )
         lines, timing = lines_of(epoch), timing_of(epoch, len(self.trainer.seeds))
         for files, places in self.parts():
             files.record(lines[places], timing)
@@ -320,7 +328,7 @@ class GroupRun:
 
     def _save(self) -> None:
         """Write the checkpoint of the last finished epoch, if it is newer than the one on disk."""
-        if self._snapshot is None:
+        if self._snapshot is None or not self.held():
             return
         epoch, arrays = self._snapshot
         for files, places in self.parts():

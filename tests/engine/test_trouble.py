@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -16,9 +17,10 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
-from qrlsuite.results import claims
+from qrlsuite.results import checkpoint, claims, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.store import EntryStore
+from qrlsuite.training.group import GroupRun
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 from tests.engine.stress import finished
@@ -187,6 +189,69 @@ def test_another_container_of_this_machine_is_judged_like_another_machine(
     claim.path.write_text(json.dumps({**content, "namespace": "pid:[1]", "pid": 2**22}))
     with pytest.raises(SeedsClaimedError):
         acquire(entry, [0])
+
+
+@pytest.mark.parametrize("machine", ["another boot, another installation", None])
+def test_another_machine_of_the_same_name_is_judged_like_another_machine(
+    machine: str | None, entry: EntryStore, quick: None
+) -> None:
+    """Host name and process namespace are the same on machines that were copied; earlier versions knew no more."""
+    claim = acquire(entry, [0])
+    content = json.loads(claim.path.read_text()) | {"machine": machine, "pid": 2**22}
+    if machine is None:
+        del content["machine"]
+    claim.path.write_text(json.dumps(content))
+    with pytest.raises(SeedsClaimedError):
+        acquire(entry, [0])
+
+
+def test_two_process_namespaces_of_one_host_name_share_a_folder(
+    words: list[str], tmp_path: Path, train: Callable[..., Path], hold: Hold
+) -> None:
+    """One holds the seeds and is killed, the other goes on; the bytes are those of one process."""
+    inside = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"]
+    if subprocess.run([*inside, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no process namespace can be made here")
+    runs = tmp_path / "shared"
+    command = [*inside, sys.executable, "-m", "qrlsuite", *words, "--epochs", "3", "--runs", str(runs)]
+    with (tmp_path / "first.txt").open("w") as output:
+        first = subprocess.Popen(
+            [*command, "--workers", "1"], env=hold.environment, stderr=output, cwd=tmp_path
+        )
+        hold.wait(first)  # type: ignore[arg-type]
+        (claim,) = runs.glob("*/*/claims/*.json")
+        said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stderr
+        assert "2 seeds are being trained by" in said
+        first.kill()
+        first.wait()
+    os.utime(claim, (0, 0))  # as when a machine has long been gone
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+    straight, entry = train("straight", [0, 1], 3), finished(runs, 2, 3)
+    assert entry is not None
+    for seed in (0, 1):
+        assert results(entry, seed) == results(straight, seed)
+
+
+def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(entry: EntryStore) -> None:
+    answers = iter([True, False, False, False])
+    run = GroupRun(entry.entry(), entry, [0], 5, held=lambda: next(answers))
+    before = entry.seed(0).epochs()
+    with pytest.raises(StoreError, match="another worker has taken these seeds over"):
+        run.run()
+    assert len(entry.seed(0).epochs()) == len(before) + 1
+    assert [header.epoch for header in checkpoint.headers(entry)] == [1], "no checkpoint is overwritten"
+
+
+def test_lines_of_two_workers_are_put_in_order_when_the_run_goes_on(train: Callable[..., Path]) -> None:
+    straight = train("straight", [0], 4)
+    entry = EntryStore(train("runs", [0], 2))
+    folder = entry.seed(0)
+    folder.write_record({"status": "running", "epochs": 2})
+    further = [store.json_line(row) for row in EntryStore(straight).seed(0).epochs()[2:]]
+    folder.lines.write_bytes(further[0] + further[0] + further[1] + further[1])
+    with pytest.raises(StoreError, match="epoch 4 is missing"):
+        folder.epochs()
+    assert results(train("runs", [0], 4), 0) == results(straight, 0)
 
 
 def test_a_file_system_that_does_not_answer_for_a_moment(
