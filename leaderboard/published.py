@@ -30,6 +30,7 @@ from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
+from qrlsuite.results import parquet
 from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
@@ -47,7 +48,7 @@ board has those of one question.
 CURVES = "curves.parquet"
 SEEDS = "seeds.parquet"
 MAX_BYTES = 20_000_000
-"""A file larger than this, packed or unpacked, is no entry."""
+"""A file larger than this, packed or unpacked, is no entry; nor one of more values than its seeds and epochs make."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +192,11 @@ def _read(folder: Path) -> PublishedEntry:
         _require(type(count) is int and 0 <= count < 10**12, folder, f"{family} parameters: {count!r}")
     networks = published["parameters"].get("networks", 1)
     _require(type(networks) is int and 0 <= networks < 10**6, folder, f"networks: {networks!r}")
-    seeds, curves = _curves(folder, task_file)
-    facts = _table(folder / SEEDS, _SEED_COLUMNS)
+    for name in ("seeds", "epochs"):
+        count = published[name]
+        _require(type(count) is int and 0 < count < 10**9, folder, f"{name}: {count!r}")
+    seeds, curves = _curves(folder, task_file, published["seeds"] * published["epochs"])
+    facts = _table(folder / SEEDS, _SEED_COLUMNS, published["seeds"], 10_000)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
     hours = np.array(facts["hours"], np.float64)
     executions = np.array(facts["executions"], np.int64)
@@ -288,9 +292,9 @@ _SEED_COLUMNS = {
 }
 
 
-def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-    """Read (N,) seeds and (N, T) curves."""
-    table = _table(folder / CURVES, _CURVE_COLUMNS)
+def _curves(folder: Path, task_file: TaskFile, rows: int) -> tuple[tuple[int, ...], NDArray[np.float64]]:
+    """Read (N,) seeds and (N, T) curves of N T rows."""
+    table = _table(folder / CURVES, _CURVE_COLUMNS, rows, len(_CURVE_COLUMNS))
     numbers = np.array(table["seed"], np.int64)
     epochs, scores = np.array(table["epoch"], np.int64), np.array(table["score"], np.float64)
     seeds, counts = np.unique(numbers, return_counts=True)
@@ -314,27 +318,23 @@ def _curves(folder: Path, task_file: TaskFile) -> tuple[tuple[int, ...], NDArray
     return tuple(int(seed) for seed in seeds), round_means(scores[order].reshape(len(seeds), length))
 
 
-def _table(path: Path, columns: Mapping[str, str]) -> dict[str, list[Any]]:
-    """Read a parquet file that must hold exactly these columns, without empty cells."""
-    try:
-        file = pyarrow.parquet.ParquetFile(path)
-        types = {
-            field.name: "list<double>"
-            if pyarrow.types.is_list(field.type) and pyarrow.types.is_float64(field.type.value_type)
-            else str(field.type)
-            for field in file.schema_arrow
-        }
-        if types != dict(columns):
-            raise StoreError(f"{path}: columns are {types}, and should be {dict(columns)}")
-        meta = file.metadata
-        size = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
-        if size > MAX_BYTES or meta.num_rows * 8 > MAX_BYTES:
-            raise StoreError(f"{path}: unpacks to more than {MAX_BYTES // 1_000_000} MB")
-        table = file.read()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise StoreError(
-            f"{path} is not a readable parquet file: {' '.join(str(error).split())[:200]}"
-        ) from None
+def _table(path: Path, columns: Mapping[str, str], rows: int, values: int) -> dict[str, list[Any]]:
+    """Read a parquet file that must hold exactly these columns, without empty cells.
+
+    Parameters
+    ----------
+    rows, values:
+        Rows at most, and values in each; a column is a dictionary of its values and places in it, so both may be there.
+    """
+    table = parquet.read(path, min(MAX_BYTES // 8, 2 * rows * values))
+    types = {
+        field.name: "list<double>"
+        if pyarrow.types.is_list(field.type) and pyarrow.types.is_float64(field.type.value_type)
+        else str(field.type)
+        for field in table.schema
+    }
+    if types != dict(columns):
+        raise StoreError(f"{path}: columns are {types}, and should be {dict(columns)}")
     if any(column.null_count for column in table.columns):
         raise StoreError(f"{path} has empty cells")
     result: dict[str, list[Any]] = table.to_pydict()

@@ -35,6 +35,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
+from qrlsuite.results import parquet
 
 FORMAT_VERSION = 1
 _SEED_FOLDER = re.compile(r"seed-(\d{4,})")
@@ -459,14 +460,15 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     Raises
     ------
     StoreError
-        If the file is truncated or not parquet.
+        If the file is truncated, not parquet, or decodes to more than a run can hold.
     """
+    table = parquet.read(path)
     try:
-        table = pyarrow.parquet.ParquetFile(path).read()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise StoreError(f"{path} is not a readable parquet file: {error}") from None
-    try:
-        rows = [_nest(flat, decimals) for flat in table.to_pylist()]
+        rows = [
+            _nest(flat) for flat in table.select([n for n in table.column_names if n != "scores"]).to_pylist()
+        ]
+        for row, scores in zip(rows, table["scores"].to_numpy() if "scores" in table.column_names else ()):
+            row["scores"] = shortest(scores) if decimals and scores is not None else scores
     except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
         raise StoreError(
             f"{path} does not hold epochs; restore the file or delete the seed's folder"
@@ -480,7 +482,7 @@ def _first_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
 
 
-def _nest(flat: Mapping[str, Any], decimals: bool) -> dict[str, Any]:
+def _nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Undo `_flatten`."""
     row: dict[str, Any] = {}
     for name, value in flat.items():
@@ -488,8 +490,7 @@ def _nest(flat: Mapping[str, Any], decimals: bool) -> dict[str, Any]:
         if dot:
             row.setdefault(outer, {})[inner] = value
         else:
-            exact = decimals and name == "scores" and value is not None
-            row[name] = shortest(np.array(value)) if exact else value
+            row[name] = value
     return row
 
 
