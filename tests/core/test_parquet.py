@@ -137,7 +137,7 @@ def written(path: Path, table: Any, **options: Any) -> Path:
 
 
 def test_bombs_take_no_memory(tmp_path: Path) -> None:
-    """Decoded, each takes gigabytes, with 194 bytes that say there is one value; here the process stays as large as a file of one value made it."""
+    """Decoded, each takes gigabytes; here the process stays as large as a file of one value made it."""
     one = written(tmp_path / "one.parquet", {"epoch": [1]})
     many = bomb(tmp_path / "many.parquet", COUNT)
     lying = bomb(tmp_path / "lying.parquet", COUNT, stated=1)

@@ -1,4 +1,4 @@
-"""Released result files: read through a closed table in a limited process, shown with a mark, never trained further."""
+"""Released result files: listed and not run, in a limited process; shown with a mark, never trained further."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import importlib
 import json
 import os
 import pickle
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -135,29 +137,173 @@ def test_names_with_dots_reach_nothing(tmp_path: Path) -> None:
         released.read(bad)
 
 
-def test_too_much_memory_is_refused(tmp_path: Path) -> None:
-    bad = write(tmp_path / "big.pkl", {"val_returns": Calls(bytearray, 1 << 40)})
-    with pytest.raises(StoreError, match="needs more than 2 GB of memory: refused"):
-        released.read(bad)
-
-
-def test_too_much_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fill = b"\x80\x04\x8c\x08builtins\x8c\x09bytearray\x93"  # 500 MB filled and dropped, again and again
-    slow = fill + b"2J\x00\x65\xcd\x1d\x85R0" * 200 + b"0N."
-    (tmp_path / "slow.pkl").write_bytes(slow)
+def limited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, change: str) -> None:
+    """Read files under other limits."""
     program = tmp_path / "limited.py"
     program.write_text(
         f"import sys; sys.path.insert(0, {str(PACKAGE / 'src')!r}); from qrlsuite_released import unpickle as r; "
-        "r.SECONDS = 1; sys.exit(r.main())"
+        f"{change}; sys.exit(r.main())"
     )
     run = released.subprocess.run
 
-    def limited(command: list[str], **options: Any) -> Any:
+    def other(command: list[str], **options: Any) -> Any:
         return run([command[0], str(program), command[-1]], **options)
 
-    monkeypatch.setattr(released.subprocess, "run", limited)
+    monkeypatch.setattr(released.subprocess, "run", other)
+
+
+def test_too_much_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = "int(open('/proc/self/statm').read().split()[0]) * 4096"
+    limited(monkeypatch, tmp_path, f"r.MEMORY = {here} + (64 << 20)")
+    (tmp_path / "large.pkl").write_bytes(b"\x80\x04(" + b"]" * 2_000_000 + b"l.")
+    with pytest.raises(StoreError, match="of memory: refused"):
+        released.read(tmp_path / "large.pkl")
+
+
+def test_too_much_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limited(monkeypatch, tmp_path, "r.SECONDS = 1")
+    (tmp_path / "slow.pkl").write_bytes(b"\x80\x04" + b"N0" * 6_000_000 + b"N.")
     with pytest.raises(StoreError, match="needs more than 60 seconds"):
         released.read(tmp_path / "slow.pkl")
+
+
+def short(text: str) -> bytes:
+    return b"\x8c" + bytes([len(text)]) + text.encode()
+
+
+def name(module: str, attribute: str) -> bytes:
+    return short(module) + short(attribute) + b"\x93"
+
+
+def dtype(code: str, order: str = "<") -> bytes:
+    state = b"(K\x03" + short(order) + b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00t"
+    return name("numpy", "dtype") + short(code) + b"\x89\x88\x87R" + state + b"b"
+
+
+def array(shape: bytes, kind: bytes, data: bytes) -> bytes:
+    """An array as protocol 4 writes it."""
+    begun = (
+        name("numpy._core.multiarray", "_reconstruct") + name("numpy", "ndarray") + b"K\x00\x85C\x01b\x87R"
+    )
+    return begun + b"(K\x01" + shape + kind + b"\x89" + data + b"tb"
+
+
+def holding(value: bytes, key: str = "val_returns") -> bytes:
+    """A file that holds a good array of returns and, under a key, a value."""
+    good = array(b"K\x02K\x02\x86", dtype("f8"), b"C\x20" + bytes(32))
+    return b"\x80\x04}(" + short("val_returns") + good + short(key) + value + b"u."
+
+
+def large(count: int) -> bytes:
+    return b"\x8a\x08" + count.to_bytes(8, "little", signed=True)
+
+
+DEEP = 200_000
+NDARRAY = name("numpy", "ndarray")
+HOSTILE = {
+    # arrays without numbers in them: the first two ended the process that read them, the third told addresses
+    "objects from bytes": NDARRAY + b"K\x01\x85" + short("O") + name("builtins", "bytearray") + b"K\x08\x85R\x87R",
+    "objects from a buffer": name("numpy._core.numeric", "_frombuffer")
+    + b"(C\x08AAAAAAAA" + dtype("O8", "|") + b"K\x01\x85" + short("C") + b"tR",
+    "addresses of objects": NDARRAY
+    + b"K\x02\x85"
+    + short("u8")
+    + array(b"K\x02\x85", dtype("O8", "|"), b"](NNe")
+    + b"\x87R",
+    "objects in an array's state": array(b"K\x01\x85", dtype("O8", "|"), b"C\x08AAAAAAAA"),
+    "a list as an array's bytes": array(b"K\x02K\x02\x86", dtype("f8"), b"](NNNNe"),
+    "fields": array(b"K\x01\x85", dtype("V8", "|"), b"C\x08AAAAAAAA"),
+    "text as numbers": array(b"K\x01\x85", dtype("U2"), b"C\x08AAAAAAAA"),
+    "a type by its name": array(b"K\x01\x85", dtype("object"), b"C\x08AAAAAAAA"),
+    "a type of two letters": array(b"K\x01\x85", dtype("f8,O"), b"C\x08AAAAAAAA"),
+    "another order of bytes": array(b"K\x01\x85", dtype("f8", "O"), b"C\x08AAAAAAAA"),
+    # shapes that are not those of their bytes
+    "a shape beyond the bytes": array(b"K\xffK\xff\x86", dtype("f8"), b"C\x08AAAAAAAA"),
+    "a negative shape": array(b"J\xff\xff\xff\xffJ\xff\xff\xff\xff\x86", dtype("f8"), b"C\x08AAAAAAAA"),
+    "a shape that overflows": array(large(1 << 62) + b"K\x04\x86", dtype("f8"), b"C\x00"),
+    "a shape of text": array(short("x") + b"\x85", dtype("f8"), b"C\x08AAAAAAAA"),
+    "a number of many bytes": name("numpy._core.multiarray", "scalar") + dtype("f8") + b"C\x10" + bytes(16) + b"\x86R",
+    "too many bytes": array(b"K\x01\x85", dtype("f8"), b"\x8e" + (1 << 62).to_bytes(8, "little")),
+    # what a call or a state would change
+    "a state of a class": name("argparse", "Namespace") + b"}" + short("x") + b"K\x01sb",
+    "a state of a function": name("_codecs", "encode") + b"}" + short("__globals__") + b"}sb",
+    "a state of a list": b"]}" + short("x") + b"K\x01sb",
+    "a call of a result": name("argparse", "Namespace") + b")R)R",
+    "a call of text": short("os.system") + short("id") + b"\x85R",
+    "a class of its own": b"(" + b"cposix\nsystem\n" + short("id") + b"o",
+    "an instance": b"(iposix\nsystem\n",
+    "an extension": b"\x82\x01",
+    "what the reader is to fetch": short("x") + b"Q",
+    "a buffer from elsewhere": b"\x97",
+    "a name in a name": name("numpy", "ndarray.__class__"),
+    "a name of a number": b"K\x01K\x02\x93",
+    "an attribute of a dictionary": name("builtins", "getattr"),
+    # what is endless
+    "a list in itself": b"]\x94h\x00a",
+    "lists in lists": b"]" * DEEP + b"a" * (DEEP - 1),
+    "tuples in tuples": b")" + b"\x85" * DEEP,
+    "a key of tuples in tuples": b"})" + b"\x85" * DEEP + b"Ns",
+    "a list of a list of a list twice, forty times": b"]\x94" + b"".join(
+        b"]\x94(h" + bytes([i, ord("h"), i]) + b"e" for i in range(40)
+    ),
+    "a long row again and again": b"](K\x00\x94" + b"h\x00" * 100_000 + b"e\x94](" + b"h\x01" * 100_000 + b"e",
+    "a long number": b"\x8b" + (100_000).to_bytes(4, "little") + b"\x7f" * 100_000,
+    "a key that is a list": b"}]Ns",
+    "a place that nothing was put in": b"h\x63",
+    "nothing to take": b"000000000",
+    "a mark that is not there": b"0000t",
+    "pairs without a half": b"}(Nu",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What becomes of each hostile file, in one process with the limits of any file."""
+    files = tmp_path_factory.mktemp("hostile") / "files.json"
+    files.write_text(json.dumps({case: holding(value).hex() for case, value in HOSTILE.items()}))
+    program = (
+        f"import json, sys; sys.path.insert(0, {str(PACKAGE / 'src')!r}); "
+        "from qrlsuite_released import unpickle as r; r.LARGEST = 10**6; "
+        "files = json.load(open(sys.argv[1])); r._limit(); "
+        "print(json.dumps({case: r.answer(bytes.fromhex(value)) for case, value in files.items()}))"
+    )
+    words = [sys.executable, "-P", "-c", program, str(files)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, ""), "the process that read them has ended"
+    answers: dict[str, Any] = json.loads(done.stdout)
+    return answers
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_file_is_refused_and_nothing_ends(case: str, answers: dict[str, Any]) -> None:
+    assert set(answers[case]) == {"refused"}
+
+
+def test_what_is_not_asked_for_is_not_looked_at() -> None:
+    """The same values beside good returns: most are refused, what is plain data is left where it is."""
+    good = {
+        case for case, value in HOSTILE.items() if "refused" not in released.answer(holding(value, "else"))
+    }
+    assert "lists in lists" in good
+    assert not good & {"a call of text", "a state of a class", "an instance", "a name in a name"}
+    assert released.answer(holding(b"N", "else"))["returns"] == [[0.0, 0.0]]
+
+
+def test_reading_looks_nothing_up() -> None:
+    """No name of a file is ever an attribute, a module or a function here."""
+    tree = ast.parse(Path(released.__file__).read_text())
+    called = {
+        node.func.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    assert not called & {"eval", "exec", "__import__", "setattr", "globals", "vars"}
+    (looked_up,) = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr"
+    ]
+    assert ast.unparse(looked_up) == "getattr(self, f'_{name.lower()}', None)", "the instruction's own name"
 
 
 @pytest.mark.parametrize(

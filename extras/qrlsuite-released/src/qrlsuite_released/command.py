@@ -39,8 +39,8 @@ def import_results(
 ) -> None:
     """Import released result files as the seeds of one entry, marked "(imported)" everywhere.
 
-    A pickle is a program. Each file is read in its own process, with limited memory and time and a closed list of
-    names; a file that asks for anything else is refused. Files that were imported before are skipped.
+    A pickle is a program, and none is run: its instructions are listed, in a process with limited memory and time. A
+    file that names what a released file does not need is refused. Files that were imported before are skipped.
 
     Example: qrlsuite import-released results/mlp/*.pkl --task beam6g --label "MLP of the paper"
     """
