@@ -64,8 +64,11 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
 
 
 def _made_with(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what a seed's last epochs were made with; under `before`, what else earlier ones were made with."""
-    *earlier, last = records
+    """Return what a seed's last epochs were made with; under `before`, what else earlier ones were made with.
+
+    The `host`, which a remote worker's record has, is nobody else's business.
+    """
+    *earlier, last = [{name: part for name, part in record.items() if name != "host"} for record in records]
     before = [record for record in dict.fromkeys(map(_frozen, earlier)) if record != _frozen(last)]
     return {**last, **({"before": [json.loads(record) for record in before]} if before else {})}
 

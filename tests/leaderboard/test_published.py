@@ -99,6 +99,23 @@ def test_writing_again_gives_the_same_bytes(folder: Path, tmp_path: Path) -> Non
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
+def test_names_of_hosts_are_not_exported(folder: Path, tmp_path: Path) -> None:
+    """A remote worker's record has one, in the run and in what it replaced."""
+    (store,) = [EntryStore(path.parent) for path in tmp_path.glob("runs/*/*/entry.json")]
+    for seed in store.seeds():
+        record = store.seed(seed).record() or {}
+        del record["format_version"]
+        (made,) = record["provenance"]
+        both = [{**made, "python": "3.0", "host": "secret-node"}, {**made, "host": "secret-node"}]
+        store.seed(seed).write_record({**record, "provenance": both})
+    (entry,), _ = collect.collect(tmp_path / "runs")
+    export(entry, tmp_path / "entries")
+    text = (folder / "entry.json").read_text()
+    assert '"before"' in text
+    assert "secret-node" not in text
+    assert '"host"' not in text
+
+
 def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
     folder: Path, train: Callable[..., Path], tmp_path: Path
 ) -> None:
