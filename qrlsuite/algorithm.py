@@ -7,6 +7,7 @@ group of seeds can be split and merged by slicing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,29 @@ BuildModel = Callable[[int], nn.Module]
 An entry's parameters are counted over all the networks that are built by it. One that is not trained, such as a
 target network, is a `copy.deepcopy` of another, or frozen by `requires_grad_(False)`.
 """
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What an algorithm keeps in memory, at least; returned by the function `memory` of an `AlgorithmSpec`.
+
+    Attributes
+    ----------
+    networks:
+        How often `state_dict` holds a model's parameters: once, with Adam's two moments three times, and with a target
+        network four times.
+    batch:
+        Samples of one agent that pass through a network at a time.
+    saved:
+        Bytes of one agent that `state_dict` holds beside them, such as a replay buffer.
+    working:
+        Bytes of one agent that it does not hold, such as an epoch's random numbers.
+    """
+
+    networks: int = 1
+    batch: int = 1
+    saved: int = 0
+    working: int = 0
 
 
 class Algorithm(Protocol):

@@ -134,12 +134,20 @@ class ModelSpec(Spec):
         Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
         `qrlsuite.population.stack`.
+    memory:
+        Reference to `memory(options, agents, batch, copies) -> int`: the bytes that a population of `agents` takes at
+        least, with `copies` of all its parameters in memory, while every agent computes `batch` samples. What does not
+        fit is refused before it is trained. None where it is unknown.
+    faster:
+        Name of a model that computes the same function much faster; recommended where training takes hours.
     """
 
     family: Literal["classical", "quantum"]
     options: str
     build: str
     population: str | None = None
+    memory: str | None = None
+    faster: str | None = None
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)
@@ -151,10 +159,22 @@ class ModelSpec(Spec):
 
 @dataclass(frozen=True, slots=True)
 class AlgorithmSpec(Spec):
-    """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`)."""
+    """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`).
+
+    Attributes
+    ----------
+    options:
+        Reference to a pydantic dataclass.
+    factory:
+        Reference to the class: see `qrlsuite.algorithm.Algorithm`.
+    memory:
+        Reference to `memory(options, rounds) -> qrlsuite.algorithm.Memory`: what it keeps in memory at least, where
+        an epoch has `rounds` steps of every environment. None where it is unknown.
+    """
 
     options: str
     factory: str
+    memory: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Double deep Q-learning with replay buffer and target network",
             options="qrlsuite.plugins.algorithms.ddqn:DDQNOptions",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
+            memory="qrlsuite.plugins.algorithms.ddqn:memory",
         )
     )
     register(
@@ -25,6 +26,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="Proximal policy optimization with generalized advantages, separate actor and critic",
             options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
+            memory="qrlsuite.plugins.algorithms.ppo:memory",
         )
     )
     register(
@@ -33,5 +35,6 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             summary="REINFORCE, the vanilla policy gradient, with or without a baseline",
             options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
+            memory="qrlsuite.plugins.algorithms.reinforce:memory",
         )
     )

@@ -30,7 +30,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from qrlsuite.algorithm import BuildModel
+from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed
@@ -202,3 +202,14 @@ class DDQN:
         self.buffer.copy_(state["buffer"])
         self.observations = state["observations"].clone().to(self.device)
         self.stored, self.epoch = (int(v) for v in state["counters"][0])
+
+
+def memory(options: DDQNOptions, rounds: int) -> Memory:
+    """Return what one agent keeps: online and target network, Adam's moments, the buffer; and an epoch's draws from it.
+
+    The buffer's rows have float32 numbers of observations of 4 numbers: beam6g's are 3, CartPole's 4.
+    """
+    row = 4 * (2 * 4 + 3)
+    return Memory(
+        networks=4, batch=options.batch, saved=options.buffer * row, working=8 * rounds * options.batch
+    )

@@ -40,7 +40,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from qrlsuite.algorithm import BuildModel
+from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed
@@ -349,3 +349,8 @@ def _normalized(advantages: Tensor) -> Tensor:
     if advantages.shape[1] < 2:
         return advantages - advantages  # a single sample is its own mean
     return (advantages - advantages.mean(1, keepdim=True)) / (advantages.std(1, keepdim=True) + 1e-8)
+
+
+def memory(options: PPOOptions, rounds: int) -> Memory:
+    """Return what one agent keeps: actor and critic with Adam's moments of both."""
+    return Memory(networks=6, batch=min(options.batch, rounds))

@@ -41,7 +41,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from qrlsuite.algorithm import BuildModel
+from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Since, Tuned
@@ -342,3 +342,8 @@ class Reinforce:
             self.carried_ends.copy_(state["carried_ends"])
         self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])
+
+
+def memory(options: REINFORCEOptions, rounds: int) -> Memory:
+    """Return what one agent keeps: a policy, where the baseline is one a value network, and Adam's moments."""
+    return Memory(networks=6 if options.baseline == "value" else 3, batch=min(BLOCK, rounds))

@@ -13,6 +13,12 @@ CIRCUITS = {
     "qiskit": "on Qiskit primitives: exact, with shots, or with noise",
 }
 
+MEMORY = {
+    "native": "qrlsuite.plugins.models.vqc:native_memory",
+    "pennylane": "qrlsuite.plugins.models.vqc:pennylane_memory",
+}
+"""What is known of the states that a simulator keeps."""
+
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
@@ -25,6 +31,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.mlp:MLPOptions",
             build="qrlsuite.plugins.models.mlp:build",
             population="qrlsuite.plugins.models.mlp:population",
+            memory="qrlsuite.plugins.models.mlp:memory",
         )
     )
     register(
@@ -35,6 +42,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.fourier:FourierOptions",
             build="qrlsuite.plugins.models.fourier:build",
             population="qrlsuite.plugins.models.fourier:population",
+            memory="qrlsuite.plugins.models.fourier:memory",
         )
     )
     for backend, summary in CIRCUITS.items():
@@ -51,5 +59,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
                 options=f"qrlsuite.plugins.models.vqc:{options}",
                 build="qrlsuite.plugins.models.vqc:build",
                 population="qrlsuite.plugins.models.vqc:population",
+                memory=MEMORY.get(backend),
+                faster=None if backend == "native" else "vqc-native",
             )
         )

@@ -32,6 +32,9 @@ from qrlsuite.plugins.circuits.options import NativeOptions, PennyLaneOptions, Q
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
+NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
+"""Bytes of circuit states that the two simulators keep at most, except that PennyLane takes at least one seed."""
+
 Activation = Literal["none", "relu", "tanh"]
 OptionValue = bool | int | float | str
 
@@ -444,6 +447,32 @@ def _require_fit(circuit: Circuit, obs_dim: int, out_dim: int) -> None:
 def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:
     """Stack built models."""
     return VQCPopulation(modules, options)
+
+
+def native_memory(options: VQCNativeOptions, agents: int, batch: int, copies: int) -> int:
+    """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, where they are kept.
+
+    Three of the simulator's working states, of 128 bytes per amplitude, come on top.
+    """
+    if not _entangled(options):
+        return 0
+    amplitudes = 1 << options.qubits
+    kept = agents * batch * amplitudes * (16 if options.dtype == "float64" else 8)
+    return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
+
+
+def pennylane_memory(options: VQCPennyLaneOptions, agents: int, batch: int, copies: int) -> int:
+    """Return the bytes of the states behind every gate, 64 layers n 2^n per sample, where PennyLane backpropagates."""
+    backprop = options.diff_method in ("auto", "backprop") and options.shots is None
+    if not (_entangled(options) and backprop and options.device == "default.qubit"):
+        return 0
+    lane = 64 * (1 << options.qubits) * options.layers * options.qubits
+    return min(agents * batch * lane, max(batch * lane, PENNYLANE_STATES))
+
+
+def _entangled(options: VQCOptions) -> bool:
+    """Return whether the circuit has a state of several qubits."""
+    return options.ansatz_options.get("entangled", True) is True
 
 
 def _backend_options(options: VQCOptions) -> dict[str, Any]:

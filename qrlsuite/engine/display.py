@@ -32,8 +32,6 @@ SILENCE_SECONDS = 20.0
 
 DAY = 86400.0
 
-FASTER = {"vqc-pennylane": "vqc-native", "vqc-qiskit": "vqc-native"}
-
 
 class _Clock:
     """Times one group's epochs, and the rounds of its first epoch, from its progress file."""
@@ -337,10 +335,9 @@ class RunDisplay:
                 self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
 
     def _faster(self) -> list[str]:
-
-        faster = FASTER.get(self.entry.model.name)
+        faster = self.entry.model.faster
         if faster in registry.load().names("models"):
-            return [f"--model {faster} trains the same circuit many times faster"]
+            return [f"--model {faster} computes the same and trains many times faster"]
         return ["fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"]
 
     def close(self) -> None:

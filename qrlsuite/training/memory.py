@@ -1,22 +1,26 @@
 """Checks, before training, that the groups fit into memory.
 
-Only the large arrays of the suite's own algorithms and models are counted, found by the names of their options; each is
-explained where it is counted. What is refused does therefore not fit; what is let through may still be large for
-reasons that are not known here (an environment's own memory, long observations, a plugin's model).
+Only what models and algorithms say of themselves is counted (`memory` of their specs); what they do not say is unknown.
+What is refused does therefore not fit; what is let through may still be large (an environment's own memory, long
+observations, a model that says nothing).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from qrlsuite import options
-from qrlsuite.errors import OptionError
+from qrlsuite import registry, specs
+from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import size_text
+
+if TYPE_CHECKING:
+    from qrlsuite.algorithm import Memory
 
 PROCESS = 300 << 20
 """Bytes of a process that has imported torch."""
@@ -24,56 +28,71 @@ PROCESS = 300 << 20
 COPIES = 3
 """Of what is saved: the training's own, the snapshot of the last epoch, and the next one while it is made."""
 
-OBSERVATION = 4
-"""Numbers of an observation: beam6g has 3, CartPole 4."""
-
-NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
-"""Bytes of circuit states that the two simulators keep at most, except that PennyLane takes at least one seed."""
-
 
 def group_bytes(entry: Entry, seeds: int) -> int:
     """Return the bytes that a group of `seeds` needs in its process, at least.
 
-    Counted are, at S seeds and batches of B samples, in float32 where nothing else is said:
+    What the algorithm saves is there three times, for checkpoints, and the parameters once more as gradients.
 
-    - a network of width w and depth d: (d - 1) w^2 parameters per seed; of these the network, Adam's two moments and
-      (with a replay buffer) the target network, each with the copies for checkpoints, and the gradients;
-    - D Fourier frequencies: per sample 2 D features, and their products with the weights of two actions or more;
-    - the replay buffer: S x buffer rows of two observations, action, reward and whether the episode went on, copied
-      for checkpoints;
-    - an epoch's draws from it: S x rounds x B in float64;
-    - circuit states of 2^n complex amplitudes: S x B x 8 bytes each (16 in float64) where the native simulator keeps
-      them, and three of its working states of 128 bytes each; S x B x layers x n x 64 where PennyLane backpropagates.
+    Raises
+    ------
+    PluginError
+        If `memory` of the algorithm's or the model's spec fails, or returns something else than it should.
     """
-    model, algorithm = (options.plain(o) for o in (entry.model_options, entry.algorithm_options))
-    batch = int(algorithm.get("batch", 64))
-    total = PROCESS
-    if "width" in model:
-        weights = (int(model["depth"]) - 1) * int(model["width"]) ** 2
-        total += 4 * seeds * weights * ((4 if "buffer" in algorithm else 3) * COPIES + 1)
-    if "frequencies" in model:
-        total += 4 * seeds * batch * int(model["frequencies"]) * (2 + 2 * 2)
-    if "buffer" in algorithm:
-        total += 4 * seeds * int(algorithm["buffer"]) * (2 * OBSERVATION + 3) * COPIES
-        total += 8 * seeds * entry.task.file.protocol.rounds * batch
-    if "qubits" in model:
-        total += _states(entry.model.name, model, seeds * batch, batch)
-    return total
+    kept = algorithm_memory(entry.algorithm, entry.algorithm_options, entry.task.file.protocol.rounds)
+    model = model_bytes(entry.model, entry.model_options, seeds, kept.batch, kept.networks * COPIES + 1)
+    return PROCESS + seeds * (kept.saved * COPIES + kept.working) + model
 
 
-def _states(name: str, model: dict[str, Any], lanes: int, batch: int) -> int:
-    """Return the bytes of circuit states, `batch` of the lanes belonging to one seed."""
-    if model["ansatz_options"].get("entangled", True) is not True:
-        return 0  # no state of several qubits
-    amplitudes = 1 << int(model["qubits"])
-    if name == "vqc-native":
-        kept = lanes * amplitudes * (16 if model["dtype"] == "float64" else 8)
-        return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
-    backprop = model.get("diff_method") in ("auto", "backprop") and model.get("shots") is None
-    if name == "vqc-pennylane" and model["device"] == "default.qubit" and backprop:
-        lane = 64 * amplitudes * int(model["layers"]) * int(model["qubits"])
-        return min(lanes * lane, max(batch * lane, PENNYLANE_STATES))
-    return 0
+def algorithm_memory(spec: specs.AlgorithmSpec, options: Any, rounds: int) -> Memory:
+    """Return what an algorithm's spec says that an agent keeps, the least that any keeps where it says nothing.
+
+    Raises
+    ------
+    PluginError
+        If its `memory` fails, or returns something else.
+    """
+    from qrlsuite.algorithm import Memory  # imports torch
+
+    if spec.memory is None:
+        return Memory()
+    kept = _call(spec, options, rounds)
+    if not isinstance(kept, Memory) or not all(map(_is_count, dataclasses.astuple(kept))):
+        raise _wrong(spec, f"returned {kept!r}, and must return a Memory of whole numbers")
+    return kept
+
+
+def model_bytes(spec: specs.ModelSpec, options: Any, agents: int, batch: int, copies: int) -> int:
+    """Return the bytes that a model's spec says that a population takes, 0 where it says nothing.
+
+    Raises
+    ------
+    PluginError
+        If its `memory` fails, or returns something else.
+    """
+    if spec.memory is None:
+        return 0
+    said: int = _call(spec, options, agents, batch, copies)
+    if not _is_count(said):
+        raise _wrong(spec, f"returned {said!r}, and must return a whole number of bytes")
+    return said
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _call(spec: specs.AlgorithmSpec | specs.ModelSpec, *arguments: Any) -> Any:
+    """Call the function that `memory` of a spec refers to."""
+    function = specs.resolve(str(spec.memory))
+    try:
+        return function(*arguments)
+    except Exception as error:  # whatever a stranger's code raises
+        raise _wrong(spec, f"fails: {registry.words(error)}") from error
+
+
+def _wrong(spec: specs.AlgorithmSpec | specs.ModelSpec, problem: str) -> PluginError:
+    return PluginError(f"'{spec.name}': memory = '{spec.memory}' {problem}")
 
 
 def available(meminfo: Path = Path("/proc/meminfo")) -> int | None:
@@ -116,8 +135,8 @@ def require(entry: Entry, groups: Sequence[Sequence[int]], workers: int, free: i
         advice = f"train fewer at a time, first --seeds {first}{fewer}; what is trained stays and counts"
     else:
         advice = (
-            "not even one seed fits: give the model fewer qubits or units or frequencies, or the algorithm a smaller "
-            "buffer"
+            f"not even one seed fits: make the model smaller (`qrlsuite show model {entry.model.name}` lists its "
+            f"options) or what the algorithm keeps (`qrlsuite show algorithm {entry.algorithm.name}`)"
         )
     raise OptionError(
         f"'{entry.label}': training {sum(sizes)} seeds at a time takes {size_text(needed)} of memory or more, and "

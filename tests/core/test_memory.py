@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pydantic.dataclasses import dataclass
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
+from qrlsuite.specs import AlgorithmSpec, ModelSpec
 from qrlsuite.training import memory
 from qrlsuite.training.memory import PROCESS, group_bytes
 
 GB = 10**9
+HERE = __name__
 BUFFER = 2000 * 11 * 4 * 3
 """Of one seed of beam6g: 2000 rows of two observations of 4 numbers and 3 more, of 4 bytes, with their copies."""
 DRAWS = 200 * 64 * 8
@@ -32,7 +36,7 @@ def test_networks_and_replay_buffers() -> None:
     assert group_bytes(wide, 10) - PROCESS == 10 * (group_bytes(wide, 1) - PROCESS)
     long = entry("mlp", "width=1", "depth=1", "buffer=1000000")
     assert group_bytes(long, 1) == PROCESS + 500 * BUFFER + DRAWS
-    assert group_bytes(entry("mlp", "width=100", "depth=2", algorithm="ppo"), 1) == PROCESS + 10 * 40_000
+    assert group_bytes(entry("mlp", "width=100", "depth=2", algorithm="ppo"), 1) == PROCESS + 19 * 40_000
 
 
 def test_circuit_states() -> None:
@@ -62,8 +66,53 @@ def test_what_does_not_fit_is_refused_with_what_would() -> None:
     assert "first --seeds 0:6; what is trained stays" in str(said.value)
     with pytest.raises(OptionError, match=r"first --seeds 0:1 --workers 1; "):
         memory.require(big, groups, 2, 3 * GB)
-    with pytest.raises(OptionError, match=r"not even one seed fits: .* fewer qubits or units"):
+    with pytest.raises(
+        OptionError, match=r"not even one seed fits: make the model smaller .`qrlsuite show model mlp`"
+    ):
         memory.require(big, groups, 2, 1 * GB)
+
+
+@dataclass(frozen=True)
+class OwnOptions:
+    width: int = 5
+    qubits: str = "many"
+    frequencies: str = "all"
+    buffer: str = "none"
+
+
+def bytes_of_mine(options: OwnOptions, agents: int, batch: int, copies: int) -> int:
+    return agents * options.width
+
+
+def none_of_mine(*given: object) -> float:
+    return 0.5
+
+
+def broken(*given: object) -> int:
+    raise ValueError("no width")
+
+
+def strange(memory: str | None) -> Entry:
+    spec = ModelSpec("mine", "Mine", "classical", f"{HERE}:OwnOptions", f"{HERE}:broken", memory=memory)
+    return replace(entry("mlp"), model=spec, model_options=OwnOptions())
+
+
+def test_a_third_party_s_options_mean_what_they_mean_to_it() -> None:
+    """No option is taken for a built-in's of that name: what a spec does not say is unknown."""
+    assert group_bytes(strange(None), 3) == PROCESS + 3 * (BUFFER + DRAWS)
+    assert group_bytes(strange(f"{HERE}:bytes_of_mine"), 3) == group_bytes(strange(None), 3) + 15
+    learner = AlgorithmSpec("learner", "Mine", f"{HERE}:OwnOptions", f"{HERE}:broken")
+    own = replace(entry("mlp", "width=100"), algorithm=learner, algorithm_options=OwnOptions())
+    assert group_bytes(own, 1) == PROCESS + 4 * 40_000, "its weights: saved three times, and gradients"
+
+
+@pytest.mark.parametrize(
+    ("memory", "message"),
+    [("broken", "fails: ValueError: no width"), ("none_of_mine", "returned 0.5, and must return a whole")],
+)
+def test_memory_that_is_no_number_is_named(memory: str, message: str) -> None:
+    with pytest.raises(PluginError, match=f"^'mine': memory = '{HERE}:{memory}' {message}"):
+        group_bytes(strange(f"{HERE}:{memory}"), 1)
 
 
 def test_what_is_free_is_read_or_at_least_what_the_machine_has(tmp_path: Path) -> None:

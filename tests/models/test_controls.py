@@ -265,7 +265,9 @@ def test_more_features_than_memory_are_refused() -> None:
     assert memory.group_bytes(large, 1) - memory.group_bytes(small, 1) == 65_535 * 64 * 4 * 6
     with pytest.raises(OptionError, match=r"training 100 seeds at a time takes .* first --seeds 0:"):
         memory.require(large, [range(100)], 1, 8 * 10**9)
-    with pytest.raises(OptionError, match=r"not even one seed fits: .* frequencies"):
+    with pytest.raises(
+        OptionError, match=r"not even one seed fits: make the model smaller .`qrlsuite show model fourier`"
+    ):
         memory.require(large, [range(1)], 1, 400 * 10**6)
     free = entry("vqc-native", "qubits=20", "entangled=mean-field"), entry("mlp", "width=1", "depth=1")
     assert memory.group_bytes(free[0], 5) == memory.group_bytes(free[1], 5), "no state of 2^20 amplitudes"

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from qrlsuite import registry
-from qrlsuite.specs import EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
+from qrlsuite.specs import AlgorithmSpec, EngineSpec, EnvironmentSpec, ModelSpec, PictureSpec, Spec
 from qrlsuite.testing import common
 from qrlsuite.testing.common import check_common, subject
 from qrlsuite.testing.fresh import fresh_process
@@ -32,6 +32,7 @@ def register_models(register):
         ModelSpec(
             name="{name}", summary="Strange", family="classical",
             options="tests.testing.strange:Good", build="tests.testing.strange:build",
+            memory="tests.testing.strange:memory",
         )
     )
 """
@@ -75,13 +76,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     importlib.invalidate_caches()
 
 
-def model(options: str = "Good", build: str = f"{STRANGE}:build", name: str = "") -> ModelSpec:
+def model(
+    options: str = "Good",
+    build: str = f"{STRANGE}:build",
+    name: str = "",
+    memory: str = f"{STRANGE}:memory",
+) -> ModelSpec:
     return ModelSpec(
         name=name or re.sub(r"\W+", "-", f"{options} {build}".lower()),
         summary="Strange",
         family="classical",
         options=f"{STRANGE}:{options}",
         build=build,
+        memory=memory,
     )
 
 
@@ -132,9 +139,18 @@ BROKEN = [
     ("options", Broken(model("Doubling"), r"differ: .*width=8\) became .*width=16\); is a value changed when it is")),
     ("options", Broken(model("Unordered"), r"^option 'names' holds a set, whose order is another one in every")),
     ("options", Broken(model("Assigned"), r"^option 'width' can be assigned to: write @dataclass\(frozen=True\)")),
+    ("memory", Broken(model(memory=f"{STRANGE}:build"), r":build' fails: AssertionError: no rule that all")),
+    ("memory", Broken(model(memory=f"{STRANGE}:Good"), r"Good' fails: .*")),
+    ("memory", Broken(AlgorithmSpec("learner", "Strange", f"{STRANGE}:Good", f"{STRANGE}:build", f"{STRANGE}:memory"),
+     r"^'learner': memory = '.*:memory' returned 1000, and must return a Memory of whole numbers")),
 ]  # fmt: skip
 
-KINDS = {ModelSpec: "models", EngineSpec: "engines", EnvironmentSpec: "environments"}
+KINDS = {
+    AlgorithmSpec: "algorithms",
+    ModelSpec: "models",
+    EngineSpec: "engines",
+    EnvironmentSpec: "environments",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
