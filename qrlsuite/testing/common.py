@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -11,7 +12,7 @@ from typing import Any
 
 from qrlsuite import options as option_values
 from qrlsuite import registry, specs
-from qrlsuite.errors import PluginError
+from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import HEAVY, fresh_process
 
@@ -72,6 +73,15 @@ class Subject:
             )
             pairs[name] = low, high
         return pairs
+
+    def counting(self, number: int) -> dict[str, Any]:
+        """Return, for every option with a whole number that is not among the settings, options where it is another."""
+        cls, counting = type(self.options()), {}
+        for name, value in option_values.plain(self.options()).items():
+            if type(value) is int and value != number and name not in self.settings:
+                with contextlib.suppress(OptionError):  # out of its bounds
+                    counting[name] = option_values.build(cls, {**self.settings, name: number}, self.title)
+        return counting
 
     def missing(self) -> str:
         """Return what to type for packages that it needs and that are not installed; `""` where all are there."""

@@ -18,6 +18,9 @@ from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding
 from qrlsuite.training import hidden
 
 OBS, OUT, B, S = 4, 3, 6, 5
+ODD = 5
+"""Units of a layer, and what else an option counts, for which vectors of the processor leave a rest."""
+BATCHES = (B, 1, 3, 7, 13)
 
 
 class Subjects:
@@ -29,6 +32,15 @@ class Subjects:
         self.spec, self.options, self.per_agent = spec, subject.options(), subject.per_agent()
         self.build = specs.resolve(spec.build)
         self.sampled = getattr(self.options, "shots", None) is not None
+        self.odd = {name: own for name, own in subject.counting(ODD).items() if self._builds(own)}
+        """Options by the name of one that is an odd number, where the model can be built with it."""
+
+    def _builds(self, options: Any) -> bool:
+        try:
+            self.population([0], [options])(_x(1))
+        except Exception:  # a value that the model does not allow
+            return False
+        return True
 
     def agent(self, seed: int, options: Any = None) -> nn.Module:
         """Return one agent, from a generator of that seed."""
@@ -97,8 +109,8 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _x(*lead: int, seed: int = 0) -> Tensor:
-    return torch.rand(*lead, B, OBS, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+def _x(*lead: int, seed: int = 0, batch: int = B) -> Tensor:
+    return torch.rand(*lead, batch, OBS, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
 def _builds(subjects: Subjects) -> None:
@@ -367,26 +379,40 @@ def _population(subjects: Subjects) -> None:
         )
 
 
+_EXACT = (
+    "torch rounds sigmoid, silu, softplus, elu and gelu differently at the end of a tensor than before it: use relu, "
+    "leaky_relu, tanh, sin, cos or exp; products of narrow matrices round by the size of the stack: use "
+    "torch.nn.Linear (which is replaced by an exact form) or qrlsuite.population.linear"
+)
+
+
 def _independence(subjects: Subjects) -> None:
-    x = _x(S)
-    whole = subjects.population(range(S))
-    gradients = _gradients(whole, x)
-    values = subjects.population(range(S))(x).detach()
+    """Compare agents alone and among others, at the options that are checked and at odd ones, for several batches."""
+    for batch in BATCHES:
+        _independent(subjects, subjects.options, batch, "")
+    for name, own in subjects.odd.items():
+        for batch in BATCHES:
+            _independent(subjects, own, batch, f" ({name} = {ODD})")
+
+
+def _independent(subjects: Subjects, own: Any, batch: int, at: str) -> None:
+    """Compare agents with options `own`, alone and among others, for a batch; `at` names the options in messages."""
+    x = 3 * _x(S, batch=batch)  # where functions bend
+    gradients = _gradients(subjects.population(range(S), [own] * S), x)
+    values = subjects.population(range(S), [own] * S)(x).detach()
     for members in SIZES:
-        chosen = list(members)
-        part = subjects.population(chosen)
+        chosen, options = list(members), [own] * len(members)
         require(
-            torch.equal(subjects.population(chosen)(x[chosen]).detach(), values[chosen]),
-            f"seeds {chosen} among themselves compute other values than among all {S}; products of narrow matrices "
-            "round differently by size of the stack: use torch.nn.Linear (which is replaced by an exact form) or "
-            "qrlsuite.population.linear, and no reduction over seeds",
+            torch.equal(subjects.population(chosen, options)(x[chosen]).detach(), values[chosen]),
+            f"seeds {chosen} among themselves compute other values than among all {S}{at}: {_EXACT}, and no reduction "
+            "over seeds",
         )
-        for name, gradient in _gradients(part, x[chosen]).items():
+        for name, gradient in _gradients(subjects.population(chosen, options), x[chosen]).items():
             expected = gradients[name]
             require(
                 gradient is not None and expected is not None and torch.equal(gradient, expected[chosen]),
-                f"seeds {chosen} among themselves get another gradient of '{name}' than among all {S}: slices must "
-                "not mix, and sums must not depend on the size of the stack",
+                f"seeds {chosen} among themselves get another gradient of '{name}' than among all {S}{at}: slices must "
+                f"not mix, and sums must not depend on the size of the stack; {_EXACT}",
             )
 
 

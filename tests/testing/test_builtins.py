@@ -49,6 +49,8 @@ WHERE_OFFERED = {
     ("significance_tests", "intervals"): ["against"],
     ("significance_tests", "times"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},
+    **{("models", name): ["memory"] for name in ("fourier", "mlp", "vqc-native", "vqc-pennylane")},
+    **{("algorithms", item.name): ["memory"] for item in EVERYTHING if item.kind == "algorithms"},
 }
 """Rules about what a thing need not have."""
 
