@@ -14,6 +14,7 @@ from qrlsuite import __version__, scaffold
 from qrlsuite.cli import main
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.scaffold import Kind
+from tests import commands
 from tests.commands import Command, start
 from tests.conftest import HANGS, install_from_source, installed
 
@@ -68,6 +69,22 @@ def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> 
         ("tasks", "acme-task"),
         ("trackers", "acme-tracker"),
     }
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_the_commands_of_a_readme_run(packages: Path, kind: Kind, tmp_path: Path) -> None:
+    """Word for word, but that seeds, epochs and workers are fewer; its tests and checks run elsewhere."""
+    lines = (packages / f"acme-{kind}" / "README.md").read_text().splitlines()
+    shown = [line for line in lines if line.startswith("qrlsuite show ")]
+    trained = [line for line in lines if line.startswith("qrlsuite run ")]
+    assert trained
+    fewer = " --seeds 2 --epochs 1 --workers 1"
+    for line in (*shown, *(line + fewer for line in trained)):
+        done = commands.qrlsuite(*line.split()[1:], env=installed(packages / "site"), cwd=tmp_path)
+        assert done.returncode == 0, f"{line}: {done.stderr}"
+    assert len([*tmp_path.glob("runs/*/*/seed-*/run.json")]) == 2
+    if kind is Kind.tracker:
+        assert len((tmp_path / "epochs.csv").read_text().splitlines()) == 2
 
 
 def test_new_packages_are_clean(packages: Path) -> None:
