@@ -89,18 +89,28 @@ def processor() -> str:
 @functools.cache
 def _commit() -> str | None:
     """Return the git commit of the suite's own working copy, as of the first call; None for an installed release."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
+    return commit_of(Path(qrlsuite.__file__).resolve().parent)
+
+
+def commit_of(package: Path) -> str | None:
+    """Return the commit of the working copy whose top holds a package, with `-dirty` where a file of it was changed.
+
+    None where there is no such working copy, or git cannot tell. A repository that merely has the package somewhere
+    below it, in a virtual environment say, or does not track it, is somebody else's.
+    """
+    if not (package.parent / ".git").exists():
         return None
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    own["GIT_OPTIONAL_LOCKS"] = "0"  # other commands of git in this folder go on
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(package.parent), *words]
+        return subprocess.run(
+            command, env=own, capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
+
     try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],
-            cwd=root,
-            capture_output=True,
-            text=True,
-            timeout=5,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
+        git("ls-files", "--error-unmatch", f"{package.name}/__init__.py")
+        return git("describe", "--always", "--dirty") or None
+    except (OSError, ValueError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip() or None

@@ -1,0 +1,77 @@
+"""The commit that a run records: of the suite's own working copy, of no other repository."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import qrlsuite
+from qrlsuite.results import provenance
+from qrlsuite.results.provenance import commit_of
+
+
+def git(folder: Path, *words: str) -> str:
+    author = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+    done = subprocess.run(["git", "-C", folder, *author, *words], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def repository(top: Path, package: Path) -> Path:
+    """Return a package below the top of a new repository, which does not track it yet."""
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (top / "README.md").write_text("")
+    git(top, "init", "-q")
+    git(top, "add", "README.md")
+    git(top, "commit", "-q", "-m", "begin")
+    return package
+
+
+def tracked(top: Path) -> Path:
+    package = repository(top, top / "qrlsuite")
+    git(top, "add", "-A")
+    git(top, "commit", "-q", "-m", "code")
+    return package
+
+
+def test_the_commit_and_whether_a_file_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tracked(tmp_path / "own")
+    head = git(package, "rev-parse", "--short", "HEAD")
+    assert commit_of(package) == head
+    other = tracked(tmp_path / "other")
+    monkeypatch.setenv("GIT_DIR", str(other.parent / ".git"))  # as in a hook of another repository
+    assert commit_of(package) == head
+    (package / "__init__.py").write_text("changed = True\n")
+    assert commit_of(package) == f"{head}-dirty"
+
+
+def test_a_second_working_copy_has_its_own(tmp_path: Path) -> None:
+    """There, `.git` is a file."""
+    tracked(tmp_path / "own")
+    git(tmp_path / "own", "worktree", "add", "-q", "--detach", str(tmp_path / "second"))
+    head = git(tmp_path / "second", "rev-parse", "--short", "HEAD")
+    assert commit_of(tmp_path / "second" / "qrlsuite") == head
+
+
+def test_another_repository_is_not_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (
+        commit_of(repository(tmp_path / "a", tmp_path / "a" / ".venv" / "site-packages" / "qrlsuite")) is None
+    )
+    assert commit_of(repository(tmp_path / "b", tmp_path / "b" / "qrlsuite")) is None, (
+        "installed, not tracked"
+    )
+    package = tracked(tmp_path / "c")
+    monkeypatch.setenv("PATH", "")
+    assert commit_of(package) is None, "no git"
+
+
+def test_the_suite_s_own_working_copy_is_recorded() -> None:
+    package = Path(qrlsuite.__file__).resolve().parent
+    if not (package.parent / ".git").exists():
+        pytest.skip("not a working copy")
+    head = git(package.parent, "rev-parse", "HEAD")
+    recorded = provenance.collect([])["commit"]
+    assert recorded is not None
+    assert head.startswith(recorded.removesuffix("-dirty").rpartition("-g")[2])
