@@ -234,6 +234,30 @@ def test_a_forward_pass_alone_gives_the_same_bits(monkeypatch: pytest.MonkeyPatc
         assert torch.equal(leaves[name].grad, again[name].grad), "recomputed states differ from kept ones"
 
 
+@pytest.mark.parametrize(
+    ("dtype", "size", "message"),
+    [
+        (
+            torch.float32,
+            3e4,
+            r"float32 holds angles up to about 1e7, .* input is 3e\+04, .* 3e\+04: .* in float64$",
+        ),
+        (torch.float64, 1e9, r"float64 holds angles up to about 1e15, .* initial parameters smaller$"),
+    ],
+)
+def test_angles_that_the_precision_cannot_hold_are_not_called_infinite(
+    dtype: torch.dtype, size: float, message: str
+) -> None:
+    """Each angle is a product of input and scaling: the square of `size`, up to which each of them is finite."""
+    circuit = ansatz("cx", qubits=4, layers=4)
+    backend = NativeBackend(circuit)
+    x, parameters = random_values(circuit, 1, 1, dtype)
+    large = {name: torch.full_like(p, size) for name, p in parameters.items()}
+    assert bool(torch.isfinite(backend(torch.full_like(x, size), parameters)).all())
+    with pytest.raises(OptionError, match=message):
+        backend(torch.full_like(x, size), large)
+
+
 def test_a_second_backward_pass_gives_the_same() -> None:
     circuit = ansatz("cx", qubits=3, layers=2)
     x, parameters = random_values(circuit, 1, 4, torch.float64)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from qrlsuite.plugins.circuits.native.sampling import ShotSampler
 
 NOT_FINITE = "the circuit's inputs or parameters are not finite (NaN or infinite)"
+ROUNDED = {torch.float32: "1e7", torch.float64: "1e15"}
+"""Angles from which on a number is rounded by about a radian: sine and cosine of it mean nothing."""
 
 
 class NativeBackend:
@@ -103,7 +105,7 @@ class NativeBackend:
             flat = inputs.new_zeros((size, 0))
         result = self._run(inputs, flat)
         if not bool(torch.isfinite(result.detach().sum())):
-            raise OptionError(NOT_FINITE)
+            raise OptionError(_cause(inputs, flat))
         return result
 
     def compile_for(self, like: Tensor) -> None:
@@ -220,3 +222,16 @@ def _check(options: NativeOptions, circuit: Circuit) -> None:
             "the mean-field approximation of a circuit is none, so it has no shots, noise or gradient rule; leave out "
             "shots, noise_model and gradient"
         )
+
+
+def _cause(inputs: Tensor, flat: Tensor) -> str:
+    """Say why expectation values are not finite."""
+    if not all(bool(torch.isfinite(values).all()) for values in (inputs, flat)):
+        return NOT_FINITE
+    precision = str(inputs.dtype).removeprefix("torch.")
+    return (
+        f"an angle of the circuit is too large: {precision} holds angles up to about {ROUNDED[inputs.dtype]}, and the "
+        f"largest input is {float(inputs.abs().max()):.2g}, the largest parameter "
+        f"{float(flat.abs().max() if flat.numel() else 0):.2g}: make inputs (observations), learning rates or initial "
+        "parameters smaller" + (", or compute in float64" if inputs.dtype == torch.float32 else "")
+    )
