@@ -250,9 +250,14 @@ class EntryCurves(Shown):
         """Where its settings come from: the preset and what `--set` changed of it, or `tuned` and how much."""
         if self.tuning is not None:
             return _tuned_text(self.tuning)
+        presets = self.task_file.presets
         name = self.preset or "default"
+        if self.algorithm not in presets.get(name, {self.algorithm: {}}):
+            return (
+                "default"  # a record of an older version, in which a preset without the algorithm was named
+            )
         family = "quantum" if self.parameters[1] else "classical"
-        tables: Mapping[Any, Any] = self.task_file.presets.get(name, {}).get(self.algorithm, {})
+        tables: Mapping[Any, Any] = presets.get(name, {}).get(self.algorithm, {})
         own = self.identity.get("algorithm_options", {})
         usual = {**tables.get("all", {}), **tables.get(family, {})}
         changed = [option for option, value in usual.items() if own.get(option, value) != value]

@@ -389,11 +389,27 @@ def from_mapping(values: Mapping[str, Any] | None) -> list[Setting]:
     return settings
 
 
+def read_toml(text: str) -> dict[str, Any]:
+    """Return the tables of a TOML text.
+
+    Raises
+    ------
+    tomllib.TOMLDecodeError
+        If it is not valid, or Python cannot hold it: hundreds of nested arrays, integers of thousands of digits.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except (RecursionError, ValueError) as error:
+        raise tomllib.TOMLDecodeError(f"too large a value: {error}") from None
+
+
 def parse_value(text: str) -> Any:
     """Read a value as TOML would (`6`, `0.5`, `.5`, `true`, `[1, 2]`, `"text"`), else as bare text."""
     for candidate in (text, f"0{text}" if text.startswith(".") else text):
         try:
-            return tomllib.loads(f"value = {candidate}")["value"]
+            return read_toml(f"value = {candidate}")["value"]
         except tomllib.TOMLDecodeError:
             continue
     return text

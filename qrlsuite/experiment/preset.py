@@ -107,7 +107,7 @@ def load(path: Path) -> PresetFile:
         If it cannot be read or is malformed; the message lists every problem.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = options.read_toml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise TaskError(f"preset file {path} cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:

@@ -76,15 +76,14 @@ class ScoreSection(_TaskTable):
             description="info: the environment's info['score']; return: the episode's return over max_return"
         ),
     ] = "info"
-    max_return: Annotated[float | None, Field(description="best possible return, for source = 'return'")] = (
-        None
-    )
-
-    @model_validator(mode="after")
-    def _maximum(self) -> ScoreSection:
-        if self.max_return is not None and self.max_return == 0:
-            raise ValueError("max_return = 0 cannot scale a return")
-        return self
+    max_return: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="best possible return, above 0, for source = 'return'; without it, rank on thresholds",
+        ),
+    ] = None
 
 
 class Cell(_TaskTable):
@@ -134,6 +133,13 @@ class RankingSection(_TaskTable):
         ) == relative:
             kind = "epsilon" if relative else "threshold"
             raise ValueError(f"the reference cell needs {kind} and delta, as the grid has {kind}s")
+        for horizon in self.horizons:
+            if self.horizons.count(horizon) > 1:
+                raise ValueError(f"horizons: {horizon} is there twice")
+        try:
+            _ = self.grid, self.reference_grid
+        except OptionError as error:
+            raise ValueError(str(error)) from None
         return self
 
     @property
@@ -272,10 +278,13 @@ class Task:
     def preset(self, name: str | None, algorithm: str, family: str) -> tuple[str | None, dict[str, Any]]:
         """Return the chosen preset's name and its values for an algorithm and a model family.
 
+        Where the default preset says nothing about them, there is no preset: the algorithm's defaults are not what a
+        task calls `tuned`.
+
         Raises
         ------
         TaskError
-            If the task has no preset of that name.
+            If the task has no preset of that name, or it says nothing about the algorithm and the family.
         """
         chosen = name or self.file.default_preset
         if chosen is None:
@@ -285,7 +294,15 @@ class Task:
                 f"task '{self.name}' has no preset '{chosen}'{nearest(chosen, self.file.presets)}"
             )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
-        return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+        if tables.keys() & {"all", family}:
+            return chosen, {**tables.get("all", {}), **tables.get(family, {})}
+        if name is None:
+            return None, {}
+        of = f" with {family} models" if tables else ""
+        raise TaskError(
+            f"task '{self.name}': preset '{chosen}' says nothing about algorithm '{algorithm}'{of}, only about "
+            f"{', '.join(self.file.presets[chosen])}: leave it out, or set options one by one"
+        )
 
     def tuning(self, preset: str | None, algorithm: str, family: str) -> TuningRecord | None:
         """Return how a preset's settings for an algorithm and a model family were found; None where it is not said."""
@@ -301,12 +318,13 @@ class Task:
             Listing every unknown name and every bad value with its path in the file.
         """
         problems = []
-        for preset in self.file.presets:
-            for family in ("classical", "quantum"):
+        for preset, by_algorithm in self.file.presets.items():
+            for family in by_algorithm.get(algorithm, {}):
+                of = (
+                    "classical" if family == "all" else family
+                )  # tables of `all` come before those of a family
                 try:
-                    options.build(
-                        cls, self.preset(preset, algorithm, family)[1], f"presets.{preset}.{algorithm}"
-                    )
+                    options.build(cls, self.preset(preset, algorithm, of)[1], f"presets.{preset}.{algorithm}")
                 except OptionError as error:
                     problems.append(str(error))
         if problems:
@@ -359,7 +377,7 @@ def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any
         If a file is not TOML or cannot be read, or a task extends an unknown task or itself.
     """
     try:
-        data = tomllib.loads(text)
+        data = options.read_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise TaskError(f"{source}: not valid TOML: {error}") from None
     if "extends" not in data:

@@ -258,7 +258,7 @@ def load(path: Path) -> list[Speed]:
         If it cannot be read or is malformed; every problem is listed.
     """
     try:
-        file = SpeedFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        file = SpeedFile.model_validate(options.read_toml(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise TaskError(f"{path.name} cannot be read: {error}") from None
     except pydantic.ValidationError as error:

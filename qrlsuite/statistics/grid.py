@@ -78,7 +78,11 @@ def _values(values: ArrayLike | Iterable[Any], name: str) -> list[Decimal]:
         listed = list(values)
     if not listed:
         raise OptionError(f"{name}: the list is empty")
-    return [exact(value, f"{name}[{index}]") for index, value in enumerate(listed)]
+    numbers = [exact(value, f"{name}[{index}]") for index, value in enumerate(listed)]
+    for index, number in enumerate(numbers):
+        if len(set(numbers)) < len(numbers) and number in numbers[:index]:
+            raise OptionError(f"{name}: {number} is there twice, and its cells would count twice")
+    return numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +112,7 @@ class Grid:
         Raises
         ------
         OptionError
-            If an epsilon is outside [0, 1) or a delta outside (0, 1], or a list is empty.
+            If an epsilon is outside [0, 1) or a delta outside (0, 1], a number is there twice, or a list is empty.
         """
         tolerances = _values(epsilons, "epsilons")
         for epsilon in tolerances:
@@ -124,7 +128,7 @@ class Grid:
         Raises
         ------
         OptionError
-            If a threshold is not finite, a delta is outside (0, 1], or a list is empty.
+            If a threshold is not finite, a delta is outside (0, 1], a number is there twice, or a list is empty.
         """
         levels = tuple(float(level) for level in _values(thresholds, "thresholds"))
         return cls(levels, _probabilities(deltas))

@@ -138,7 +138,7 @@ def parse(text: str, source: str) -> PlanFile:
         Listing every problem with its path in the file.
     """
     try:
-        return PlanFile.model_validate(tomllib.loads(text))
+        return PlanFile.model_validate(options.read_toml(text))
     except tomllib.TOMLDecodeError as error:
         raise TaskError(f"{source}: not valid TOML: {error}") from None
     except pydantic.ValidationError as error:

@@ -287,7 +287,7 @@ def parse(text: str, source: str) -> Study:
         Listing every problem with its path in the file.
     """
     try:
-        data = tomllib.loads(text)
+        data = options.read_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise TaskError(f"{source}: not valid TOML: {error}") from None
     try:

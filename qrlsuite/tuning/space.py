@@ -120,7 +120,7 @@ def load(name: str) -> GridFile:
         raise UnknownNameError(f"unknown grid '{name}'{nearest(name, known)}; or give a file, my-grid.toml")
     path = Path(name) if name.endswith(".toml") else known[name]
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = options.read_toml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise TaskError(f"grid file {path} cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:

@@ -16,6 +16,16 @@ from qrlsuite.experiment import entry, task
 from qrlsuite.hookspecs import hookimpl
 from tests.conftest import TINY
 
+MAXIMUM = "[score]\nsource = 'return'\nmax_return = "
+LEVELS = """epsilons = [0.6, 0.8]
+deltas = [0.5, 0.75]
+reference = { epsilon = 0.6, delta = 0.5 }
+"""
+ABSOLUTE = """thresholds = [1.0, 2.5, 1.0]
+deltas = [0.5, 0.75]
+reference = { threshold = 1.0, delta = 0.5 }
+"""
+
 
 @pytest.mark.parametrize("name", registry.load().names("tasks"))
 def test_every_registered_task_loads_under_its_own_name(name: str) -> None:
@@ -53,6 +63,26 @@ def test_the_hash_covers_the_definition_and_nothing_else() -> None:
         ("format_version = 1", "format_version = 2", "format_version = 2"),
         ("steps = 20", "steps = 20 = 3", "not valid TOML"),
         (
+            "degree = 3",
+            f"degree = {'[' * 5000}{']' * 5000}",
+            "not valid TOML: too large a value: maximum recursion",
+        ),
+        ("seeds = 4", f"seeds = {'9' * 5000}", "not valid TOML: too large a value"),
+        ("[ranking]", f"{MAXIMUM}-5\n[ranking]", "score.max_return = -5: Input should be greater than 0"),
+        ("[ranking]", f"{MAXIMUM}nan\n[ranking]", "score.max_return = nan: Input should be a finite number"),
+        ("[ranking]", f"{MAXIMUM}inf\n[ranking]", "score.max_return = inf: Input should be a finite number"),
+        (
+            "epsilons = [0.6, 0.8]",
+            "epsilons = [0.6, 0.8, 0.60]",
+            "epsilons: 0.6 is there twice, and its cells would",
+        ),
+        ("deltas = [0.5, 0.75]", "deltas = [0.5, 0.5]", "deltas: 0.5 is there twice"),
+        ("horizons = [180]", "horizons = [180, 180]", "horizons: 180 is there twice"),
+        (LEVELS, ABSOLUTE.replace("2.5", "nan"), r"thresholds\[1\] = nan is not finite"),
+        (LEVELS, ABSOLUTE.replace("2.5", "inf"), r"thresholds\[1\] = inf is not finite"),
+        (LEVELS, ABSOLUTE, "thresholds: 1.0 is there twice"),
+        (LEVELS, ABSOLUTE.replace("2.5, 1.0", "2.5").replace("d = 1.0", "d = nan"), "nan is not finite"),
+        (
             'default_algorithm = "ddqn"',
             'default_preset = "relesed"',
             "default_preset 'relesed'; none is registered",
@@ -81,6 +111,23 @@ def test_all_mistakes_are_named_at_once() -> None:
         TaskError, match=r"protocol\.seeds = 0.*environment\.name: unknown environment 'beam6h'"
     ):
         task.parse(TINY.replace("seeds = 4", "seeds = 0").replace('name = "beam6g"', 'name = "beam6h"'), "t")
+
+
+def test_a_preset_that_says_nothing_of_an_algorithm_is_not_its_preset() -> None:
+    """An entry of an algorithm of somebody's own is not called `tuned` by the task's default preset."""
+    presets = "[presets.tuned.ppo.quantum]\nlr = 0.1\n[presets.tuned.ddqn.all]\nlr = 0.2\n"
+    text = TINY.replace("[environment]", 'default_preset = "tuned"\n[environment]', 1) + presets
+    read = task.parse(text, "t.toml")
+    assert read.preset(None, "ddqn", "classical") == ("tuned", {"lr": 0.2})
+    assert read.preset(None, "ppo", "quantum") == ("tuned", {"lr": 0.1})
+    assert read.preset(None, "ppo", "classical") == (None, {})
+    assert read.preset(None, "mine", "classical") == (None, {})
+    with pytest.raises(
+        TaskError, match=r"'tuned' says nothing about algorithm 'mine', only about ppo, ddqn: leave"
+    ):
+        read.preset("tuned", "mine", "classical")
+    with pytest.raises(TaskError, match=r"says nothing about algorithm 'ppo' with classical models, only"):
+        read.preset("tuned", "ppo", "classical")
 
 
 def test_a_mistake_in_a_preset_is_named_with_its_file(tmp_path: Path) -> None:

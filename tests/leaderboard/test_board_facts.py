@@ -176,6 +176,8 @@ def test_the_board_says_where_settings_come_from() -> None:
         "released but lr",
     ]
     assert replace(one, tuning={"changed": ["algorithm.lr"]}).settings == "tuned but lr"
+    assert replace(one, preset="released", algorithm="mine").settings == "default", "as older records have it"
+    assert replace(one, preset="mine.toml").settings == "mine.toml"
     assert replace(one, tuning={"trials": None, "seeds": "1000000:?"}).settings == "tuned"
     mixed = "tuned and untuned settings are ranked against each other: a difference may be one of tuning"
     text = tables.markdown(boards.of([tuned, released, by_hand]))
