@@ -8,12 +8,14 @@ counted more often than long ones.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from qrlsuite import specs
@@ -288,18 +290,28 @@ def references(
         streams = Streams(entry.task.hash, seed)
 
         def uniform(envs: LaneEnv, block: int) -> Policy:
-            stream = streams.numpy("evaluation random", block)
-            choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
-            return lambda observations: stream.integers(choices, size=envs.num_envs)
+            return _random(envs, streams.numpy("evaluation random", block))
 
         returns, scores, _ = play(entry, 1, episodes, seed, uniform, "random", report)
         played.append(Played("random", returns, scores))
     return played
 
 
+def _random(envs: LaneEnv, stream: np.random.Generator) -> Policy:
+    """Return the policy that draws from the action space; where that is not discrete, as Gymnasium samples it."""
+    if isinstance(envs.single_action_space, spaces.Discrete):
+        choices = int(envs.single_action_space.n)
+        return lambda observations: stream.integers(choices, size=envs.num_envs)
+    space = copy.deepcopy(envs.action_space)
+    space.seed(int(stream.integers(2**31)))
+    return lambda observations: np.asarray(space.sample()).reshape(-1)  # as `Trainer.act` gives them
+
+
 def _checked(name: str, policy: Policy, envs: LaneEnv) -> Policy:
-    """Return a reference policy whose actions are looked at before the environment takes them."""
-    choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+    """Return a reference policy whose actions are looked at before the environment takes them, where discrete."""
+    if not isinstance(envs.single_action_space, spaces.Discrete):
+        return policy
+    choices = int(envs.single_action_space.n)
 
     def act(observations: NDArray[np.float32]) -> NDArray[np.int64]:
         actions = np.asarray(policy(observations))

@@ -18,13 +18,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import nn
 
 import qrlsuite
 from qrlsuite import population, registry, specs
 from qrlsuite.environment import LaneEnv
-from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError, StoreError
+from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
@@ -82,10 +83,21 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
 
 
 def first_network(entry: Entry) -> nn.Module:
-    """Return one agent's freshly built first network; nothing is computed with it."""
+    """Return one agent's freshly built first network; nothing is computed with it.
+
+    Raises
+    ------
+    OptionError
+        If actions are not discrete: the algorithm alone knows its outputs then.
+    """
     envs = build_envs(entry, 1, lambda: None)
     inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
-    outputs = int(envs.single_action_space.n)  # type: ignore[attr-defined]
+    if not isinstance(envs.single_action_space, spaces.Discrete):
+        raise OptionError(
+            f"'{entry.label}': the actions of environment '{entry.task.environment.name}' are "
+            f"{envs.single_action_space}, not discrete, so that the size of the model is not known before it is trained"
+        )
+    outputs = int(envs.single_action_space.n)
     with _building("models", entry.model.name):
         agent: nn.Module = specs.resolve(entry.model.build)(
             inputs, outputs, entry.model_options, torch.Generator()

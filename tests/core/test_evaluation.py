@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
+from qrlsuite.environment import LaneEnv, batched_spaces
 from qrlsuite.errors import OptionError, PluginError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import load
 from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
+from qrlsuite.training.trainer import count_parameters
 from tests.conftest import golden
 
 WALK = """
@@ -184,6 +189,44 @@ def test_a_task_without_reference_policies_has_the_random_one(walk: Entry) -> No
     assert random.name == "random"
     assert random.summary()["score"] is None
     assert set(random.summary()["return"]) == {"mean", "std", "min", "p5", "p25", "p50", "p75", "p95", "max"}
+
+
+class Push(LaneEnv):
+    """Episodes of one step whose reward is the action, a number in [2, 3]."""
+
+    def __init__(self, options: object, lanes: int) -> None:
+        batched_spaces(self, spaces.Box(0, 1, (1,)), spaces.Box(2, 3, (1,)), lanes)
+
+    def reset(self, **given: object) -> tuple[np.ndarray, dict[str, object]]:
+        return np.zeros((self.num_envs, 1), np.float32), {}
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, object]]:
+        assert actions.shape == (self.num_envs,)
+        ended = np.ones(self.num_envs, bool)
+        return np.zeros((self.num_envs, 1), np.float32), actions.astype(float), ended, ~ended, {}
+
+
+def hardest(envs: LaneEnv) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda observations: np.full(envs.num_envs, 3.0)
+
+
+def test_actions_need_not_be_discrete(walk: Entry) -> None:
+    task = copy.copy(walk.task)
+    own = f"{__name__}:"
+    task.environment = replace(
+        walk.task.environment, vector=f"{own}Push", policies={"hardest": f"{own}hardest"}
+    )
+    entry = replace(walk, task=task)
+    best, random = evaluation.references(entry, episodes=200)
+    assert (best.returns == 3.0).all()
+    assert ((random.returns >= 2) & (random.returns <= 3)).all()
+    assert 2.4 < random.returns.mean() < 2.6
+    again = evaluation.references(entry, episodes=200)[1]
+    assert (again.returns == random.returns).all()
+    with pytest.raises(
+        OptionError, match=r"the actions of environment 'gym' are Box\(2.0, 3.0.*not discrete"
+    ):
+        count_parameters(entry)
 
 
 def too_many(envs: object) -> Callable[[np.ndarray], np.ndarray]:
