@@ -7,6 +7,7 @@ its actions, so these are what a checkpoint holds, and resuming plays them again
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import re
 from collections.abc import Mapping, Sequence
@@ -376,12 +377,15 @@ def quick_task(env_id: str) -> dict[str, Any]:
     20 seeds, 100 epochs of 1000 steps in 10 environments, 20 validation episodes. Thresholds on the return are
     derived from the `reward_threshold` T at which Gymnasium counts the environment as solved: T - |T|,
     T - |T|/2, T - |T|/4 and T, the last one shown first. Where Gymnasium knows none, the one threshold is 0:
-    a task file is needed to say what a good return is. Without a time limit, episodes are cut at 1000 steps.
+    a task file is needed to say what a good return is. A threshold that random actions reach in each of 10 episodes
+    tells nothing apart, and is left out; where none is left, the highest of these returns is the threshold. The
+    summary says so. Without a time limit, episodes are cut at 1000 steps.
 
     Raises
     ------
     qrlsuite.errors.OptionError
-        If the environment cannot be made, or the algorithms cannot act or observe in it.
+        If the environment cannot be made, the algorithms cannot act or observe in it, or every episode of random
+        actions has the same return and reaches all thresholds.
     """
     known = specification(env_id)
     options: dict[str, Any] = {"id": env_id}
@@ -389,13 +393,27 @@ def quick_task(env_id: str) -> dict[str, Any]:
         options["max_episode_steps"] = QUICK_STEPS
     GymLanes(env_id, 1).close()
     solved = known.reward_threshold
-    thresholds = [0.0]
+    derived = [0.0]
     if solved is not None:
-        thresholds = sorted({float(solved - abs(solved) * part) for part in (1, 0.5, 0.25, 0)})
+        derived = sorted({float(solved - abs(solved) * part) for part in (1, 0.5, 0.25, 0)})
+    lowest, highest = _random_returns(env_id, options.get("max_episode_steps"))
+    thresholds = [level for level in derived if level > lowest]
+    summary = f"{env_id} of Gymnasium, with settings for a quick look"
+    if len(thresholds) < len(derived):
+        reached = ", ".join(f"{level:g}" for level in derived if level <= lowest)
+        summary += f"; without threshold {reached}, which random actions always reach"
+    if not thresholds:
+        if highest == lowest:
+            raise OptionError(
+                f"gym:{env_id}: random actions always have the return {lowest:g}, which reaches every threshold that "
+                "is known (0, or what Gymnasium calls solved): write a task file that says what a good return is"
+            )
+        thresholds = [highest]
+        summary += "; instead of it, the highest return of 10 random episodes"
     return {
         "format_version": 1,
         "name": quick_name(env_id),
-        "summary": f"{env_id} of Gymnasium, with settings for a quick look",
+        "summary": summary,
         "environment": {"name": "gym", "options": options},
         "protocol": {
             "seeds": 20,
@@ -412,6 +430,34 @@ def quick_task(env_id: str) -> dict[str, Any]:
             "horizons": [100_000],
         },
     }
+
+
+@functools.cache
+def _random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
+    """Return the lowest and the highest return of 10 episodes of random actions, always the same ones.
+
+    Minus infinity where an episode does not end within 1000 steps or fails: nothing is known then.
+    """
+    lanes = 10
+    envs = GymLanes(env_id, lanes, {} if limit is None else {"max_episode_steps": limit})
+    envs.autoreset = False
+    envs.seed_from(0)
+    stream = np.random.Generator(np.random.Philox(0))
+    running, returns = np.ones(lanes, np.bool_), np.zeros(lanes)
+    try:
+        envs.reset()
+        for _ in range(QUICK_STEPS):
+            actions = stream.integers(int(envs._action_space.n), size=lanes)
+            _, rewards, terminated, truncated, _ = envs.step(actions)
+            returns[running] += rewards[running]
+            running &= ~(terminated | truncated)
+            if not running.any():
+                return float(returns.min()), float(returns.max())
+    except Exception:  # a stranger's environment, which training will name
+        return -np.inf, -np.inf
+    finally:
+        envs.close()
+    return -np.inf, -np.inf
 
 
 def quick_name(env_id: str) -> str:

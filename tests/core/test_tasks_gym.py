@@ -97,20 +97,37 @@ def test_the_text_variant_differs_from_beam6g_in_its_physics_alone() -> None:
     ("env_id", "thresholds"),
     [
         ("Acrobot-v1", [-200, -150, -125, -100]),
-        ("CartPole-v1", [0, 237.5, 356.25, 475]),
+        ("CartPole-v1", [237.5, 356.25, 475]),
         ("CliffWalking-v1", [0]),
-        (f"{HERE}:Walk-v0", [0]),
+        ("FrozenLake-v1", [0.35, 0.525, 0.7]),
+        ("MountainCar-v0", [-165, -137.5, -110]),
     ],
 )
 def test_a_task_without_a_file(env_id: str, thresholds: list[float]) -> None:
     quick = task.load(f"gym:{env_id}")
     assert quick.environment_options.id == env_id
-    assert quick.file.ranking.thresholds == thresholds
-    assert quick.file.ranking.reference.threshold == thresholds[-1]
+    assert quick.file.ranking.thresholds == pytest.approx(thresholds)
+    assert quick.file.ranking.reference.threshold == pytest.approx(thresholds[-1])
     assert quick.file.score.source == "return"
     unlimited = env_id.startswith("CliffWalking")
     assert quick.environment_options.max_episode_steps == (1000 if unlimited else None)
     assert quick.hash == task.load(f"gym:{env_id}").hash
+
+
+def test_thresholds_that_random_actions_always_reach_are_left_out() -> None:
+    """MountainCar's were -220 (random actions have -200), and 0 elsewhere, which no return is below."""
+    assert (
+        "without threshold -220, which random actions always" in task.load("gym:MountainCar-v0").file.summary
+    )
+    assert "without" not in task.load("gym:Acrobot-v1").file.summary
+    counted = task.load(f"gym:{HERE}:Counted-v0").file
+    instead = "without threshold 0, which random actions always reach; instead of it, the highest return of 10 random"
+    assert instead in counted.summary
+    assert counted.ranking.thresholds == [11], "episodes have 3 to 11 steps"
+    with pytest.raises(
+        OptionError, match="random actions always have the return 3, which reaches every threshold"
+    ):
+        task.load(f"gym:{HERE}:Even-v0")
 
 
 def test_names_of_tasks_without_a_file_are_names() -> None:

@@ -72,6 +72,23 @@ class Forgetful(Walk):
         return super().step(action)
 
 
+class Counted(Walk):
+    """Gives 1 for every step."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, _, *rest = super().step(action)
+        return observation, 1.0, *rest
+
+
+class Even(Counted):
+    """The same, for three steps."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        first = super().reset(seed=seed)
+        self.length = 3
+        return first
+
+
 class Endless(Walk):
     """Never ends."""
 
@@ -103,6 +120,14 @@ class Unmade(Walk):
         import no_such_package.inner  # noqa: F401
 
 
-for name, limit in [("Walk", 20), ("Forgetful", 20), ("Endless", None), ("Broken", 20), ("Unmade", 20)]:
+for name, limit in [
+    ("Walk", 20),
+    ("Counted", 20),
+    ("Even", 20),
+    ("Forgetful", 20),
+    ("Endless", None),
+    ("Broken", 20),
+    ("Unmade", 20),
+]:
     gymnasium.register(f"{name}-v0", f"{HERE}:{name}", max_episode_steps=limit, disable_env_checker=True)
 gymnasium.register("Cut-v0", f"{HERE}:Endless", max_episode_steps=4, disable_env_checker=True)
