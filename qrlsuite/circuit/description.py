@@ -30,9 +30,9 @@ Only numpy is imported here.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -257,15 +257,24 @@ class Circuit:
         wires:
             A qubit stands for its Pauli Z, several qubits for the product of theirs: `measure([0, (1, 2)])` measures
             Z_0 and Z_1 Z_2.
+
+        Raises
+        ------
+        CircuitError
+            If these are no qubits or groups of them, or one is there twice.
         """
-        groups = [(w,) if isinstance(w, int) else tuple(w) for w in wires]
+        listed = [] if isinstance(wires, str) else list(wires)
+        groups: list[tuple[Any, ...]] = [
+            tuple(w) if isinstance(w, Iterable) and not isinstance(w, str) else (w,) for w in listed
+        ]
         if (
             not groups
+            or not all(isinstance(w, int | np.integer) for g in groups for w in g)
             or len(set(map(frozenset, groups))) != len(groups)
             or any(not g or len(set(g)) != len(g) or not all(0 <= w < self.qubits for w in g) for g in groups)
         ):
             raise CircuitError(
-                f"observables {list(wires)!r}: distinct qubits 0..{self.qubits - 1}, or distinct groups of them, are "
+                f"observables {wires!r}: distinct qubits 0..{self.qubits - 1}, or distinct groups of them, are "
                 "needed"
             )
         self._observables = tuple(int(g[0]) if len(g) == 1 else tuple(map(int, g)) for g in groups)

@@ -95,13 +95,13 @@ def _qiskit(circuit: Circuit) -> str:
 
 
 def _pennylane(circuit: Circuit) -> str:
-    """Return a program that makes the QNode `circuit(x, ...)`; parameters have their shapes."""
+    """Return a program that makes the QNode `circuit(x, ...)`; parameters have their shapes, and x may be a batch."""
 
     def element(e: Element) -> str:
         index = np.unravel_index(e.index, circuit.parameters[e.parameter].shape)
         return f"{e.parameter}[{', '.join(str(int(i)) for i in index)}]"
 
-    shapes = [f"x {_shape((circuit.inputs,))}"]
+    shapes = [f"x {_shape((circuit.inputs,))} or (batch, {circuit.inputs})"]
     shapes += [f"{name} {_shape(parameter.shape)}" for name, parameter in circuit.parameters.items()]
     lines = [
         "import pennylane as qml",
@@ -112,7 +112,7 @@ def _pennylane(circuit: Circuit) -> str:
         f'    """Expectation values; {", ".join(shapes)}."""',
     ]
     for operation in circuit:
-        angles = [_formula(a, lambda i: f"x[{i}]", element) for a in operation.angles]
+        angles = [_formula(a, lambda i: f"x[..., {i}]", element) for a in operation.angles]
         name = _PENNYLANE_FIXED.get(operation.gate, operation.gate)
         wires = list(operation.wires)
         arguments = ", ".join([*angles, f"wires={wires[0] if len(wires) == 1 else wires}"])

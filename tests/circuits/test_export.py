@@ -55,6 +55,9 @@ def test_the_pennylane_program(make: Any) -> None:
     names: dict[str, Any] = {}
     exec(export(circuit, "pennylane"), names)
     np.testing.assert_allclose(names["circuit"](x, **parameters), expected, atol=1e-12)
+    batch = np.stack([x, 0 * x, -x])
+    alone = [names["circuit"](each, **parameters) for each in batch]
+    np.testing.assert_allclose(np.transpose(names["circuit"](batch, **parameters)), alone, atol=1e-12)
 
 
 @pytest.mark.parametrize("make", CIRCUITS)
@@ -93,7 +96,7 @@ def test_a_small_circuit_by_hand() -> None:
         f"crz({math.pi}) q[0], q[1];",
     ]
     assert "circuit.rx(w[1] * x[0] + 0.5, 0)" in export(circuit, "qiskit")
-    assert "qml.RX(w[0, 1] * x[0] + 0.5, wires=0)" in export(circuit, "pennylane")
+    assert "qml.RX(w[0, 1] * x[..., 0] + 0.5, wires=0)" in export(circuit, "pennylane")
 
 
 @pytest.mark.parametrize("format", FORMATS)
