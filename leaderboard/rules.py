@@ -106,7 +106,7 @@ class _Fenced:
         Under which it was registered.
     promise:
         Its promise.
-    where:
+    origin:
         What to call it in messages.
     """
 

@@ -24,7 +24,7 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
         point is neither copied nor converted.
     relative:
         Whether scores are fractions of a known maximum, in [0, 1].
-    what:
+    name:
         What to call the curves in an error message.
 
     Raises

@@ -83,7 +83,7 @@ class EventSink:
     ----------
     known:
         Where trackers are registered.
-    words:
+    requests:
         The trackers that are asked for, `NAME` or `NAME=TARGET`.
 
     Attributes

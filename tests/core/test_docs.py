@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import inspect
 import itertools
 import re
 import shlex
@@ -224,3 +226,68 @@ def test_links_between_pages_resolve() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def sections(docstring: str | None) -> dict[str, list[str]]:
+    """Return the lines of a numpy-style docstring by section, `Parameters` and such."""
+    lines, found, name = (docstring or "").splitlines(), {"": []}, ""
+    for line, below in itertools.zip_longest(lines, lines[1:], fillvalue=""):
+        if below and set(below.strip()) == {"-"} and len(below.strip()) == len(line.strip()):
+            name = line.strip()
+            found[name] = []
+        else:
+            found[name].append(line)
+    return found
+
+
+def parameters(docstring: str | None) -> set[str]:
+    """Return the names that a docstring documents as parameters."""
+    lines = [
+        line for line in sections(inspect.cleandoc(docstring or "")).get("Parameters", []) if ":" in line
+    ]
+    heads = [line.split(":")[0] for line in lines if not line.startswith((" ", "-"))]
+    return {name.strip(" *`") for head in heads for name in head.split(",")}
+
+
+def taken(node: ast.AST) -> set[str]:
+    """Return the names of what a function takes, or a class when it is made: its fields, where it has no `__init__`."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        a = node.args
+        every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
+        return {argument.arg for argument in every}
+    assert isinstance(node, ast.ClassDef)
+    made = [
+        taken(item) for item in node.body if isinstance(item, ast.FunctionDef) and item.name == "__init__"
+    ]
+    fields = {
+        item.target.id
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
+    }
+    return set().union(*made) if made else fields
+
+
+SOURCES = [
+    path
+    for folder in ("qrlsuite", "plugins", "leaderboard", "tasks")
+    for path in (ROOT / folder).rglob("*.py")
+]
+
+
+def test_documented_parameters_exist() -> None:
+    wrong, documented = [], 0
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                names = parameters(ast.get_docstring(node))
+                documented += len(names)
+                wrong += [
+                    f"{path.name}:{node.lineno} {node.name}: {name}" for name in sorted(names - taken(node))
+                ]
+    assert documented > 500
+    assert not wrong
+
+
+def test_parameters_are_found_in_a_docstring() -> None:
+    text = "Do it.\n\nParameters\n----------\na, b:\n    Two: numbers.\n*c:\n    More.\n\nReturns\n-------\nint:\n    1"
+    assert parameters(text) == {"a", "b", "c"}
