@@ -65,7 +65,11 @@ class Algorithm(Protocol):
         """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,)."""
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (S, B) for observations (S, B, obs)."""
+        """Return the greedy actions (S, B) for observations (S, B, obs).
+
+        An algorithm that draws them has an attribute `draws` that is true. It draws from streams of its own, so that
+        training goes on as if no action had been drawn.
+        """
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that training depends on, seed-first, environments' state excluded."""

@@ -155,6 +155,7 @@ class PPO:
         self.epoch = 0
         self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
         self._validation: list[np.random.Generator] = []
+        self.draws = options.validation == "sampled"
 
     def start(self) -> None:
         """Reset the environments."""
@@ -308,7 +309,7 @@ class PPO:
         Drawn actions come from one stream per seed and epoch, in the order of the calls since the epoch ended.
         """
         logits = self.actor(torch.from_numpy(observations).to(self.device))
-        if self.options.validation == "sampled":
+        if self.draws:
             if not self._validation:
                 self._validation = [s.numpy("validation actions", self.epoch) for s in self.streams]
             noise = [g.gumbel(size=logits.shape[1:]) for g in self._validation]

@@ -8,11 +8,13 @@ import importlib.util
 import json
 from collections.abc import Mapping
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from typing import Any
 
 from qrlsuite import options as option_values
 from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, PluginError
+from qrlsuite.experiment.task import load as load_task
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
 from qrlsuite.testing.fresh import HEAVY, fresh_process
 
@@ -97,7 +99,7 @@ def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, An
     kind:
         A key of `registry.KINDS`.
     name_or_spec:
-        A registered name, or a spec, registered or not.
+        A registered name, or a spec, registered or not; or for a task its file (`*.toml`).
     settings:
         Values of options. Where there are options `qubits` and `layers` and they are not set, two qubits and one
         layer are taken: conformance shows at the smallest size, and simulators take long at others.
@@ -108,6 +110,9 @@ def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, An
         If nothing or more than one thing has that name.
     """
     known = registry.load()
+    if kind == "tasks" and isinstance(name_or_spec, str) and name_or_spec.endswith(".toml"):
+        file = load_task(name_or_spec).file
+        name_or_spec = specs.TaskSpec(file.name, file.summary, str(Path(name_or_spec).resolve()))
     if isinstance(name_or_spec, str):
         registered = known.get(kind, name_or_spec)
         spec, distribution = registered.spec, registered.distribution

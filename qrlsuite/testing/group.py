@@ -141,6 +141,11 @@ class ToyGroup:
         chosen: NDArray[np.int64] = self.algorithm.act(observations)
         return chosen
 
+    @property
+    def draws(self) -> bool:
+        """Whether actions in validation are drawn, and differ from call to call."""
+        return bool(getattr(self.algorithm, "draws", False))
+
     def save(self) -> dict[str, NDArray[Any]]:
         """Return everything, seed-first."""
         saved = {f"algorithm.{k}": array(v) for k, v in self.algorithm.state_dict().items()}

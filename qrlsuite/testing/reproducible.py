@@ -36,7 +36,7 @@ def different_seed(lanes: Lanes, steps: int) -> None:
     require(
         differs(play(envs, action_rows), play(others, action_rows)) is not None,
         f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
-        "deterministic=True",
+        "--deterministic (in Python deterministic=True)",
     )
 
 

@@ -26,7 +26,7 @@ class CheckTarget:
 
 
 def select(word: str) -> list[CheckTarget]:
-    """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, or the module of a tracker.
+    """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, a task's file, or the module of a tracker.
 
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
     own; `distribution:NAME` says so where it is not.
@@ -37,6 +37,8 @@ def select(word: str) -> list[CheckTarget]:
         If it stands for things of several kinds, or for nothing; the message says what to type.
     """
     known = registry.load()
+    if word.endswith(".toml"):
+        return [CheckTarget("tasks", word)]
     kind, colon, name = word.partition(":")
     if colon:
         return _of_kind(kind, name)

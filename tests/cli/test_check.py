@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import registry
+from qrlsuite import registry, testing
 from qrlsuite.cli import main
+from qrlsuite.experiment.task import load
 from tests.core.test_hooks import install, suite
 
 ENGINES = """
@@ -121,6 +122,30 @@ def test_settings_are_checked_and_a_broken_rule_is_exit_code_1(check: Command) -
     code, out, _ = check("tidy-too", "--set", "slot=3")
     assert code == 1
     assert "did you mean 'slots'" in out
+
+
+def test_a_task_of_one_s_own_is_checked(check: Command, tiny_task: str) -> None:
+    code, out, err = check(tiny_task)
+    assert (code, err) == (0, "")
+    assert "  ✓ scores: " in out
+
+
+def test_an_environment_is_checked_as_a_task_has_it(
+    check: Command, tiny_task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[object, ...]] = []
+    monkeypatch.setattr(testing, "check", lambda *words, **more: [asked.append((*words, more))][1:])
+    given = load(tiny_task).file.environment.options
+    assert check("environment:beam6g", "--task", tiny_task, "--set", "degree=5", "--deterministic")[0] == 0
+    assert asked == [("environments", "beam6g", {**given, "degree": 5}, {"deterministic": True})]
+    assert (
+        "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
+    )
+    assert "--task and --deterministic are for an environment" in check("mlp", "--deterministic")[2]
+
+
+def test_ppo_that_draws_in_validation_keeps_the_rules(check: Command) -> None:
+    assert check("algorithm:ppo", "--set", "validation=sampled")[0] == 0
 
 
 def test_json_is_one_row_per_rule(check: Command) -> None:

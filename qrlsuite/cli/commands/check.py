@@ -13,6 +13,7 @@ from rich.text import Text
 from qrlsuite import registry, testing
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
+from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import parse_setting
 from qrlsuite.testing import Finding, selection
 from qrlsuite.testing.findings import watching
@@ -24,7 +25,8 @@ def check(
         str | None,
         typer.Argument(
             metavar="NAME|KIND:NAME|DISTRIBUTION",
-            help="What is registered, or a whole distribution. For a tracker without a name: its module.",
+            help="What is registered, a whole distribution, or a task's file. For a tracker without a name: its "
+            "module.",
         ),
     ] = None,
     settings: Annotated[
@@ -33,6 +35,16 @@ def check(
             "--set", metavar="NAME=VALUE", help="Check a single plugin with this value of an option."
         ),
     ] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            "--task", help="Check an environment with the options that this task, or task file, gives it."
+        ),
+    ] = None,
+    deterministic: Annotated[
+        bool,
+        typer.Option("--deterministic", help="The episodes of this environment are meant to be all alike."),
+    ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Test plugins against the suite's rules; a broken rule is shown with its likely cause.
@@ -45,22 +57,36 @@ def check(
         _teach(json_output)
         return
     items = selection.select(name)
-    chosen = {setting.name: setting.value for setting in map(parse_setting, settings or [])}
+    more = {"deterministic": True} if deterministic else {}
+    if (task or deterministic) and [item.kind for item in items] != ["environments"]:
+        raise typer.BadParameter(
+            "--task and --deterministic are for an environment: qrlsuite check environment:NAME"
+        )
+    chosen = {} if task is None else _options_in(task, items[0])
+    chosen |= {setting.name: setting.value for setting in map(parse_setting, settings or [])}
     if chosen and len(items) > 1:
         raise typer.BadParameter("--set is for one thing: name it, qrlsuite check KIND:NAME --set NAME=VALUE")
     if json_output:
-        results = [(item, _findings(item, chosen)) for item in items]
+        results = [(item, _findings(item, chosen, more)) for item in items]
         typer.echo(json.dumps([_plain(item, finding) for item, findings in results for finding in findings]))
     else:
-        results = _show(items, chosen)
+        results = _show(items, chosen, more)
     if not all(finding.ok for _, findings in results for finding in findings):
         raise typer.Exit(1)
 
 
-def _findings(item: CheckTarget, settings: dict[str, Any]) -> list[Finding]:
+def _options_in(task: str, item: CheckTarget) -> dict[str, Any]:
+    """Return the options that a task gives the environment which is to be checked."""
+    section = load_task(task).file.environment
+    if section.name != item.name:
+        raise typer.BadParameter(f"--task {task}: its environment is '{section.name}', not '{item.name}'")
+    return dict(section.options)
+
+
+def _findings(item: CheckTarget, settings: dict[str, Any], more: dict[str, Any]) -> list[Finding]:
 
     try:
-        return testing.check(item.kind, item.name, settings)
+        return testing.check(item.kind, item.name, settings, **more)
     except (Exception, SystemExit) as error:  # code that fails outside of any rule: the rest is still checked
         return [Finding("check", False, registry.words(error))]
 
@@ -76,7 +102,9 @@ def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _show(items: list[CheckTarget], settings: dict[str, Any]) -> list[tuple[CheckTarget, list[Finding]]]:
+def _show(
+    items: list[CheckTarget], settings: dict[str, Any], more: dict[str, Any]
+) -> list[tuple[CheckTarget, list[Finding]]]:
     """Check things one after another, with what is going on in the last line of a terminal."""
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     results = []
@@ -87,7 +115,7 @@ def _show(items: list[CheckTarget], settings: dict[str, Any]) -> list[tuple[Chec
 
         for item in items:
             with watching(announce(item)):
-                findings = _findings(item, settings)
+                findings = _findings(item, settings, more)
             results.append((item, findings))
             console.print(printable(item.title), style="bold")
             for finding in findings:
@@ -117,6 +145,7 @@ def _teach(json_output: bool) -> None:
     typer.echo("qrlsuite check NAME            something registered: qrlsuite check mlp")
     typer.echo("qrlsuite check KIND:NAME       where several kinds have the name: qrlsuite check model:mlp")
     typer.echo("qrlsuite check DISTRIBUTION    everything that a package registers")
+    typer.echo("qrlsuite check FILE.toml        a task of your own")
     typer.echo("\nIn a package's own tests: from qrlsuite.testing import assert_conforms")
     if others:
         typer.echo(f"\nInstalled plugins of others: {', '.join(printable(name) for name in others)}")
