@@ -119,10 +119,9 @@ def price(entry: EntryCurves, unit: str) -> Price:
     if not total:
         if kind == "hours":
             return Price(math.nan, "no times in its record")
-        without = "no circuit executions in its record (a mean-field approximation has none)"
         if not entry.has_circuit:
-            without = "executes no circuits"
-        return Price(math.nan, without)
+            return Price(math.nan, "executes no circuits")
+        return Price(math.nan, "no circuit executions in its record: its model counts none, or executes none")
     found = Price(total / steps, spread=max(of_seeds) / min(of_seeds) if min(of_seeds) else math.inf)
     if math.isinf(found.spread):
         return replace(found, problem=f"the records of some of its seeds hold no {unit}")

@@ -318,6 +318,8 @@ def plot(
     --------
     >>> plot("tiers", tasks="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
     """
+    if "task" in settings:
+        raise OptionError(f"plot takes `tasks`, one or several: write tasks={settings['task']!r}")
     drawn = compose(
         kind,
         _several(tasks),

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import pydantic
 import pydantic_core
+from packaging.version import Version
 
 from qrlsuite.errors import OptionError, PluginError, nearest
 
@@ -113,9 +114,20 @@ def describe(cls: type[Any]) -> list[dict[str, Any]]:
         }
         if name in added:
             row["since"], _ = added[name]
-            row["description"] += f" (since {row['since']})"
+            row["description"] += f" ({_since(row['since'])})"
         rows.append(row)
     return rows
+
+
+def _since(version: str) -> str:
+    """Say which version brought an option; a version that is not yet released, without its number."""
+    from qrlsuite import __version__
+
+    return (
+        f"since {version}"
+        if Version(version) <= Version(__version__)
+        else f"not in {__version__} as released"
+    )
 
 
 def _values(schema: Mapping[str, Any]) -> str:

@@ -38,6 +38,8 @@ def describe(kind: str, name: str) -> dict[str, Any]:
     UnknownNameError
         If nothing of that kind has the name.
     """
+    if kind == "tasks" and name.startswith("gym:"):
+        return {"kind": "task", "name": name, "distribution": "gymnasium"} | _task(name)
     registered = registry.load().get(kind, name)
     spec = registered.spec
     content: dict[str, Any] = {
@@ -47,13 +49,7 @@ def describe(kind: str, name: str) -> dict[str, Any]:
         "distribution": registered.distribution,
     }
     if isinstance(spec, specs.TaskSpec):
-        task = load(name)
-        content |= {
-            "hash": task.hash,
-            "path": spec.path,
-            **task.file.model_dump(mode="json", exclude={"name", "summary"}),
-        }
-        return content
+        return content | {"path": spec.path} | _task(name)
     for field in dataclasses.fields(spec):
         if field.name == "family":
             content["family"] = getattr(spec, field.name)
@@ -62,6 +58,12 @@ def describe(kind: str, name: str) -> dict[str, Any]:
         content["options"] = options.describe(specs.resolve(reference))
         content["set_with"] = _set_with(kind, name)
     return content
+
+
+def _task(name: str) -> dict[str, Any]:
+    """Return a task's hash and file."""
+    task = load(name)
+    return {"hash": task.hash, **task.file.model_dump(mode="json", exclude={"name"})}
 
 
 def _set_with(kind: str, name: str) -> str:

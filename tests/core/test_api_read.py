@@ -165,6 +165,8 @@ def test_a_picture_of_equal_numbers(small: EntryCurves, large: EntryCurves) -> N
     assert ["30 seeds*" in text for text in shown] == [True, True]
     with pytest.warns(UserWarning, match="qubits=14: 30 seeds, and not all that were asked for"):
         api.plot("bars", tasks="beam6g", seeds=iter(range(40)), **WHERE)
+    with pytest.raises(OptionError, match=r"plot takes `tasks`, one or several: write tasks='beam6g'"):
+        api.plot("bars", task="beam6g", **WHERE)
 
 
 def test_pictures_of_an_environment_take_its_options() -> None:

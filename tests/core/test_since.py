@@ -170,7 +170,11 @@ def test_a_run_from_before_is_resumed(train: Callable[..., Path], upgrade: Calla
     assert EntryStore(begun).record() == EntryStore(straight).record()
 
 
-def test_it_is_shown() -> None:
+def test_it_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("qrlsuite.__version__", "0.1.1")
+    (row,) = [row for row in options.describe(LaterAlgorithm) if row["name"] == "warm_up"]
+    assert row["description"] == "steps before learning (not in 0.1.1 as released)"
+    monkeypatch.setattr("qrlsuite.__version__", "0.2.0")
     rows = {row["name"]: row for row in options.describe(LaterAlgorithm)}
     assert rows["warm_up"]["since"] == "0.2.0"
     assert rows["warm_up"]["description"] == "steps before learning (since 0.2.0)"

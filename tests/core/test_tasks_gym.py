@@ -160,6 +160,11 @@ def test_a_task_file_names_an_unknown_id_with_its_path(tmp_path: Path) -> None:
 
 
 def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
+    shown = json.loads(cli("show", "task", "gym:FrozenLake-v1", "--json", cwd=tmp_path).stdout)
+    assert shown["ranking"]["thresholds"] == pytest.approx([0.35, 0.525, 0.7])
+    assert cli("show", "gym:FrozenLake-v1", cwd=tmp_path).stdout.startswith(
+        "kind: task\nname: gym:FrozenLake-v1\n"
+    )
     words = ["run", "--task", "gym:FrozenLake-v1", "--model", "mlp", "--seeds", "2", "--epochs", "2"]
     done = cli(*words, "--runs", "tmp", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

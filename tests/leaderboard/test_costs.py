@@ -92,7 +92,7 @@ def test_equal_prices_are_compared_at_whole_epochs() -> None:
     ("change", "by", "problem"),
     [
         ({"records": {0: {**PAID, "executions": 0}}, "parameters": (9, 0)}, "executions", "executes no circuits"),
-        ({"records": {0: {**PAID, "executions": 0}}}, "executions", "no circuit executions in its"),
+        ({"records": {0: {**PAID, "executions": 0}}}, "executions", "in its record: its model counts none, or"),
         ({}, "shots", "exact values, without shots"),
         ({"records": {0: {**PAID, "hours": 0}}}, "core-hours", "no times in its record"),
         ({"records": {}}, "core-hours", "no times in its record"),

@@ -69,6 +69,8 @@ def show(
     kind, target = _kind(name, second)
     known = registry.load()
     kinds = [k for k in registry.KINDS if (kind in (None, k)) and target in known.entries[k]]
+    if target.startswith("gym:") and kind in (None, "tasks"):
+        kinds = ["tasks"]
     if not kinds and kind is None:
         folder = _entry_folder(runs, target, published)
         if folder is not None:
