@@ -263,7 +263,8 @@ class Circuit:
         CircuitError
             If these are no qubits or groups of them, or one is there twice.
         """
-        listed = [] if isinstance(wires, str) else list(wires)
+        given: Any = wires  # whatever a program hands over
+        listed = [] if isinstance(given, str) else list(given)
         groups: list[tuple[Any, ...]] = [
             tuple(w) if isinstance(w, Iterable) and not isinstance(w, str) else (w,) for w in listed
         ]
