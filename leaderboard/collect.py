@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
-from qrlsuite.results import lookup
+from qrlsuite.results import codes, lookup
 from qrlsuite.results.lookup import Stored
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
@@ -44,7 +44,7 @@ def collect(
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    good: dict[tuple[str, str, str], list[EntryCurves]] = {}
+    good: dict[tuple[str, str, str], list[list[EntryCurves]]] = {}
     refused = []
     if only is None:
         stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
@@ -56,15 +56,14 @@ def collect(
             refused.append(f"{absent} of the study's {len(only)} entries: nothing is trained yet")
     for store in stores:
         try:
-            entry = read(store)
+            held = read_each(store)
         except QrlSuiteError as error:
             refused.append(str(error))
             continue
-        if entry is None:
-            continue
-        good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
+        for entry in held:
+            _add(good.setdefault((entry.task, entry.task_hash, entry.name), []), entry)
     collected = []
-    for copies in good.values():
+    for copies in (copies for kinds in good.values() for copies in _told_apart(kinds)):
         shown = _shown(copies) if published else copies[-1:]
         collected += shown
         for other in copies if published and len(shown) < len(copies) else ():
@@ -72,6 +71,32 @@ def collect(
                 size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
                 refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
     return collected, refused
+
+
+def _add(kinds: list[list[EntryCurves]], entry: EntryCurves) -> None:
+    """Put a copy of an entry to those of the same code."""
+    for copies in kinds:
+        if copies[0].codes == entry.codes or set(copies[0].codes) & set(entry.codes):
+            copies.append(entry)
+            return
+    kinds.append([entry])
+
+
+def _told_apart(kinds: list[list[EntryCurves]]) -> list[list[EntryCurves]]:
+    """Return copies of an entry by code, each with its mark where there are several codes."""
+    if len(kinds) == 1:
+        return kinds
+    return [
+        [_marked(entry, "@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in copies]
+        for copies in kinds
+    ]
+
+
+def _marked(entry: EntryCurves, mark: str) -> EntryCurves:
+    """Return an entry whose name and label say of which code it is."""
+    if "@" in entry.name:
+        return entry
+    return replace(entry, name=f"{entry.name}{mark}", label=f"{entry.label} {mark}")
 
 
 def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
@@ -205,6 +230,26 @@ def best(copies: Iterable[EntryCurves]) -> EntryCurves:
 
 
 def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
+    """Read the copies of the entry that has a name; `NAME @MARK` names its seeds of one code."""
+    try:
+        found, mark = _every_copy(runs, name, published, tasks), ""
+    except UnknownNameError:
+        base, at, mark = name.rpartition("@")
+        if not at:
+            raise
+        found = _every_copy(runs, base.rstrip(), published, tasks)
+    kinds: list[list[EntryCurves]] = []
+    for entry in found:
+        _add(kinds, entry)
+    told = _told_apart(kinds)
+    meant = [copies for copies in told if not mark or copies[0].name.rpartition("@")[2].startswith(mark)]
+    if len(meant) != 1:
+        labels = listed([f"'{copies[0].label}'" for copies in told])
+        raise UnknownNameError(f"'{name}' has seeds of {len(told)} codes: write {labels}")
+    return meant[0]
+
+
+def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
@@ -223,7 +268,7 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
                     raise error from None
                 raise
         folders = [entry.store for entry in everything if entry.key == key]
-    copies = [entry for entry in map(read, folders) if entry is not None]
+    copies = [entry for store in folders for entry in read_each(store)]
     if not copies:
         raise UnknownNameError(f"entry '{name}' has no finished epoch yet")
     if tasks and copies[0].task not in tasks:
@@ -298,15 +343,44 @@ def read(store: EntryStore) -> EntryCurves | None:
     Raises
     ------
     StoreError
+        If a file is damaged, a published entry is not what it says, or the seeds are of several codes.
+    """
+    found = read_each(store)
+    if len(found) > 1:
+        labels = listed([f"'{entry.label}'" for entry in found])
+        raise StoreError(f"{store.path} has seeds of several codes, which are several entries: {labels}")
+    return found[0] if found else None
+
+
+def read_each(store: EntryStore) -> list[EntryCurves]:
+    """Read a folder's entry, from runs or published; nothing where no run has finished an epoch.
+
+    Seeds of several codes are as many entries.
+
+    Raises
+    ------
+    StoreError
         If a file is damaged, or a published entry is not what it says.
     """
     if published_entries.is_published(store.path):
-        return published_entries.read(store.path).entry_curves()
-    return read_entry(store)
+        return [published_entries.read(store.path).entry_curves()]
+    groups = codes.of_seeds(store)
+    found = [_of_code(store, group) for group in groups] if len(groups) > 1 else [read_entry(store)]
+    return [entry for entry in found if entry is not None]
 
 
-def read_entry(store: EntryStore) -> EntryCurves | None:
+def _of_code(store: EntryStore, group: codes.SameCode) -> EntryCurves | None:
+    entry = read_entry(store, group.seeds)
+    return None if entry is None else _marked(entry, f"@{group.mark}")
+
+
+def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryCurves | None:
     """Read one entry from its runs; None where no run has finished an epoch. Tuning seeds do not count.
+
+    Parameters
+    ----------
+    seeds:
+        These alone; None for all.
 
     Raises
     ------
@@ -314,8 +388,8 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         If a file is damaged, or a score is outside [0, 1].
     """
     record = store.record()
-    runs = [store.seed(seed).read() for seed in store.seeds() if seed < TUNING_SEEDS]
-    runs = [run for run in runs if len(run.scores)]
+    chosen = [seed for seed in store.seeds() if seed < TUNING_SEEDS and (seeds is None or seed in seeds)]
+    runs = [run for run in (store.seed(seed).read() for seed in chosen) if len(run.scores)]
     if not runs:
         return None
     length = _common_length(runs)
@@ -331,8 +405,8 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
     require_scores(np.concatenate(list(own.values())), task_file, store.path)
     values = np.stack([own[run.seed][:length] for run in kept])
     return EntryCurves(
-        name=record["name"],
-        label=record["label"],
+        name=record["name"] + store.mark,
+        label=" ".join([record["label"], store.mark]).rstrip(),
         task=record["task_name"],
         task_hash=record["task_hash"],
         task_file=task_file,
@@ -360,6 +434,7 @@ def read_entry(store: EntryStore) -> EntryCurves | None:
         devices=origin.devices(provenance),
         tuning=record["tuning"],
         plan=record.get("plan"),
+        codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
         executions=sum(run.executions for run in runs),
         records={
             run.seed: {

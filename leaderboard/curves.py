@@ -50,6 +50,8 @@ class EntryCurves(Shown):
         Core-hours spent on the runs, those that were left out too.
     clocked:
         Whether any of these hours are by the clock and not processor time; None where the record does not say.
+    codes:
+        Digests of the code identities of its seeds; none where all code is the suite's with its first bits, or unknown.
     identity:
         What the entry's hash covers: task, algorithm, model and their resolved options.
     options:
@@ -105,6 +107,7 @@ class EntryCurves(Shown):
     networks: int | None = None
     fixed: int = 0
     clocked: bool | None = None
+    codes: tuple[str, ...] = ()
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""

@@ -39,7 +39,8 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
     store = EntryStore(entry.folder)
     built = store.entry()
-    folder = out / entry.task / entry.name
+    record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
+    folder = out / entry.task / record["name"]
     _refuse_smaller(folder, entry, force)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]
@@ -49,7 +50,7 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
             "repeat the `qrlsuite run` that made it"
         )
     content = published.files(
-        {name: value for name, value in store.record().items() if name != "published"},
+        {**record, **({"code": runs[0].record["code"]} if entry.codes else {})},
         entry.seeds,
         entry.curves,
         [run.seconds / 3600 for run in runs],

@@ -30,7 +30,7 @@ from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
 from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
-from qrlsuite.results import parquet
+from qrlsuite.results import codes, parquet
 from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
@@ -120,6 +120,7 @@ class PublishedEntry:
             executions=int(self.executions.sum()),
             tuning=record["tuning"],
             plan=record.get("plan"),
+            codes=codes.distinct([codes.read(record, self.folder / "entry.json")]),
             source="published",
             records={
                 seed: {
@@ -177,6 +178,7 @@ def _read(folder: Path) -> PublishedEntry:
     record = EntryStore(folder).record()
     task_file = TaskFile.model_validate(record["task_file"])
     published = record["published"]
+    codes.read(record, folder / "entry.json")
     _check_identity(folder, record, task_file)
     provenance = published["provenance"]
     _require(

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import QrlSuiteError, listed
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.leaderboard import origin, published
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.leaderboard.published import PublishedEntry
-from qrlsuite.results import provenance
+from qrlsuite.results import codes, provenance
 from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import learning_curve
 
@@ -111,6 +112,8 @@ def verify(
     sound = f"files sound: {count} seeds of {length} epochs, hashes and label computed again"
     if made_by is None:
         return VerificationResult(folder, name, True, "files", (), sound)
+    if changed := _changed_code(entry, made_by):
+        return VerificationResult(folder, name, False, "files", (), changed)
     chooser = generator or np.random.default_rng()
     places = sorted(int(i) for i in chooser.choice(count, size=min(rerun, count), replace=False))
     seeds = tuple(entry.seeds[place] for place in places)
@@ -122,6 +125,15 @@ def verify(
     if differs is None:
         return _equal(entry, name, places, seeds, again)
     return _plausible(entry, name, places, seeds, again, differs)
+
+
+def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
+    """Say in what the installed code differs from that which made an entry; None where that is unknown or nothing."""
+    made_with = codes.read(entry.record, entry.folder / "entry.json")
+    if made_with is None:
+        return None
+    changed = identity.differences(made_with.parts, identity.of(made_by).parts)
+    return f"its seeds cannot be trained again by this code: {listed(changed)}" if changed else None
 
 
 def _beginning(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
@@ -164,10 +176,11 @@ def _train(
 def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:
     """Say in what this machine differs from the one that made the seeds; None where bits must be equal.
 
-    Versions of plugins, and the device, are missing from what earlier versions of the suite recorded: they are then not
-    compared, and the device was the CPU.
+    The suite's version does not count: its parts compute equal bits while their `numerics` are equal, which are 1 where
+    none are recorded. Versions of plugins, and the device, are missing from what earlier versions of the suite
+    recorded: they are then not compared, and the device was the CPU.
     """
-    here = provenance.collect(made_by.distributions())
+    here = provenance.of(made_by)
     for record in (made for place in places for made in origin.all_of(entry.provenance[place])):
         if provenance.device_kind(record) != "cpu":
             name = record["device"].get("name", "unknown")
@@ -175,8 +188,14 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
         versions = record.get("versions")
         versions = versions if isinstance(versions, dict) else {}
         for name, version in here["versions"].items():
-            if versions.get(name) != version and (name in versions or name in provenance.PACKAGES):
+            compared = name != "qrlsuite" and (name in versions or name in provenance.PACKAGES)
+            if versions.get(name) != version and compared:
                 return f"{name} {version} here, {versions.get(name)} there"
+        numerics = record.get("numerics")
+        numerics = numerics if isinstance(numerics, dict) else {}
+        for role, number in here["numerics"].items():
+            if numerics.get(role, 1) != number:
+                return f"numerics {number} of the {role} here, {numerics.get(role, 1)} there"
         for name in ("processor", "system", "python"):
             if record.get(name) != here[name]:
                 return f"{name} {here[name]} here, {record.get(name)} there"

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -351,6 +351,8 @@ def train(
     device: str = "cpu",
     minutes: float | None = None,
     track: str | Sequence[str] = (),
+    fresh: bool = False,
+    same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> EntryCurves | None:
@@ -384,6 +386,10 @@ def train(
         Stop after this time, with every finished epoch saved.
     track:
         Trackers that watch, `NAME` or `NAME=TARGET`.
+    fresh:
+        Where the code of the entry has changed: train anew, and move the old seeds to a folder beside it.
+    same:
+        Where the code has changed: your word that nothing changed in effect, as a reason; the seeds are continued.
     runs:
         The results folder.
     progress:
@@ -400,7 +406,7 @@ def train(
     UnknownNameError, OptionError, TaskError
         For an unknown name, or an option or argument that cannot be used.
     StoreError
-        If a file of the entry is damaged.
+        If a file of the entry is damaged, or another code has begun its seeds.
     QrlSuiteError
         If training failed; finished epochs are kept.
     KeyboardInterrupt
@@ -416,8 +422,9 @@ def train(
     watching = [track] if isinstance(track, str) else list(track)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     _check_positive("epochs", epochs)
-    chosen_execution = _execution(engine, workers, device)
+    chosen_execution = _execution(engine, workers, device, fresh, same)
     execution.check_minutes(minutes, chosen_execution)
+    execution.require_same_code(Path(runs), [entry], chosen_execution)
     work = execution.plan(Path(runs), entry, chosen_execution, seed_numbers, epochs)
     with trackers.asking(watching):
         execution.train(
@@ -519,6 +526,7 @@ def decide(
     engine: str | Execution = "local",
     workers: int | None = None,
     device: str = "cpu",
+    same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> DecisionOutcome:
@@ -533,7 +541,7 @@ def decide(
         The plan's file.
     train:
         False only reads what is decided so far.
-    engine, workers, device, runs:
+    engine, workers, device, same, runs:
         As for `train`. The plan's seeds lie below `runs`/decisions.
     progress:
         Whether to show a bar on a terminal or in a notebook, and lines elsewhere.
@@ -564,7 +572,7 @@ def decide(
     if not train:
         return decided.read(Path(plan), Path(runs))
     study = decisions.DecisionStudy(decisions.load(Path(plan)), str(plan), Path(runs))
-    return decided.run(study, _execution(engine, workers, device), not progress, "call")
+    return decided.run(study, _execution(engine, workers, device, same=same), not progress, "call")
 
 
 def tune(
@@ -587,6 +595,8 @@ def tune(
     engine: str | Execution = "local",
     workers: int | None = None,
     device: str = "cpu",
+    fresh: bool = False,
+    same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> list[Search]:
@@ -596,7 +606,7 @@ def tune(
 
     Parameters
     ----------
-    task, algorithm, engine, workers, device, runs:
+    task, algorithm, engine, workers, device, fresh, same, runs:
         As for `train`. Trials lie below `runs`/tuning.
     model:
         A model, with settings if need be (`"mlp width=16"`); or several, which get equal budgets.
@@ -655,7 +665,7 @@ def tune(
         raise OptionError(f"out = {str(out)!r}: the preset file's name ends in .toml")
     _check_positive("epochs", epochs)
     _check_positive("trials", trials)
-    chosen_execution = _execution(engine, workers, device)
+    chosen_execution = _execution(engine, workers, device, fresh, same)
     budget = _seconds(minutes)
     varied = {
         name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
@@ -736,6 +746,8 @@ def run_study(
     engine: str | Execution = "local",
     workers: int | None = None,
     device: str = "cpu",
+    fresh: bool = False,
+    same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> StudyRun:
@@ -759,7 +771,7 @@ def run_study(
         Stop at a group's end when this time is used up. The same call continues.
     format:
         Of the pictures, which are written into the results folder.
-    engine, workers, device, runs, progress:
+    engine, workers, device, fresh, same, runs, progress:
         As for `train`.
 
     Returns
@@ -784,7 +796,7 @@ def run_study(
         raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
     _check_positive("epochs", epochs)
     budget = _seconds(minutes)
-    chosen_execution = _execution(engine, workers, device)
+    chosen_execution = _execution(engine, workers, device, fresh, same)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     study = study_files.load(name)
     studies.check(study)
@@ -792,6 +804,7 @@ def run_study(
     members = study_runner.select(study, from_mapping(options), models, names)
     folder = Path(runs)
     speeds = speed.known(folder)
+    execution.require_same_code(folder, [member.entry for member in members], chosen_execution)
     items = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
     if budget is not None:
         study_runner.check_budget(items, budget, chosen_execution.workers)
@@ -803,14 +816,16 @@ def run_study(
     return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
 
 
-def _execution(engine: str | Execution, workers: int | None, device: str) -> Execution:
+def _execution(
+    engine: str | Execution, workers: int | None, device: str, fresh: bool = False, same: str | None = None
+) -> Execution:
     """Return where training is done."""
     if isinstance(engine, Execution):
         if workers is not None or device != "cpu":
             raise OptionError("workers and device belong to an engine that is built already: give them there")
-        return engine
+        return replace(engine, fresh=engine.fresh or fresh, same=engine.same if same is None else same)
     _check_positive("workers", workers)
-    return execution.create(engine, workers, device=device)
+    return replace(execution.create(engine, workers, device=device), fresh=fresh, same=same)
 
 
 def _check_positive(name: str, value: int | None) -> None:

@@ -66,6 +66,20 @@ class Spec:
 
 
 @dataclass(frozen=True, slots=True)
+class NumericSpec(Spec):
+    """What a spec has of which an entry's numbers are made.
+
+    Attributes
+    ----------
+    numerics:
+        Of the suite's own: raised when its bits change, so that earlier seeds are not continued with it. A plugin's
+        code is compared itself, see `qrlsuite.experiment.identity`.
+    """
+
+    numerics: int = field(default=1, kw_only=True)
+
+
+@dataclass(frozen=True, slots=True)
 class PictureSpec(Spec):
     """A picture of an environment, drawn by `qrlsuite plot NAME --task TASK`.
 
@@ -83,7 +97,7 @@ class PictureSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
-class EnvironmentSpec(Spec):
+class EnvironmentSpec(NumericSpec):
     """An environment.
 
     Attributes
@@ -116,7 +130,7 @@ class EnvironmentSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
-class ModelSpec(Spec):
+class ModelSpec(NumericSpec):
     """A function approximator.
 
     Attributes
@@ -158,7 +172,7 @@ class ModelSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
-class AlgorithmSpec(Spec):
+class AlgorithmSpec(NumericSpec):
     """A learning algorithm: one file with an options dataclass and a class (see `qrlsuite.algorithm`).
 
     Attributes
@@ -201,7 +215,7 @@ class StudySpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
-class AnsatzSpec(Spec):
+class AnsatzSpec(NumericSpec):
     """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`."""
 
     options: str
@@ -209,7 +223,7 @@ class AnsatzSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True)
-class CircuitBackendSpec(Spec):
+class CircuitBackendSpec(NumericSpec):
     """Something that computes expectation values of a circuit, differentiably, in torch.
 
     Attributes

@@ -476,3 +476,28 @@ def mean_field_refusal(backend: str) -> str:
         f"backend '{backend}' runs circuits, and the mean-field approximation of a circuit is none; backend 'native' "
         "computes it (model vqc-native)"
     )
+
+
+def canonical(circuit: Circuit) -> str:
+    """Return a circuit as text, exactly: equal for two circuits that are the same gates, however they were written."""
+    kind = " mean-field" if circuit.mean_field else ""
+    lines = [f"circuit {circuit.qubits} qubits {circuit.inputs} inputs{kind}"]
+    for parameter in circuit.parameters.values():
+        shape = "x".join(map(str, parameter.shape))
+        lines.append(f"parameter {parameter.name} {shape} {float(parameter.low)!r} {float(parameter.high)!r}")
+    for operation in circuit:
+        control = "" if operation.control is None else f" control {operation.control}"
+        angles = "".join(f" {_written(angle)}" for angle in operation.angles)
+        lines.append(f"{operation.gate} {' '.join(map(str, operation.wires))}{control}{angles}")
+    measured = " ".join("*".join(map(str, qubits)) for qubits in circuit.measured)
+    return "\n".join([*lines, f"measure {measured}", ""])
+
+
+def _written(angle: Angle) -> str:
+    """Write an angle: its constant, and after a plus sign each, its inputs with their scale, and its weight."""
+    inputs = [f"x{index}" for index in (angle.input, angle.factor) if index is not None]
+    scale = [f"{angle.scale.parameter}[{angle.scale.index}]"] if angle.scale else []
+    weight = [f"{angle.weight.parameter}[{angle.weight.index}]"] if angle.weight else []
+    return "+".join(
+        [repr(float(angle.constant)), *(["*".join([*scale, *inputs])] if inputs else []), *weight]
+    )

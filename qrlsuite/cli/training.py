@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -50,6 +51,22 @@ DeviceOption = Annotated[
     str, typer.Option("--device", help="Where networks are trained: cpu, cuda or cuda:1.")
 ]
 
+FreshOption = Annotated[
+    bool,
+    typer.Option(
+        "--fresh",
+        help="Where the code of an entry has changed: train anew, and move the old seeds to a folder beside it.",
+    ),
+]
+SameOption = Annotated[
+    str | None,
+    typer.Option(
+        "--same",
+        metavar="REASON",
+        help="Where the code has changed: your word that nothing changed in effect; the seeds are continued.",
+    ),
+]
+
 
 def execution_of(
     engine: str,
@@ -58,10 +75,13 @@ def execution_of(
     time: str | None = None,
     settings: list[str] | None = None,
     device: str = "cpu",
+    fresh: bool = False,
+    same: str | None = None,
 ) -> Execution:
     """Build the engine that a command's options name; the errors are those of `qrlsuite.engine.execution.create`."""
     chosen = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
-    return execution.create(engine, workers, {"partition": partition, "time": time, **chosen}, device)
+    built = execution.create(engine, workers, {"partition": partition, "time": time, **chosen}, device)
+    return replace(built, fresh=fresh, same=same)
 
 
 _PIECE = re.compile(r"(\d+(?:\.\d+)?)\s*(seconds|sec|s|minutes|min|m|hours|h|days|d)")

@@ -22,8 +22,9 @@ from qrlsuite.engine.api import Engine, EngineOutcome, RemoteEngine
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results import speed
+from qrlsuite.results import codes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup, plan_groups
@@ -48,6 +49,10 @@ class Execution:
         The engine's name, for messages.
     remote:
         Whether groups run on other machines than this one.
+    fresh:
+        Whether an entry whose code has changed is begun anew, and its old seeds set aside.
+    same:
+        Its author's word that a change of code changes nothing: the reason.
     """
 
     engine: Engine | RemoteEngine
@@ -56,6 +61,8 @@ class Execution:
     submits: bool = False
     name: str = "local"
     remote: bool = False
+    fresh: bool = False
+    same: str | None = None
 
     def run(self, work: Plan, show: api.Show) -> EngineOutcome:
         """Let the engine train the groups of a plan."""
@@ -215,6 +222,41 @@ def plan(
     return Plan(runs, entry, store, requested, last, frozenset(busy), missing)
 
 
+def require_same_code(runs: Path, entries: Sequence[Entry], execution: Execution) -> list[str]:
+    """Refuse entries of which another code has begun seeds: before they are planned, and anything is trained.
+
+    With `execution.fresh`, such seeds are set aside; with `execution.same`, the codes are declared to be the same.
+
+    Returns
+    -------
+    list of str
+        What was moved, one line each.
+
+    Raises
+    ------
+    StoreError
+        Saying what changed and the ways on, or why seeds cannot be set aside.
+    OptionError
+        If both ways are asked for, or the reason is none.
+    """
+    if execution.fresh and execution.same is not None:
+        raise OptionError(
+            "--fresh and --same: the old seeds are either set aside or continued; give one of them"
+        )
+    moved: list[str] = []
+    for entry in entries:
+        store, code = EntryStore.find(runs, entry), identity.of(entry)
+        if execution.same is not None:
+            codes.declare_same(store, code, execution.same)
+        elif execution.fresh:
+            old, earlier = codes.set_aside(runs, store, code, execution.engine.queued(store))
+            moved += [] if old is None else [f"the seeds of another code are now in {old}"]
+            moved += [] if earlier is None else [f"{earlier} has seeds of this code: they are continued"]
+        else:
+            codes.require(store, code)
+    return moved
+
+
 class _TimeIsUp(Exception):
     """Ends an engine's work as Ctrl-C does."""
 
@@ -270,11 +312,15 @@ def train(
             raise _TimeIsUp
 
     display.deadline = None if minutes is None else began + 60 * minutes
+    code = identity.of(work.entry)
+    codes.require(work.store, code)
     if not execution.remote and work.groups:
         _check_device(execution.device)
         check_memory(work, execution)
     fresh = not work.store.path.exists()
     EntryStore.create(work.runs, work.entry)
+    if work.groups:
+        codes.prepare(work.store, code)
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
     display.begin(execution.submits, holders)
     if not work.groups:

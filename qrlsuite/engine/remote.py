@@ -22,6 +22,7 @@ from qrlsuite.engine.api import Answer, EngineOutcome, Link, RemoteEngine, Show,
 from qrlsuite.engine.local import ATTEMPTS
 from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire_each
@@ -123,7 +124,10 @@ class _Run:
         self.work, self.store = work, work.store
         self.entry = work.store.entry()
         self.events = EventSink(registry.load(), asked())
-        self._files = functools.partial(GroupFiles, self.entry, work.store, events=self.events)
+        self.code = identity.of(self.entry)
+        self._files = functools.partial(
+            GroupFiles, self.entry, work.store, events=self.events, code=self.code
+        )
         found = versions([*PACKAGES, *self.entry.distributions()])
         self.versions = {name: version for name, version in found.items() if version is not None}
         self.seconds = checkpoint_seconds(TASK_SECONDS)
@@ -202,6 +206,7 @@ class _Run:
             "seconds": self.seconds,
             "device": self.work.device,
             "versions": self.versions,
+            "code": self.code.record()["parts"],
         }
         task = pack(header, arrays)
         if len(task) > MOST_BYTES:

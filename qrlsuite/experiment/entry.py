@@ -100,21 +100,28 @@ class Entry:
         covered = {k: v for k, v in values.items() if k not in options.later(cls)}
         return options.plain(options.build(cls, covered, "preset"))
 
-    def distributions(self) -> list[str]:
-        """Return the distributions whose code makes the entry's numbers, each once.
+    def registered(self) -> dict[str, registry.Registered]:
+        """Return what makes the entry's numbers, by role: environment, algorithm and model.
 
-        Those of environment, algorithm and model, and of ansatz and circuit backend where the model has them.
+        Where the model has them, its `ansatz` and its circuit `backend`, too.
         """
         known = registry.load()
         named = {
-            "environments": self.task.environment.name,
-            "algorithms": self.algorithm.name,
-            "models": self.model.name,
-            "ansatzes": getattr(self.model_options, "ansatz", None),
-            "circuit_backends": getattr(self.model_options, "backend", None),
+            "environment": ("environments", self.task.environment.name),
+            "algorithm": ("algorithms", self.algorithm.name),
+            "model": ("models", self.model.name),
+            "ansatz": ("ansatzes", getattr(self.model_options, "ansatz", None)),
+            "backend": ("circuit_backends", getattr(self.model_options, "backend", None)),
         }
-        registered = [known.entries[kind].get(name) for kind, name in named.items() if isinstance(name, str)]
-        return list(dict.fromkeys(each.distribution for each in registered if each is not None))
+        return {
+            role: known.entries[kind][name]
+            for role, (kind, name) in named.items()
+            if isinstance(name, str) and name in known.entries[kind]
+        }
+
+    def distributions(self) -> list[str]:
+        """Return the distributions whose code makes the entry's numbers, each once."""
+        return list(dict.fromkeys(each.distribution for each in self.registered().values()))
 
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""

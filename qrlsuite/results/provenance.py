@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import qrlsuite
+from qrlsuite.experiment import identity
+from qrlsuite.experiment.entry import Entry
 
 if TYPE_CHECKING:
     import torch
@@ -40,6 +42,11 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
         "threads": 1,
         "commit": _commit(),
     }
+
+
+def of(entry: Entry, device: torch.device | None = None) -> dict[str, Any]:
+    """Return what `collect` returns of an entry, and the `numerics` of its parts that are the suite's, by role."""
+    return {**collect(entry.distributions(), device), "numerics": identity.numerics(entry)}
 
 
 def version(distribution: str) -> str | None:

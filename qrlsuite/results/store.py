@@ -38,6 +38,7 @@ from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import parquet
 
 FORMAT_VERSION = 1
+_MARK = re.compile(r"@[0-9a-f]{8}")
 _SEED_FOLDER = re.compile(r"seed-(\d{4,})")
 
 
@@ -501,6 +502,12 @@ class EntryStore:
         self.path = path
         self.groups = path / "groups"
         self.claims = path / "claims"
+
+    @property
+    def mark(self) -> str:
+        """What follows the entry's name where these seeds are of another code, `@1a2b3c4d`; else nothing."""
+        found = _MARK.search(self.path.name)
+        return found[0] if found is not None and found.end() == len(self.path.name) else ""
 
     @classmethod
     def find(cls, runs: Path, entry: Entry) -> EntryStore:

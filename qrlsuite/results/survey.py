@@ -81,7 +81,7 @@ def look(store: EntryStore, queued: Collection[int] | None = None) -> EntrySurve
         folder=store.path,
         task=str(record.get("task_name", store.path.parent.name)),
         name=store.path.name,
-        label=str(record.get("label", "?")),
+        label=" ".join([str(record.get("label", "?")), store.mark]).rstrip(),
         seeds=dict(Counter(statuses.values())),
         epochs=(min(epochs), max(epochs)) if epochs else None,
         size=size,
@@ -339,6 +339,32 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
         If somebody trains the entry or a queue has some of its seeds, if its folder is a link or lies beyond one, or
         if it cannot be removed.
     """
+    require_movable(runs, store, queued)
+    path = store.path
+    size, _ = _usage(path)
+    gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
+    move_away(store, gone)
+    try:
+        (gone / "entry.json").unlink()  # so that what is left, if this is interrupted, is no entry
+        shutil.rmtree(gone)
+    except OSError as error:
+        raise StoreError(f"cannot remove {gone}: {error.strerror or error}") from None
+    return size
+
+
+def require_movable(runs: Path, store: EntryStore, queued: Collection[int] | None = None) -> None:
+    """Refuse to move an entry's folder that is or lies beyond a link, or of which a queue has seeds.
+
+    Parameters
+    ----------
+    runs, queued:
+        As for `delete`.
+
+    Raises
+    ------
+    StoreError
+        Saying which of these.
+    """
     path = store.path
     if path.is_symlink() or path.parent.is_symlink() or path.resolve().parents[1] != runs.resolve():
         raise StoreError(
@@ -349,12 +375,3 @@ def delete(runs: Path, store: EntryStore, queued: Collection[int] | None = None)
         raise StoreError(
             f"{path} waits in a queue ({waits[0].where}): cancel that first; nothing was deleted"
         )
-    size, _ = _usage(path)
-    gone = path.with_name(f".deleted-{path.name}-{secrets.token_hex(4)}")
-    move_away(store, gone)
-    try:
-        (gone / "entry.json").unlink()  # so that what is left, if this is interrupted, is no entry
-        shutil.rmtree(gone)
-    except OSError as error:
-        raise StoreError(f"cannot remove {gone}: {error.strerror or error}") from None
-    return size

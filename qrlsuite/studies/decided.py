@@ -196,6 +196,7 @@ def run(
     KeyboardInterrupt
         When it was interrupted and every worker has saved and ended.
     """
+    execution.require_same_code(study.folder, list(study.entries.values()), chosen_execution)
     study.begin()
     submitted: list[str] = []
     decision = study.look()

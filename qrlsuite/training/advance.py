@@ -13,6 +13,7 @@ Of a task:
     seconds         how long to train; one epoch is trained at least
     device          `cpu`, `cuda` or `cuda:1`
     versions        of the distributions that make the numbers: a worker with others refuses the task
+    code            the parts of the entry's code identity: the same
 
 Of an answer:
 
@@ -45,6 +46,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import from_record
 from qrlsuite.results import provenance
 from qrlsuite.results.checkpoint import Arrays
@@ -113,6 +115,15 @@ def advance(task: bytes) -> bytes:
     answer: dict[str, Any] = {"token": token, "seeds": seeds, "refused": None, "error": None}
     if different:
         return pack({**answer, "refused": f"{socket.gethostname()} has {different}"}, {})
+    try:
+        changed = identity.differences(
+            [dict(part) for part in header["code"]],
+            identity.of(from_record(header["entry"], "the task")).parts,
+        )
+    except (QrlSuiteError, KeyError, TypeError, ValueError) as error:
+        return pack({**answer, "refused": f"this is no task: {error}"}, {})
+    if changed:
+        return pack({**answer, "refused": f"{socket.gethostname()} has other code: {listed(changed)}"}, {})
     keep_freed_memory()
     with _one_at_a_time:
         more, arrays = _trained(header, seeds, arrays)
@@ -161,7 +172,7 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
         entry = from_record(header["entry"], "the task")
         trainer = Trainer(entry, seeds, header["device"])
         more["parameters"] = trainer.models.trained()
-        origin = provenance.collect(entry.distributions(), trainer.device)
+        origin = provenance.of(entry, trainer.device)
         more["provenance"] = {**origin, "host": socket.gethostname()}
         if header["epoch"]:
             trainer.restore(header["epoch"], arrays)

@@ -18,8 +18,10 @@ from safetensors.numpy import save as encode
 
 from qrlsuite import options, registry
 from qrlsuite.errors import EnvironmentFailure, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results import checkpoint, provenance, store
+from qrlsuite.experiment.identity import CodeIdentity
+from qrlsuite.results import checkpoint, codes, provenance, store
 from qrlsuite.training.interrupts import Interruptible
 from qrlsuite.training.trackers import EventSink, asked
 from qrlsuite.training.trainer import Epoch, Report, Trainer
@@ -61,12 +63,20 @@ class GroupFiles:
         Protocol seeds; all at the same epoch.
     events:
         The trackers that are told.
+    code:
+        The identity of the code that trains.
     """
 
     def __init__(
-        self, entry: Entry, entry_store: store.EntryStore, seeds: Sequence[int], events: EventSink
+        self,
+        entry: Entry,
+        entry_store: store.EntryStore,
+        seeds: Sequence[int],
+        events: EventSink,
+        code: CodeIdentity,
     ) -> None:
         self.entry, self.store, self.seeds, self.events = entry, entry_store, list(seeds), events
+        self.code = code
         self.parameters: dict[str, int] = {}
         self.saved_epoch = 0
 
@@ -108,11 +118,15 @@ class GroupFiles:
         self.parameters = dict(parameters)
         for seed in self.seeds:
             folder = self.store.seed(seed)
+            old = folder.record() or {}
+            begun = {"code": self.code.record()} if epoch == 0 else {}
             record = {
                 **self._seed_record(seed),
                 "status": "running",
                 "epochs": epoch,
-                "provenance": _with_origin(folder.record() or {}, origin),
+                **({"code": old["code"]} if "code" in old else {}),
+                **begun,
+                "provenance": _with_origin(old, origin),
             }
             folder.write_record(record)
             history = folder.epochs() if self.events.heard("run_started") else []
@@ -193,6 +207,20 @@ def _with_origin(record: Mapping[str, Any], origin: Mapping[str, Any]) -> list[A
     return made_with if origin in made_with else [*made_with, origin]
 
 
+def _required_code(entry: Entry, entry_store: store.EntryStore) -> CodeIdentity:
+    """Return the identity of the code here, unless another one was sent to train the entry or has begun it.
+
+    Raises
+    ------
+    StoreError
+        Saying what differs.
+    """
+    code = identity.of(entry)
+    codes.require_sent(entry_store, code, socket.gethostname())
+    codes.require(entry_store, code)
+    return code
+
+
 class GroupRun:
     """The training of one group of seeds in this process, with its files.
 
@@ -240,6 +268,7 @@ class GroupRun:
     ) -> None:
         self.epochs, self.held = epochs, held
         parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
+        found = [_required_code(*part[:2]) for part in parts]
         self.trainer = Trainer(
             [own for own, _, part in parts for _ in part],
             [seed for *_, part in parts for seed in part],
@@ -248,7 +277,7 @@ class GroupRun:
         )
         self.progress, self.report = self.trainer.progress, report
         events = EventSink(registry.load(), asked())
-        self.files = [GroupFiles(*part, events) for part in parts]
+        self.files = [GroupFiles(*part, events, code) for part, code in zip(parts, found)]
         self.progress.epochs, self.progress.warnings = epochs, events.problems
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
 
@@ -307,7 +336,7 @@ class GroupRun:
             self.trainer.start()
         self.progress.epoch = self.trainer.epoch
         parameters = self.trainer.models.trained()
-        origin = provenance.collect(self.trainer.entry.distributions(), self.trainer.device)
+        origin = provenance.of(self.trainer.entry, self.trainer.device)
         for files in self.files:
             files.begin(self.trainer.epoch, parameters, origin)
 

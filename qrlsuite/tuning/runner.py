@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qrlsuite.engine import api
-from qrlsuite.engine.execution import Execution, check_memory, plan
+from qrlsuite.engine.execution import Execution, check_memory, plan, require_same_code
 from qrlsuite.errors import OptionError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.halving import Halving
@@ -101,10 +103,12 @@ def _run(
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
+        for line in require_same_code(runs / FOLDER, entries, execution):
+            display.console.print(line, markup=False, soft_wrap=True)
         plans = [plan(runs / FOLDER, entry, execution, seeds, epochs) for entry in entries]
         for work in plans:
             check_memory(work, execution)
-            EntryStore.create(work.runs, work.entry)
+            codes.prepare(EntryStore.create(work.runs, work.entry), identity.of(work.entry))
             trained += len(work.missing)
         display.begin_trials(plans)
         for together in execution.divide(plans):

@@ -17,6 +17,7 @@ from qrlsuite.cli.training import (
     EngineOption,
     EngineOptionsOption,
     PartitionOption,
+    SameOption,
     TimeOption,
     WorkersOption,
     execution_of,
@@ -159,6 +160,7 @@ def run(
     time: TimeOption = None,
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
+    same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -169,7 +171,7 @@ def run(
     Example: qrlsuite decide run width.toml --workers 8
     """
     study = _study(path, runs)
-    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device)
+    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device, same=same)
     console = Console(stderr=True, quiet=json_output, highlight=False)
     try:
         outcome = decided.run(

@@ -14,8 +14,10 @@ from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
+    FreshOption,
     MinutesOption,
     PartitionOption,
+    SameOption,
     TimeOption,
     TrackOption,
     WorkersOption,
@@ -88,6 +90,8 @@ def run(
     time: TimeOption = None,
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
+    fresh: FreshOption = False,
+    same: SameOption = None,
     track: TrackOption = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Also start a training that will take more than a day.")
@@ -110,8 +114,10 @@ def run(
         trackers.ask(track)
     seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
     last = epochs or (QUICK_EPOCHS if quick else None)
-    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device)
+    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
     execution.check_minutes(minutes, chosen_execution)
+    for line in execution.require_same_code(runs, [entry], chosen_execution):
+        typer.echo(line, err=True)
     work = execution.plan(runs, entry, chosen_execution, seed_numbers, last)
     display = RunDisplay(work, chosen_execution.workers, quiet=json_output)
     if not json_output:

@@ -11,14 +11,17 @@ import typer
 
 from qrlsuite import circuit, registry
 from qrlsuite.circuit import drawing, export
+from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.catalog import describe, hooks
 from qrlsuite.leaderboard import collect, pictures, rules
 from qrlsuite.options import parse_setting
-from qrlsuite.results import lookup
+from qrlsuite.results import codes, lookup
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, write_atomically
 from qrlsuite.results.survey import outline
 
@@ -53,6 +56,12 @@ def show(
             help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane.",
         ),
     ] = None,
+    code: Annotated[
+        bool,
+        typer.Option(
+            "--identity", help="Show the code identity, and what it is taken of: of an entry or a plugin."
+        ),
+    ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -74,7 +83,7 @@ def show(
     if not kinds and kind is None:
         folder = _entry_folder(runs, target, published)
         if folder is not None:
-            content = outline(EntryStore(folder))
+            content = _code_of_entry(EntryStore(folder)) if code else outline(EntryStore(folder))
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not kinds:
@@ -84,6 +93,11 @@ def show(
     if len(kinds) > 1:
         singulars = " or ".join(f"`show {registry.SINGULAR[k]} {target}`" for k in kinds)
         raise UnknownNameError(f"'{target}' is several things; write {singulars}")
+    if code:
+        size = (4 if qubits is None else qubits, 2 if layers is None else layers)
+        content = _code_of_plugin(kinds[0], target, *size, settings or [])
+        typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
+        return
     content = describe(kinds[0], target)
     if kinds[0] == "significance_tests":
         content["promises"] = rules.load(target).promise
@@ -149,6 +163,40 @@ def _entry_folder(runs: Path, name: str, published: bool) -> Path | None:
         if any(lookup.mentions(entry, name) for entry in stored):
             raise
         return None
+
+
+def _code_of_entry(store: EntryStore) -> dict[str, Any]:
+    """Return the steps from an entry's code to its identity, and with which identities its seeds were trained."""
+    entry = store.entry()
+    now, drawn = identity.of(entry), identity.circuit_of(entry)
+    return {
+        "label": entry.label,
+        **({} if drawn is None else {"circuit": canonical(drawn)}),
+        "parts": {f"{part['role']} {part['name']}": dict(part) for part in now.parts},
+        "text": now.text,
+        "digest": now.digest,
+        "seeds": {
+            format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]
+            for group in codes.of_seeds(store)
+        },
+    }
+
+
+def _code_of_plugin(kind: str, name: str, qubits: int, layers: int, settings: list[str]) -> dict[str, Any]:
+    """Return what a registered thing adds to the identity of an entry: its circuit, files or `numerics`.
+
+    Raises
+    ------
+    OptionError
+        If it computes nothing of an entry.
+    """
+    if kind not in identity.ROLES:
+        raise OptionError(
+            f"{registry.SINGULAR[kind]} '{name}' computes nothing of an entry, and has no code identity"
+        )
+    drawn = _circuit(name, qubits, layers, settings) if kind == "ansatzes" else None
+    text = {} if drawn is None else {"circuit text": canonical(drawn)}
+    return {**text, **identity.of_registered(kind, name, drawn)}
 
 
 def _circuit(name: str, qubits: int, layers: int, settings: list[str]) -> circuit.Circuit:

@@ -15,12 +15,15 @@ from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
+    FreshOption,
     PartitionOption,
+    SameOption,
     TimeOption,
     WorkersOption,
     execution_of,
     seconds,
 )
+from qrlsuite.engine.execution import require_same_code
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
@@ -199,6 +202,8 @@ def run(
     time: TimeOption = None,
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
+    fresh: FreshOption = False,
+    same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -211,7 +216,7 @@ def run(
     Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run all --budget 8h
     """
     _check_format(format_)
-    execution = execution_of(engine, workers, partition, time, engine_options, device)
+    execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
     limit = seconds(budget) if budget is not None else None
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
@@ -229,6 +234,8 @@ def run(
     if dry_run:
         _dry_run(name, runner.dry_run(every, limit, execution.workers), json_output)
         return
+    for line in require_same_code(runs, [member.entry for member in everyone], execution):
+        typer.echo(line, err=True)
     session = runner.Session(runs, execution, speeds, limit, quiet=json_output)
     results = []
     for study, members in chosen:

@@ -16,7 +16,9 @@ from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
     EngineOptionsOption,
+    FreshOption,
     PartitionOption,
+    SameOption,
     TimeOption,
     WorkersOption,
     execution_of,
@@ -151,6 +153,8 @@ def tune(
     time: TimeOption = None,
     engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
+    fresh: FreshOption = False,
+    same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
@@ -180,7 +184,7 @@ def tune(
         objective=objective.value,
     )
     searches = runner.build(search.for_each_model(shared, models), runs)
-    execution = execution_of(engine, workers, partition, time, engine_options, device)
+    execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
     display = TuneDisplay(searches, execution, quiet=json_output)
     display.begin()
     if dry_run:

@@ -1,0 +1,265 @@
+"""Code identity: what computes an entry's numbers, as content. A name stands for one thing only while this stays.
+
+    part                      what its identity covers
+    of the suite itself       its `numerics`, which is raised when its bits change; not its source
+    a circuit                 its description, as built: gates, wires, angles, parameters (`canonical`)
+    a plugin's other parts    the syntax trees of the modules that its code reaches by imports within its distribution
+    a file that an option     its bytes
+    names
+
+The parts as canonical JSON give the digest, 16 hexadecimal digits of SHA-256. Engines, trackers and rules compute
+nothing of an entry.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from typing import Any, cast
+
+from qrlsuite import circuit, options, registry, specs
+from qrlsuite.circuit.description import Circuit, canonical
+from qrlsuite.experiment import source
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.task import digest
+
+OURS = "qrlsuite"
+_CODE = {
+    "environment": ("options", "entry_point", "vector"),
+    "model": ("options", "build", "population"),
+    "algorithm": ("options", "factory"),
+    "backend": ("options", "factory"),
+    "ansatz": ("options", "build"),
+}
+"""The references of a spec to code that computes, by role."""
+
+ROLES = {
+    "environments": "environment",
+    "models": "model",
+    "algorithms": "algorithm",
+    "circuit_backends": "backend",
+    "ansatzes": "ansatz",
+}
+"""Roles by kind in the plural."""
+
+Part = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class CodeIdentity:
+    """The parts that compute an entry's numbers.
+
+    Attributes
+    ----------
+    parts:
+        Each has a `role`, a `name` and, but for a file, a `distribution`; and `numerics`, the SHA-256 of a `circuit`,
+        that of each of some `files`, or its own `sha256`.
+    """
+
+    parts: tuple[Part, ...]
+
+    @property
+    def text(self) -> str:
+        """What the digest is taken of: canonical JSON."""
+        return json.dumps(self.parts, sort_keys=True, separators=(",", ":"))
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits."""
+        return digest(self.parts)
+
+    @property
+    def original(self) -> bool:
+        """Whether all code is the suite's, with its first bits: what seeds without a recorded identity have."""
+        return all(
+            part.get("distribution") == OURS and part.get("numerics", 1) == 1
+            for part in self.parts
+            if "distribution" in part
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return what `run.json` stores."""
+        return {"digest": self.digest, "parts": [dict(part) for part in self.parts]}
+
+
+def of(entry: Entry) -> CodeIdentity:
+    """Compute an entry's code identity from what is installed now."""
+    parts = [
+        _part(role, each, circuit_of(entry) if role == "ansatz" else None, _environment_id(entry, role))
+        for role, each in entry.registered().items()
+    ]
+    return CodeIdentity((*parts, *_files(entry)))
+
+
+def numerics(entry: Entry) -> dict[str, int]:
+    """Return the `numerics` of an entry's parts that are the suite's own, by role."""
+    return {
+        role: cast(specs.NumericSpec, each.spec).numerics
+        for role, each in entry.registered().items()
+        if each.distribution == OURS
+    }
+
+
+def circuit_of(entry: Entry) -> Circuit | None:
+    """Build the circuit that a model's options describe; None where they describe none that can be built."""
+    own = entry.model_options
+    try:
+        chosen = dict(getattr(own, "ansatz_options", {}))
+        known = options.field_names(specs.resolve(registry.ansatz(own.ansatz).options))
+        for name in getattr(own, "passes_on", ()):
+            if name in known:
+                chosen.setdefault(name, getattr(own, name))
+        return circuit.ansatz(own.ansatz, own.qubits, own.layers, **chosen)
+    except Exception:  # a stranger's builder, of which training says in better words what is wrong
+        return None
+
+
+def of_registered(kind: str, name: str, drawn: Circuit | None = None) -> Part:
+    """Return the part of a registered thing, by its kind in the plural.
+
+    Parameters
+    ----------
+    drawn:
+        Of an ansatz: the circuit that it builds.
+    """
+    return _part(ROLES[kind], registry.load().get(kind, name), drawn, None)
+
+
+def _part(role: str, each: registry.Registered, drawn: Circuit | None, gym: str | None) -> Part:
+    part: dict[str, Any] = {"role": role, "name": each.spec.name, "distribution": each.distribution}
+    if each.distribution == OURS:
+        part["numerics"] = cast(specs.NumericSpec, each.spec).numerics
+    if drawn is not None:
+        return {**part, "circuit": hashlib.sha256(canonical(drawn).encode()).hexdigest()}
+    if gym is not None and (module := _gymnasium_module(gym)) is not None:
+        owner = metadata.packages_distributions().get(module.partition(".")[0], ["unknown"])[0]
+        return {"role": role, "name": gym, "distribution": owner, "files": _modules([module], owner)}
+    if each.distribution != OURS:
+        references = [getattr(each.spec, name) for name in _CODE[role]]
+        roots = [reference.partition(":")[0] for reference in references if reference is not None]
+        part["files"] = _modules(roots, each.distribution)
+    return part
+
+
+def _environment_id(entry: Entry, role: str) -> str | None:
+    """Return the id under which Gymnasium makes an entry's environment, where no spec has its code."""
+    spec = entry.task.environment
+    if role != "environment" or spec.entry_point is not None:
+        return None
+    if spec.vector is None:
+        return spec.gymnasium_id
+    return entry.task.environment_options.id if spec.name == "gym" else None
+
+
+def _gymnasium_module(env_id: str) -> str | None:
+    """Return the module of an environment that another package than Gymnasium registered there."""
+    gymnasium = sys.modules.get("gymnasium")
+    known = None if gymnasium is None else gymnasium.registry.get(env_id.rpartition(":")[2])
+    point = None if known is None else known.entry_point
+    module = point.partition(":")[0] if isinstance(point, str) else getattr(point, "__module__", None)
+    return None if module is None or module.partition(".")[0] in ("gymnasium", OURS) else module
+
+
+def _modules(roots: Sequence[str], distribution: str) -> dict[str, str]:
+    """Return the modules that roots reach within their distribution; without one, within their own folder."""
+    tops = {root.partition(".")[0] for root in roots}
+    listed = _listed(distribution)
+    places = {_place(spec) for top in tops if (spec := source.find(top)) is not None} - {None}
+
+    def belongs(name: str, spec: ModuleSpec) -> bool:
+        return name in tops or (name in listed if listed else _place(spec) in places)
+
+    return source.reached(roots, belongs)
+
+
+def _listed(distribution: str) -> set[str]:
+    """Return the top-level modules that a distribution says that it has."""
+    try:
+        found = metadata.distribution(distribution)
+    except (metadata.PackageNotFoundError, ValueError):
+        return set()
+    words = (found.read_text("top_level.txt") or "").split()
+    files = [file for file in found.files or () if file.suffix == ".py"]
+    return {*words, *(file.parts[0].partition(".")[0] for file in files)}
+
+
+def _place(spec: ModuleSpec) -> Path | None:
+    """Return the folder in which a top-level module lies, None where packages of all origins do."""
+    if spec.origin is None or not spec.has_location:
+        return None
+    path = Path(spec.origin).parent
+    folder = path.parent if spec.submodule_search_locations is not None else path
+    shared = folder.name in ("site-packages", "dist-packages") or (folder / "asyncio").is_dir()
+    return None if shared else folder
+
+
+def _files(entry: Entry) -> Iterator[Part]:
+    """Yield a part for every option that names a file."""
+    sides = {
+        "environment": entry.task.environment_options,
+        "algorithm": entry.algorithm_options,
+        "model": entry.model_options,
+    }
+    for side, values in sides.items():
+        for name, value in _texts(side, options.plain(values)):
+            if ("/" in value or "." in value) and (content := _content(Path(value))) is not None:
+                yield {"role": "file", "name": name, "sha256": content}
+
+
+def _content(path: Path) -> str | None:
+    """Return the SHA-256 of a file, None where there is none."""
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except (OSError, ValueError):  # a text that can be no path
+        return None
+
+
+def _texts(name: str, value: Any) -> Iterator[tuple[str, str]]:
+    if isinstance(value, str):
+        yield name, value
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _texts(f"{name}.{key}", inner)
+    elif isinstance(value, list | tuple):
+        for number, inner in enumerate(value):
+            yield from _texts(f"{name}.{number}", inner)
+
+
+def differences(before: Sequence[Part], now: Sequence[Part]) -> list[str]:
+    """Say in words what differs between the parts of two identities."""
+    old, new = ({(part["role"], part["name"]): part for part in parts} for parts in (before, now))
+    changes: list[str] = []
+    for key in dict.fromkeys([*old, *new]):
+        changes += _changes(f"{key[0]} '{key[1]}'", old.get(key), new.get(key))
+    return changes
+
+
+def _changes(what: str, old: Part | None, new: Part | None) -> Iterator[str]:
+    if old == new:
+        return
+    if old is None or new is None:
+        yield f"{what} is {'new' if old is None else 'gone'}"
+        return
+    owner = new.get("distribution")
+    if owner != old.get("distribution"):
+        yield f"{what} is of {owner}, and was of {old.get('distribution')}"
+    if old.get("numerics", 1) != new.get("numerics", 1):
+        yield f"{what} has numerics {new.get('numerics', 1)}, and had {old.get('numerics', 1)}"
+    if old.get("circuit") != new.get("circuit"):
+        yield f"the circuit of {what} of {owner} has changed"
+    if old.get("sha256") != new.get("sha256"):
+        yield f"the {what} has another content"
+    was, files = old.get("files", {}), new.get("files", {})
+    for path in dict.fromkeys([*was, *files]):
+        if was.get(path) != files.get(path):
+            verb = "is new" if path not in was else "is gone" if path not in files else "has changed"
+            yield f"{path} of {owner} ({what}) {verb}"

@@ -1,0 +1,324 @@
+"""The code identities of an entry's seeds: which of them are one entry, and what to do where the code has changed.
+
+`run.json` has the identity of the code that began a seed under `code`, `entry.json` that of the code that trains now.
+Seeds from before identities were recorded have none: they are those of the suite's first bits, or of a plugin's code
+that nobody knows. What an author declared to be the same in effect stands in `entry.json` under `same`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import socket
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qrlsuite.errors import OptionError, StoreError, listed
+from qrlsuite.experiment import identity
+from qrlsuite.experiment.identity import CodeIdentity
+from qrlsuite.results import survey
+from qrlsuite.results.claims import living, move_away
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import EntryStore, read_json, write_json
+
+UNKNOWN = ""
+"""The digest of seeds whose code was not recorded."""
+
+_PART = {
+    "role": str,
+    "name": str,
+    "distribution": str,
+    "numerics": int,
+    "circuit": str,
+    "sha256": str,
+    "files": dict,
+}
+
+
+class ChangedCodeError(StoreError):
+    """An entry has seeds of another code than the installed one."""
+
+
+@dataclass(frozen=True)
+class SameCode:
+    """Seeds of one code, or of several that were declared to be the same.
+
+    Attributes
+    ----------
+    codes:
+        Identities by digest, in the order of the seeds; None where nothing was recorded.
+    """
+
+    seeds: tuple[int, ...]
+    codes: Mapping[str, CodeIdentity | None]
+
+    @property
+    def mark(self) -> str:
+        """Eight digits that tell these seeds from others of the entry; zeros where the code of none is known."""
+        return next(filter(None, self.codes), "0" * 8)[:8]
+
+
+def read(record: Mapping[str, Any], source: Path) -> CodeIdentity | None:
+    """Return the identity that a record has under `code`, None where it has none.
+
+    Raises
+    ------
+    StoreError
+        If it is not one.
+    """
+    content = record.get("code")
+    if content is None:
+        return None
+    parts = content.get("parts") if isinstance(content, Mapping) else None
+    if isinstance(parts, list) and all(_is_part(part) for part in parts):
+        code = CodeIdentity(tuple(parts))
+        if code.digest == content.get("digest"):
+            return code
+    raise StoreError(f"{source}: code is not a code identity; restore the file")
+
+
+def _is_part(part: Any) -> bool:
+    return (
+        isinstance(part, dict)
+        and {"role", "name"} <= part.keys() <= _PART.keys()
+        and all(isinstance(value, _PART[name]) for name, value in part.items())
+        and all(isinstance(content, str) for content in part.get("files", {}).values())
+    )
+
+
+def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
+    """Return the digests of identities; none where one is unknown or of the suite's first bits: these are alike."""
+    known = list(codes)
+    if any(code is None or code.original for code in known):
+        return ()
+    return tuple(dict.fromkeys(code.digest for code in known if code is not None))
+
+
+def of_seeds(store: EntryStore) -> list[SameCode]:
+    """Return an entry's seeds by their code, those of one code first that the lowest seed has.
+
+    Raises
+    ------
+    StoreError
+        If a seed's code is no identity, or the entry's record is damaged.
+    """
+    seeds: dict[str, list[int]] = {}
+    codes: dict[str, CodeIdentity | None] = {}
+    for seed in store.seeds() if store.path.is_dir() else ():
+        path = store.seed(seed).path / "run.json"
+        try:
+            record = store.seed(seed).record()
+        except StoreError:  # is said where the seed is read
+            continue
+        if record is None:
+            continue
+        code = read(record, path)
+        digest = UNKNOWN if code is None else code.digest
+        codes[digest] = code
+        seeds.setdefault(digest, []).append(seed)
+    return [
+        SameCode(
+            tuple(sorted(seed for digest in alike for seed in seeds[digest])),
+            {digest: codes[digest] for digest in alike},
+        )
+        for alike in _alike(codes, _declared(store) if len(codes) > 1 else [])
+    ]
+
+
+def _declared(store: EntryStore) -> list[list[str]]:
+    """Return the digests that were declared to be the same, one list for each declaration.
+
+    Raises
+    ------
+    StoreError
+        If the entry's record is damaged.
+    """
+    said = store.record().get("same", [])
+    if not isinstance(said, list) or not all(
+        isinstance(one, dict)
+        and isinstance(one.get("codes"), list)
+        and all(isinstance(code, str) for code in one["codes"])
+        for one in said
+    ):
+        raise StoreError(f"{store.path / 'entry.json'}: same is not a list of declarations; restore the file")
+    return [one["codes"] for one in said]
+
+
+def _alike(codes: Mapping[str, CodeIdentity | None], declared: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Divide digests into those that stand for the same code, in their order."""
+    first = next((digest for digest, code in codes.items() if code is not None and code.original), None)
+    links = [*declared, *([[UNKNOWN, first]] if first is not None and UNKNOWN in codes else [])]
+    groups: list[set[str]] = []
+    for link in [*([digest] for digest in codes), *links]:
+        touched = [group for group in groups if group & set(link)]
+        groups = [group for group in groups if group not in touched] + [set(link).union(*touched)]
+    order = list(codes)
+    found = [[digest for digest in order if digest in group] for group in groups]
+    return sorted((group for group in found if group), key=lambda group: order.index(group[0]))
+
+
+def others(store: EntryStore, current: CodeIdentity) -> list[SameCode]:
+    """Return the seeds of an entry that another code than this one has begun.
+
+    Raises
+    ------
+    StoreError
+        If a record is damaged.
+    """
+    held = of_seeds(store)
+    if not held:
+        return []
+    codes = {digest: code for group in held for digest, code in group.codes.items()}
+    same = next(
+        group
+        for group in _alike({current.digest: current, **codes}, _declared(store))
+        if current.digest in group
+    )
+    return [group for group in held if not set(group.codes) & set(same)]
+
+
+def require(store: EntryStore, current: CodeIdentity) -> None:
+    """Refuse to continue an entry's seeds with another code than that which began them.
+
+    Raises
+    ------
+    ChangedCodeError
+        Saying what changed, and the ways on.
+    StoreError
+        If a record is damaged.
+    """
+    for group in others(store, current):
+        raise ChangedCodeError(_refusal(store, group, current))
+    if store.path.is_dir() and living(store):  # somebody has begun it a moment ago, and no seed says so yet
+        require_sent(store, current, socket.gethostname())
+
+
+def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
+    seeds, record = format_seeds(group.seeds), store.record()
+    before = next(filter(None, group.codes.values()), None)
+    if before is None and all("numerics" in part or part["role"] == "file" for part in current.parts):
+        before = CodeIdentity(
+            tuple({**part, **({"numerics": 1} if "numerics" in part else {})} for part in current.parts)
+        )
+    if before is None:
+        change = (
+            "they were begun before the code of plugins was recorded, so nobody knows whether it is the same"
+        )
+    else:
+        change = listed(identity.differences(before.parts, current.parts))
+    if record.get("plan") is None:
+        anew = (
+            f"--fresh trains anew, and the old seeds move to {store.path.name}@{group.mark}; a changed thing can \
+be registered under another name"
+        )
+    else:
+        anew = "restore that code, or write another plan"
+    return (
+        f"{store.path} has seeds {seeds} of '{record['label']}' that another code has begun: {change}. Nothing was "
+        f'trained. {anew}; and --same "REASON" says that nothing changed in effect'
+    )
+
+
+def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
+    """Refuse to train an entry here with another code than that of whoever started it.
+
+    Raises
+    ------
+    StoreError
+        Naming this machine and what differs.
+    """
+    path = store.path / "entry.json"
+    sent = read(store.record(), path) if path.exists() else None
+    if sent is None:
+        return
+    if len(_alike({sent.digest: sent, current.digest: current}, _declared(store))) > 1:
+        differing = listed(identity.differences(sent.parts, current.parts))
+        raise ChangedCodeError(
+            f"{host} would train {store.path} with another code than the machine that started it: {differing}; "
+            "install the same on both, and repeat the command"
+        )
+
+
+def prepare(store: EntryStore, current: CodeIdentity) -> None:
+    """Write down with which code an entry is trained from now on; workers refuse another one."""
+    if store.record().get("code") != current.record():
+        _note(store, "code", current.record())
+
+
+def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:
+    """Record its author's word that an entry's seeds of another code and this code do the same.
+
+    Raises
+    ------
+    OptionError
+        If no reason is given.
+    StoreError
+        If a record is damaged or cannot be written.
+    """
+    if not reason.strip() or not reason.isprintable():
+        raise OptionError(
+            "--same: say in one line why nothing changed in effect, for example --same 'renamed'"
+        )
+    changed = others(store, current)
+    if not changed:
+        return
+    said = {
+        "codes": sorted({current.digest, *(digest for group in changed for digest in group.codes)}),
+        "reason": reason.strip(),
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    _note(store, "same", [*store.record().get("same", []), said])
+
+
+def _note(store: EntryStore, name: str, value: Any) -> None:
+    path = store.path / "entry.json"
+    write_json(path, {**read_json(path), name: value})
+
+
+def set_aside(
+    runs: Path, store: EntryStore, current: CodeIdentity, queued: Collection[int] = ()
+) -> tuple[Path | None, Path | None]:
+    """Move an entry's folder with seeds of another code to `<entry>@<mark>`; nothing is deleted.
+
+    A folder of this code's seeds that was set aside before takes its place.
+
+    Parameters
+    ----------
+    queued:
+        The seeds that a queue still has.
+
+    Returns
+    -------
+    tuple
+        Where the old seeds are now, and where this code's seeds were; None where there are none.
+
+    Raises
+    ------
+    StoreError
+        If somebody trains the entry, a queue or a decision plan has it, seeds of both codes are in it, its new place is
+        taken, or it cannot be moved.
+    """
+    changed = others(store, current)
+    if not changed:
+        return None, None
+    survey.require_movable(runs, store, queued)
+    target = store.path.with_name(f"{store.path.name}@{changed[0].mark}")
+    if store.record().get("plan") is not None:
+        raise StoreError(
+            f"{store.path} is of a decision plan that has begun: its seeds stay; write another plan"
+        )
+    if len(changed) > 1 or len(of_seeds(store)) > 1:
+        seeds = format_seeds(changed[0].seeds)
+        raise StoreError(
+            f"{store.path} has seeds of several codes: move the folders of seeds {seeds} to {target} beside a copy of "
+            "entry.json, and repeat the command"
+        )
+    if target.exists():
+        raise StoreError(f"{target} is there already: move it out of {runs}, and repeat the command")
+    move_away(store, target)
+    earlier = EntryStore(store.path.with_name(f"{store.path.name}@{current.digest[:8]}"))
+    if not (earlier.path / "entry.json").exists() or others(earlier, current):
+        return target, None
+    move_away(earlier, store.path)
+    return target, earlier.path
