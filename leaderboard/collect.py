@@ -44,7 +44,7 @@ def collect(
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    good: dict[tuple[str, str, str], list[list[EntryCurves]]] = {}
+    good: dict[tuple[str, str, str], list[EntryCurves]] = {}
     refused = []
     if only is None:
         stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
@@ -61,9 +61,9 @@ def collect(
             refused.append(str(error))
             continue
         for entry in held:
-            _add(good.setdefault((entry.task, entry.task_hash, entry.name), []), entry)
+            good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
     collected = []
-    for copies in (copies for kinds in good.values() for copies in _told_apart(kinds)):
+    for copies in (copies for same in good.values() for copies in told_apart(same)):
         shown = _shown(copies) if published else copies[-1:]
         collected += shown
         for other in copies if published and len(shown) < len(copies) else ():
@@ -73,22 +73,27 @@ def collect(
     return collected, refused
 
 
-def _add(kinds: list[list[EntryCurves]], entry: EntryCurves) -> None:
-    """Put a copy of an entry to those of the same code."""
-    for copies in kinds:
-        if copies[0].codes == entry.codes or set(copies[0].codes) & set(entry.codes):
-            copies.append(entry)
-            return
-    kinds.append([entry])
+def by_code(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
+    """Return copies of an entry in lists, one for each code that trained some."""
+    kinds: list[list[EntryCurves]] = []
+    for entry in copies:
+        for kind in kinds:
+            if kind[0].codes == entry.codes or set(kind[0].codes) & set(entry.codes):
+                kind.append(entry)
+                break
+        else:
+            kinds.append([entry])
+    return kinds
 
 
-def _told_apart(kinds: list[list[EntryCurves]]) -> list[list[EntryCurves]]:
+def told_apart(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
     """Return copies of an entry by code, each with its mark where there are several codes."""
+    kinds = by_code(copies)
     if len(kinds) == 1:
         return kinds
     return [
-        [_marked(entry, "@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in copies]
-        for copies in kinds
+        [_marked(entry, "@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
+        for same in kinds
     ]
 
 
@@ -238,10 +243,7 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
         if not at:
             raise
         found = _every_copy(runs, base.rstrip(), published, tasks)
-    kinds: list[list[EntryCurves]] = []
-    for entry in found:
-        _add(kinds, entry)
-    told = _told_apart(kinds)
+    told = told_apart(found)
     meant = [copies for copies in told if not mark or copies[0].name.rpartition("@")[2].startswith(mark)]
     if len(meant) != 1:
         labels = listed([f"'{copies[0].label}'" for copies in told])

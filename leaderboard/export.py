@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.leaderboard import published
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.fingerprint import fingerprint
+from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore, parameters_of
 
 
@@ -39,6 +41,7 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
     store = EntryStore(entry.folder)
     built = store.entry()
+    codes.require_installed(store, entry.seeds, identity.of(built))
     record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
     folder = out / entry.task / record["name"]
     _refuse_smaller(folder, entry, force)

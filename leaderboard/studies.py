@@ -122,9 +122,10 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
 
 
 def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryCurves]:
+    """Return the copies of an entry; only those of the same code as the first."""
     stores = [EntryStore.find(folder, entry) for folder in folders]
     found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
-    return [curves for curves in found if curves is not None]
+    return next(iter(collect.by_code(curves for curves in found if curves is not None)), [])
 
 
 def published_seeds(items: Iterable[PendingEntry]) -> dict[str, int]:

@@ -25,7 +25,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard import origin, published
 from qrlsuite.leaderboard.curves import require_scores
 from qrlsuite.leaderboard.published import PublishedEntry
-from qrlsuite.results import checkpoint, provenance
+from qrlsuite.results import checkpoint, codes, provenance
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
@@ -123,6 +123,7 @@ def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenO
     runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
     for run in runs_by_seed.values():  # all of them, before anything is written
         _check(run, entry, source.seed(run.seed))
+    codes.require_mergeable(store, source, exported is not None)
     store = EntryStore.create(runs, entry)
     claim = acquire(store, seeds)
     try:
@@ -232,6 +233,7 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> T
                 "interactions_per_epoch": entry.task.file.protocol.interactions,
                 "status": "finished",
                 "epochs": len(rows),
+                **({"code": exported.record["code"]} if "code" in exported.record else {}),
                 "provenance": [dict(exported.provenance[row])],
             }
         )

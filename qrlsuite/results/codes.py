@@ -220,6 +220,66 @@ be registered under another name"
     )
 
 
+def require_installed(store: EntryStore, seeds: Collection[int], current: CodeIdentity) -> None:
+    """Refuse to build trained agents with a plugin's code that has changed since; `numerics` do not count.
+
+    Raises
+    ------
+    ChangedCodeError
+        Saying what changed.
+    StoreError
+        If a record is damaged.
+    """
+    for group in others(store, current):
+        for code in filter(None, group.codes.values() if set(group.seeds) & set(seeds) else ()):
+            changed = identity.differences(
+                *([{**part, "numerics": 1} for part in each.parts] for each in (code, current))
+            )
+            if changed:
+                raise ChangedCodeError(
+                    f"{store.path}: seeds {format_seeds(group.seeds)} were trained by another code than is installed: "
+                    f"{listed(changed)}; install that code, or say with `qrlsuite run --same` that nothing changed"
+                )
+
+
+def require_mergeable(store: EntryStore, source: EntryStore, exported: bool) -> None:
+    """Refuse to put seeds of one code to those of another.
+
+    Parameters
+    ----------
+    store:
+        Where the seeds are to go; it need not exist.
+    exported:
+        Whether `source` is an exported entry, whose record has its code.
+
+    Raises
+    ------
+    ChangedCodeError
+        Saying what differs.
+    StoreError
+        If a record is damaged.
+    """
+    groups = of_seeds(store)
+    own = {digest: code for group in groups for digest, code in group.codes.items()}
+    if exported:
+        code = read(source.record(), source.path / "entry.json")
+        theirs: Mapping[str, CodeIdentity | None] = {UNKNOWN if code is None else code.digest: code}
+    else:
+        theirs = {digest: code for group in of_seeds(source) for digest, code in group.codes.items()}
+    declared = _declared(source) + (_declared(store) if groups else [])
+    alike = _alike({**own, **theirs}, declared)
+    if len(alike) < 2:
+        return
+    before, other = ({**own, **theirs}[digests[0]] for digests in alike[:2])
+    change = "of some, the code is not known"
+    if before is not None and other is not None:
+        change = listed(identity.differences(before.parts, other.parts))
+    raise ChangedCodeError(
+        f"the seeds of {source.path} are not all of one code with each other and those of {store.path}: {change}; "
+        "choose another folder with --runs"
+    )
+
+
 def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
     """Refuse to train an entry here with another code than that of whoever started it.
 

@@ -115,15 +115,8 @@ def advance(task: bytes) -> bytes:
     answer: dict[str, Any] = {"token": token, "seeds": seeds, "refused": None, "error": None}
     if different:
         return pack({**answer, "refused": f"{socket.gethostname()} has {different}"}, {})
-    try:
-        changed = identity.differences(
-            [dict(part) for part in header["code"]],
-            identity.of(from_record(header["entry"], "the task")).parts,
-        )
-    except (QrlSuiteError, KeyError, TypeError, ValueError) as error:
-        return pack({**answer, "refused": f"this is no task: {error}"}, {})
-    if changed:
-        return pack({**answer, "refused": f"{socket.gethostname()} has other code: {listed(changed)}"}, {})
+    if changed := _changed_code(header):
+        return pack({**answer, "refused": f"{socket.gethostname()} has other code: {changed}"}, {})
     keep_freed_memory()
     with _one_at_a_time:
         more, arrays = _trained(header, seeds, arrays)
@@ -132,6 +125,15 @@ def advance(task: bytes) -> bytes:
         nothing = {"epoch": header["epoch"], "lines": [], "timings": []}
         return pack({**answer, **more, **nothing, "error": too_large(len(content), len(seeds))}, {})
     return content
+
+
+def _changed_code(header: Mapping[str, Any]) -> str:
+    """Say in what the code here differs from what a task is to be trained with; nothing where it does not."""
+    try:
+        sent = [dict(part) for part in header["code"]]
+        return listed(identity.differences(sent, identity.of(from_record(header["entry"], "the task")).parts))
+    except (QrlSuiteError, KeyError, TypeError, ValueError):  # is said where the entry is built
+        return ""
 
 
 @functools.cache

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from qrlsuite import specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, PluginError, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore, SeedStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training.trainer import Policy, Trainer, build_envs, play_episodes
@@ -166,8 +168,9 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     Raises
     ------
     StoreError
-        If a run has no parameters, or they are not those of the entry's model.
+        If a run has no parameters, they are not those of the entry's model, or its code has changed since.
     """
+    codes.require_installed(store, seeds, identity.of(entry))
     stored = [parameters(store.seed(seed)) for seed in seeds]
     trainer = Trainer(entry, seeds, device)
     state: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())

@@ -25,6 +25,7 @@ from qrlsuite.options import parse_setting
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, read_json, write_json
+from qrlsuite.training.advance import advance, pack, unpack
 from tests.commands import qrlsuite, start_worker
 from tests.conftest import TINY, install, installed
 
@@ -79,6 +80,35 @@ def filled(layer, generator):
         parameter.data = torch.rand(parameter.shape, generator=generator)
     return layer
 '''
+WORLD = """
+import gymnasium, numpy
+from own_rules import STEPS
+
+class World(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), numpy.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = STEPS
+        return numpy.zeros(2, numpy.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return self.np_random.uniform(-1, 1, 2).astype(numpy.float32), float(action), self.left == 0, False, {}
+
+gymnasium.register("own/World-v0", "own_world:World")
+"""
+GYM = """
+[environment]
+name = "gym"
+[environment.options]
+id = "own_world:own/World-v0"
+[score]
+source = "return"
+max_return = 6
+
+"""
 FILES = {"own_circuit": CIRCUIT, "own_model": MODEL, "own_helper": HELPER, "own_aside": "SIZE = 1\n"}
 
 
@@ -262,6 +292,23 @@ def test_an_export_carries_the_code_and_is_verified_with_it(author: Author) -> N
     assert "own_helper.py of own" in other.stdout + other.stderr
 
 
+def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(author: Author) -> None:
+    assert author.run(model="line").returncode == 0
+    assert author.command("export", "line", "--out", "out").returncode == 0
+    author.edit("own_helper", "rand(", "randn(")
+    for words in (("evaluate", "line", "--best", "1", "--episodes", "4"), ("export", "line", "--out", "out")):
+        refused = author.command(*words)
+        assert refused.returncode == 2
+        assert "own_helper.py of own (model 'line') has changed" in refused.stderr
+    before, author.runs = author.runs, author.folder / "more"
+    assert author.run(model="line", seeds="2:4").returncode == 0
+    for folder in (before, author.folder / "out"):
+        refused = author.command("import", str(folder))
+        assert "are not all of one code" in refused.stdout + refused.stderr
+        assert "own_helper.py of own" in refused.stdout + refused.stderr
+    assert list(author.board().values()) == [2]
+
+
 def test_the_steps_to_the_identity_can_be_read(author: Author) -> None:
     assert author.run().returncode == 0
     (name,) = author.entries()
@@ -276,6 +323,17 @@ def test_the_steps_to_the_identity_can_be_read(author: Author) -> None:
     assert set(model["files"]) == {"own_model.py", "own_helper.py"}
     text = (author.site / "own_helper.py").read_bytes()
     assert model["files"]["own_helper.py"] == hashlib.sha256(source.canonical(text)).hexdigest()
+
+
+def test_an_environment_of_another_package_counts(author: Author) -> None:
+    author.write("own_world", WORLD)
+    author.write("own_rules", "STEPS = 5\n")
+    author.task.write_text(TINY.replace(TINY[TINY.index("[environment]") : TINY.index("[protocol]")], GYM))
+    assert author.run(model="line").returncode == 0, author.run(model="line").stderr
+    author.edit("own_rules", "5", "6")
+    refused = author.run(model="line", seeds="3")
+    assert refused.returncode == 2
+    assert "own_rules.py of unknown (environment 'own_world:own/World-v0') has changed" in refused.stderr
 
 
 def edit_json(path: Path, **values: Any) -> None:
@@ -343,10 +401,8 @@ def test_a_published_entry_of_other_code_is_another_entry(train: Callable[..., P
     entry = collect.read(EntryStore(folder))
     assert entry is not None
     assert entry.codes == ()
-    kinds: list[list[Any]] = []
-    for copy in (entry, replace(entry, codes=("1a2b3c4d5e6f7a8b",)), replace(entry, source="published")):
-        collect._add(kinds, copy)
-    assert [[copy.label for copy in copies] for copies in collect._told_apart(kinds)] == [
+    copies = [entry, replace(entry, codes=("1a2b3c4d5e6f7a8b",)), replace(entry, source="published")]
+    assert [[copy.label for copy in same] for same in collect.told_apart(copies)] == [
         ["ddqn mlp width=16 @00000000"] * 2,
         ["ddqn mlp width=16 @1a2b3c4d"],
     ]
@@ -383,6 +439,26 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
     assert codes.set_aside(runs, store, now) == (taken, None)
     assert codes.set_aside(runs, store, now) == (None, None)
     assert EntryStore(taken).seeds() == [0, 1]
+
+
+def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> None:
+    entry = tiny(tiny_task, "width=16")
+    parts = identity.of(entry).record()["parts"]
+    task = {
+        "token": "t",
+        "seeds": [0],
+        "epoch": 0,
+        "epochs": 1,
+        "seconds": 0,
+        "device": "cpu",
+        "versions": {},
+    }
+    task |= {"entry": entry.record(), "code": [{**parts[0], "numerics": 2}, *parts[1:]]}
+    answer, _ = unpack(advance(pack(task, {})))
+    assert answer["refused"].endswith("has other code: environment 'beam6g' has numerics 1, and had 2")
+    answer, _ = unpack(advance(pack({**task, "code": parts}, {})))
+    assert answer["refused"] is None
+    assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
 
 
 def test_all_entries_are_looked_at_before_one_is_trained(
