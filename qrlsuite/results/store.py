@@ -1,13 +1,14 @@
 """The results on disk: the one source of truth, readable without this suite.
 
     runs/<task>/<entry>/entry.json              what was run: every option resolved
-                        seed-0007/run.json      status, parameters, versions, machine
+                        seed-0007/run.json      status, parameters, code identity, versions, machine
                                   epochs.jsonl  one line per epoch while the run goes on
                                   epochs.parquet  the same once it has finished
                                   timings.jsonl everything that may differ between two equal runs
                                   final.safetensors  the trained agent
                         groups/<id>/checkpoint.safetensors, progress.json
                         claims/<id>.json        who is working on which seeds
+                <entry>@1a2b3c4d/               seeds of other code (`qrlsuite.results.codes`)
 
 Files are replaced atomically (temporary file, fsync, rename) and carry a format version; lines are appended,
 and a torn last line is dropped. Nothing is ever pickled.
