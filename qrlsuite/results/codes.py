@@ -18,7 +18,7 @@ from qrlsuite.errors import OptionError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import survey
-from qrlsuite.results.claims import living, move_away
+from qrlsuite.results.claims import certain, move_away
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, read_json, write_json
 
@@ -105,6 +105,7 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
     """
     seeds: dict[str, list[int]] = {}
     codes: dict[str, CodeIdentity | None] = {}
+    before: Mapping[str, Any] = {}
     for seed in store.seeds() if store.path.is_dir() else ():
         path = store.seed(seed).path / "run.json"
         try:
@@ -113,8 +114,9 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
             continue
         if record is None:
             continue
-        code = read(record, path)
-        digest = UNKNOWN if code is None else code.digest
+        if not before or record.get("code") != before.get("code"):  # seeds mostly have the same
+            code, before = read(record, path), record
+            digest = UNKNOWN if code is None else code.digest
         codes[digest] = code
         seeds.setdefault(digest, []).append(seed)
     return [
@@ -190,7 +192,7 @@ def require(store: EntryStore, current: CodeIdentity) -> None:
     """
     for group in others(store, current):
         raise ChangedCodeError(_refusal(store, group, current))
-    if store.path.is_dir() and living(store):  # somebody has begun it a moment ago, and no seed says so yet
+    if store.path.is_dir() and certain(store):  # somebody has begun it a moment ago, and no seed says so yet
         require_sent(store, current, socket.gethostname())
 
 
