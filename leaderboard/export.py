@@ -43,7 +43,7 @@ def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
     built = store.entry()
     codes.require_installed(store, entry.seeds, identity.of(built))
     record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
-    folder = out / entry.task / record["name"]
+    folder = out / entry.task / built.name
     _refuse_smaller(folder, entry, force)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]

@@ -11,6 +11,7 @@ import hashlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from importlib.machinery import ModuleSpec
+from typing import Any
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -44,7 +45,7 @@ def _unfolded(node: ast.AST) -> Iterator[ast.AST | str]:
     for name in node._fields:
         if name in ("kind", "type_ignores", "type_comment"):
             continue
-        value = getattr(node, name, None)
+        value: Any = getattr(node, name, None)
         if isinstance(node, _DOCUMENTED) and name == "body":
             value = _without_docstring(value)
         elif isinstance(node, ast.JoinedStr):
@@ -78,7 +79,7 @@ def _joined(values: list[ast.expr]) -> list[ast.expr]:
             continue
         before = parts[-1] if parts else None
         if isinstance(value, ast.Constant) and isinstance(before, ast.Constant):
-            parts[-1] = ast.Constant(f"{before.value}{value.value}")
+            parts[-1] = ast.Constant(str(before.value) + str(value.value))
         else:
             parts.append(value)
     return parts

@@ -211,11 +211,11 @@ def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
         change = listed(identity.differences(before.parts, current.parts))
     if record.get("plan") is None:
         anew = (
-            f"--fresh trains anew, and the old seeds move to {store.path.name}@{group.mark}; a changed thing can \
-be registered under another name"
+            f"--fresh trains anew, and the old seeds move to {store.path.name}@{group.mark}; a changed thing can be "
+            "registered under another name"
         )
     else:
-        anew = "restore that code, or write another plan"
+        anew = "Restore that code, or write another plan"
     return (
         f"{store.path} has seeds {seeds} of '{record['label']}' that another code has begun: {change}. Nothing was "
         f'trained. {anew}; and --same "REASON" says that nothing changed in effect'

@@ -25,6 +25,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import TaskError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
 from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.pictures import decided as drawing
@@ -59,9 +60,8 @@ def put(store: EntryStore, seed: int, epochs: int, start: int) -> None:
     timings = [json_line({"epoch": t, "cpu": 36 / epochs}) for t in range(1, epochs + 1)]
     folder.timings.write_bytes(b"".join(timings))
     planned = {"plan": plan} if (plan := store.entry().plan) else {}
-    folder.write_record(
-        {**planned, "status": "finished", "epochs": epochs, "parameters": {}, "provenance": []}
-    )
+    began = {**planned, "code": identity.of(store.entry()).record(), "parameters": {}, "provenance": []}
+    folder.write_record({**began, "status": "finished", "epochs": epochs})
 
 
 class Scripted:
@@ -207,6 +207,26 @@ def test_ctrl_c_between_groups_changes_no_decision() -> None:
         resumed = answer("run", "widths.toml", "--engine", "scripted", "--runs", runs)
         assert resumed["pairs"] == straight["pairs"]
         assert len(Scripted.trained) == 5, "nothing is trained twice"
+
+
+def test_a_plan_goes_on_with_the_code_that_began_it(
+    refused: Refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write()
+    straight = answer("run", "widths.toml", "--engine", "scripted", "--runs", "straight")
+    Scripted.interrupt_at = len(Scripted.trained) + 1
+    assert say("run", "widths.toml", "--engine", "scripted").exit_code == 130
+    Scripted.interrupt_at = -1
+    known = registry.load().entries["models"]
+    changed = replace(known["mlp"].spec, numerics=2)  # type: ignore[call-arg]
+    monkeypatch.setitem(known, "mlp", replace(known["mlp"], spec=changed))
+    begun = len(Scripted.trained)
+    message = refused("run", "widths.toml", "--engine", "scripted")
+    assert "model 'mlp' has numerics 2, and had 1" in message
+    assert "Restore that code, or write another plan" in message
+    assert len(Scripted.trained) == begun
+    resumed = answer("run", "widths.toml", "--engine", "scripted", "--same", "no bit of a score")
+    assert resumed["pairs"] == straight["pairs"]
 
 
 def test_the_example_on_the_page_runs(

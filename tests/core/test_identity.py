@@ -309,6 +309,60 @@ def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(au
     assert list(author.board().values()) == [2]
 
 
+STUDY = """
+format_version = 1
+name = "lines"
+summary = "One layer"
+[[entries]]
+name = "line"
+task = "tiny.toml"
+model = "line"
+[[pictures]]
+name = "curves"
+kind = "curves"
+"""
+
+
+def test_searches_studies_and_python_stop_as_well(author: Author) -> None:
+    (author.folder / "lines.toml").write_text(STUDY)
+    budget = ("--seeds", "1", "--epochs", "1", "--workers", "1")
+    tune = ("tune", "--task", str(author.task), "--model", "line", "--vary", "lr=1e-2,1e-3", *budget)
+    study = ("study", "run", "lines.toml", *budget)
+    for words in (tune, study):
+        assert (done := author.command(*words)).returncode == 0, done.stderr
+    author.edit("own_helper", "rand(", "randn(")
+    for words in (tune, study):
+        refused = author.command(*words)
+        assert refused.returncode == 2
+        assert "own_helper.py of own (model 'line') has changed" in refused.stderr
+        assert "Nothing was trained" in refused.stderr
+    program = f"""if True:
+        import qrlsuite
+        words = dict(seeds=1, epochs=1, workers=1, runs={str(author.runs)!r}, progress=False)
+        try:
+            qrlsuite.train("tiny.toml", "line", **words)
+        except qrlsuite.errors.StoreError as error:
+            assert "has changed" in str(error)
+        else:
+            raise SystemExit("it goes on")
+        print(qrlsuite.train("tiny.toml", "line", fresh=True, **words).seeds)
+    """
+    environment = installed(author.site)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=author.folder,
+        check=False,
+    )
+    assert done.stdout == "(0,)\n", done.stderr
+    for words in (tune, study):
+        assert (done := author.command(*words, "--fresh")).returncode == 0, done.stderr
+    assert len(author.entries()) == 2
+    assert len(list((author.runs / "tuning").glob("*/*@*/entry.json"))) == 2
+
+
 def test_the_steps_to_the_identity_can_be_read(author: Author) -> None:
     assert author.run().returncode == 0
     (name,) = author.entries()
@@ -422,7 +476,7 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
     edit_json(folder / "entry.json", plan="1a2b3c4d5e6f7a8b")
     with pytest.raises(StoreError, match="write another plan"):
         codes.set_aside(runs, store, now)
-    with pytest.raises(StoreError, match="restore that code, or write another plan"):
+    with pytest.raises(StoreError, match="Restore that code, or write another plan"):
         codes.require(store, now)
     edit_json(folder / "entry.json", plan=None)
     submitted = store.path / "slurm" / "submitted.json"
