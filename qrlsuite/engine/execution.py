@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import shutil
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -314,6 +315,8 @@ def train(
     display.deadline = None if minutes is None else began + 60 * minutes
     code = identity.of(work.entry)
     codes.require(work.store, code)
+    if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
+        codes.require_sent(work.store, code, socket.gethostname())
     if not execution.remote and work.groups:
         _check_device(execution.device)
         check_memory(work, execution)

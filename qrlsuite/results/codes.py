@@ -8,7 +8,6 @@ that nobody knows. What an author declared to be the same in effect stands in `e
 from __future__ import annotations
 
 import datetime
-import socket
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from qrlsuite.errors import OptionError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import survey
-from qrlsuite.results.claims import certain, move_away
+from qrlsuite.results.claims import move_away
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, read_json, write_json
 
@@ -192,8 +191,6 @@ def require(store: EntryStore, current: CodeIdentity) -> None:
     """
     for group in others(store, current):
         raise ChangedCodeError(_refusal(store, group, current))
-    if store.path.is_dir() and certain(store):  # somebody has begun it a moment ago, and no seed says so yet
-        require_sent(store, current, socket.gethostname())
 
 
 def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:

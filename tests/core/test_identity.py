@@ -17,6 +17,7 @@ import pytest
 
 from qrlsuite import registry
 from qrlsuite.engine import execution
+from qrlsuite.engine.display import RunDisplay
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment import identity, source
 from qrlsuite.experiment.entry import Entry, resolve
@@ -513,6 +514,24 @@ def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> 
     answer, _ = unpack(advance(pack({**task, "code": parts}, {})))
     assert answer["refused"] is None
     assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
+
+
+def test_what_somebody_trains_is_not_begun_with_other_code(
+    tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry, runs = tiny(tiny_task, "width=16"), tmp_path / "runs"
+    store = EntryStore.create(runs, entry)
+    codes.prepare(store, identity.of(entry))
+    claim = acquire(store, [0])  # of a seed that is being built, and has no record yet
+    with_numerics(monkeypatch, "models", "mlp", 2)
+    here = execution.create(workers=1)
+    work = execution.plan(runs, entry, here, [0, 1], 1)
+    with pytest.raises(
+        StoreError, match="than the machine that started it: model 'mlp' has numerics 2, and had 1"
+    ):
+        execution.train(work, here, RunDisplay(work, 1, quiet=True))
+    claim.release()
+    assert not store.seeds()
 
 
 def test_all_entries_are_looked_at_before_one_is_trained(
