@@ -466,11 +466,8 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     """
     table = parquet.read(path)
     try:
-        rows = [
-            _nest(flat) for flat in table.select([n for n in table.column_names if n != "scores"]).to_pylist()
-        ]
-        for row, scores in zip(rows, table["scores"].to_numpy() if "scores" in table.column_names else ()):
-            row["scores"] = shortest(scores) if decimals and scores is not None else scores
+        columns = [_column(table, name, decimals) for name in table.column_names]
+        rows = [_nest(dict(zip(table.column_names, values))) for values in zip(*columns)]
     except (TypeError, ValueError, OverflowError):  # columns of other types than `table_bytes` writes
         raise StoreError(
             f"{path} does not hold epochs; restore the file or delete the seed's folder"
@@ -478,6 +475,15 @@ def read_table(path: Path, decimals: bool = True) -> list[dict[str, Any]]:
     if not rows:
         raise StoreError(f"{path} holds no epoch")
     return rows
+
+
+def _column(table: pyarrow.Table, name: str, decimals: bool) -> list[Any]:
+    """Return a column's values, one a row; lists of scores are numpy arrays, or with `decimals` as in the lines."""
+    if name != "scores":
+        values: list[Any] = table[name].to_pylist()
+        return values
+    arrays = table[name].to_numpy()
+    return [shortest(array) if decimals and array is not None else array for array in arrays]
 
 
 def _first_line(error: Exception) -> str:
