@@ -128,6 +128,7 @@ class PublishedEntry:
                     "finished": True,
                     "hours": float(hours),
                     "executions": int(executions),
+                    "diverged": None,  # not recorded
                 }
                 for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
             },
