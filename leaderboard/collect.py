@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
-from qrlsuite.results import codes, lookup
+from qrlsuite.results import codes, genuine, lookup
 from qrlsuite.results.lookup import Stored
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
 Key = tuple[str, str]
@@ -58,9 +60,10 @@ def collect(
         try:
             held = read_each(store)
         except QrlSuiteError as error:
-            refused.append(str(error))
+            refused.append(printable(error))  # names of folders are strangers' words
             continue
         for entry in held:
+            refused += entry.refused
             good.setdefault((entry.task, entry.task_hash, entry.name), []).append(entry)
     collected = []
     for copies in (copies for same in good.values() for copies in told_apart(same)):
@@ -160,6 +163,8 @@ def select(
     if not named:
         entries, left_out = collect(runs, tasks, published, only)
         entries = [entry for entry in entries if not tasks or entry.task in tasks]
+    else:
+        left_out = [line for entry in entries for line in entry.refused]
     n_read = len(entries)
     kept = []
     for entry in entries:
@@ -379,6 +384,8 @@ def _of_code(store: EntryStore, group: codes.SameCode) -> EntryCurves | None:
 def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryCurves | None:
     """Read one entry from its runs; None where no run has finished an epoch. Tuning seeds do not count.
 
+    A seed of which a file is damaged, or which is not what its folder says, is left out alone.
+
     Parameters
     ----------
     seeds:
@@ -387,24 +394,24 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     Raises
     ------
     StoreError
-        If a file is damaged, or a score is outside [0, 1].
+        If the entry's record is damaged, or no seed can be read.
     """
     record = store.record()
-    chosen = [seed for seed in store.seeds() if seed < TUNING_SEEDS and (seeds is None or seed in seeds)]
-    runs = [run for run in (store.seed(seed).read() for seed in chosen) if len(run.scores)]
+    task_file = current(
+        TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
+    )
+    runs, refused = _readable(store, task_file, seeds)
     if not runs:
+        if refused:
+            raise StoreError("; ".join(refused))
         return None
     length = _common_length(runs)
     kept = [run for run in runs if len(run.scores) >= length]
     provenance = [made for run in runs for made in run.record.get("provenance", [])]
     parameters = parameters_of(run.record for run in runs)
     identity = record["identity"]
-    task_file = current(
-        TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
-    )
     preset = record["preset"]
     own = {run.seed: run.curve for run in runs}
-    require_scores(np.concatenate(list(own.values())), task_file, store.path)
     values = np.stack([own[run.seed][:length] for run in kept])
     return EntryCurves(
         name=record["name"] + store.mark,
@@ -449,7 +456,35 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
             for run in runs
         },
         runs=own if any(len(curve) != length for curve in own.values()) else {},
+        refused=tuple(refused),
     )
+
+
+def _readable(
+    store: EntryStore, task_file: TaskFile, chosen: Collection[int] | None
+) -> tuple[list[SeedRun], list[str]]:
+    """Return the runs with an epoch or more, and one line for each seed that does not count and why."""
+    runs: dict[int, SeedRun] = {}
+    refused = []
+    for seed in store.seeds():
+        if seed >= TUNING_SEEDS or (chosen is not None and seed not in chosen):
+            continue
+        try:
+            run = store.seed(seed).read()
+            require_scores(run.curve, task_file, store.seed(seed).path)
+        except StoreError as error:
+            refused.append(f"seed {seed}: {printable(error)}")
+            continue
+        if len(run.scores):
+            runs[seed] = run
+    for seeds in genuine.copies(store, list(runs.values())):
+        refused.append(
+            f"{printable(store.path)}: seeds {format_seeds(seeds)} are copies of each other (they have equal scores), "
+            "and none of them counts; delete the folders of the copies"
+        )
+        for seed in seeds:
+            del runs[seed]
+    return list(runs.values()), refused
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

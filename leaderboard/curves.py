@@ -75,6 +75,8 @@ class EntryCurves(Shown):
     records:
         By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
         `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
+    refused:
+        One line for each seed that does not count, because a file of it is damaged or it is not what it says.
     """
 
     name: str
@@ -108,6 +110,7 @@ class EntryCurves(Shown):
     fixed: int = 0
     clocked: bool | None = None
     codes: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -192,6 +195,7 @@ class EntryCurves(Shown):
             "seeds": f"{n_runs}"
             + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")
             + (f", {len(self.diverged)} diverged" if self.diverged else ""),
+            **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
             "core-hours": f"{self.hours:.2f}",

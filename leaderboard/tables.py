@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,6 +13,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from qrlsuite.engine.terminal import printable
 from qrlsuite.leaderboard.absent import absent
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Comparison
@@ -327,12 +329,24 @@ def across_markdown(board: AcrossBoard) -> str:
 def _markdown_table(
     heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]], remarks: Sequence[str]
 ) -> list[str]:
-    lines = [f"### {heading}", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
-    for row in rows:
-        texts = (cell.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;") for cell in row)
-        lines.append(f"| {' | '.join(texts)} |")
-    shown = (line.replace("\\", "\\\\").replace("*", "\\*").replace("<", "&lt;") for line in remarks)
-    return [*lines, "", *(f"{line}  " for line in shown), ""]
+    lines = [f"### {_plain(heading)}", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    lines += [f"| {' | '.join(map(_plain, row))} |" for row in rows]
+    return [*lines, "", *(f"{_plain(line, '')}  " for line in remarks), ""]
+
+
+def _plain(text: str, further: str = "`|") -> str:
+    """Return Markdown that shows a text as it is: labels and options are strangers' words.
+
+    An underscore within a word stands for itself, as in `batch_size`.
+
+    Parameters
+    ----------
+    further:
+        Characters to escape beside the usual ones; a remark of ours may have code in it.
+    """
+    special = rf"[\\*\[\]{further}]|(?<!\w)_|_(?!\w)"
+    escaped = re.sub(special, lambda found: f"\\{found[0]}", printable(text))
+    return escaped.replace("&", "&amp;").replace("<", "&lt;")
 
 
 def csv_text(board: Leaderboard) -> str:

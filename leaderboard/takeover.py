@@ -122,7 +122,7 @@ def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenO
         raise StoreError(f"{source.path} holds no seed")
     runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
     for run in runs_by_seed.values():  # all of them, before anything is written
-        _check(run, entry, source.seed(run.seed))
+        require_scores(run.curve, entry.task.file, source.seed(run.seed).path)
     codes.require_mergeable(store, source, exported is not None)
     store = EntryStore.create(runs, entry)
     claim = acquire(store, seeds)
@@ -173,16 +173,6 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
         )
     return TakenOver(store, entry, tuple(new), tuple(known), tuple(notes))
-
-
-def _check(run: SeedRun, entry: Entry, folder: SeedStore) -> None:
-    """Refuse a seed that is not one of the entry, or whose scores cannot be."""
-    own = (entry.task.hash, entry.name, run.seed)
-    if tuple(run.record.get(name) for name in ("task_hash", "entry", "seed")) != own:
-        raise StoreError(
-            f"{folder.path}: its run.json does not say that it is seed {run.seed} of {entry.name}"
-        )
-    require_scores(run.curve, entry.task.file, folder.path)
 
 
 def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int]) -> None:

@@ -17,6 +17,7 @@ and a torn last line is dropped. Nothing is ever pickled.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -36,11 +37,11 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.results import parquet
+from qrlsuite.results import genuine, parquet
 
 FORMAT_VERSION = 1
 _MARK = re.compile(r"@[0-9a-f]{8}")
-_SEED_FOLDER = re.compile(r"seed-(\d{4,})")
+_SEED_FOLDER = re.compile(r"seed-(\d{4}|[1-9]\d{4,})", re.ASCII)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -83,7 +84,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises
     ------
     StoreError
-        If it cannot be read, is not an object, or has another format version.
+        If it cannot be read, is not an object, has another format version, or holds text that controls a terminal.
     """
     try:
         content = json.loads(path.read_bytes())
@@ -97,6 +98,7 @@ def read_json(path: Path) -> dict[str, Any]:
             f"{path} has format version {version!r}, this suite reads {FORMAT_VERSION}: "
             "use the suite that wrote it (pip install -U qrlsuite), or another folder (--runs DIR)"
         )
+    genuine.require_plain(path, content)
     return content
 
 
@@ -219,11 +221,18 @@ class SeedRun:
 
 
 class SeedStore:
-    """The folder of one seed's run."""
+    """The folder of one seed's run.
 
-    def __init__(self, path: Path, seed: int) -> None:
+    Parameters
+    ----------
+    of:
+        The entry that it lies in, if its record has to name it.
+    """
+
+    def __init__(self, path: Path, seed: int, of: EntryStore | None = None) -> None:
         self.path = path
         self.seed = seed
+        self.of = of
         self.lines = path / "epochs.jsonl"
         self.table = path / "epochs.parquet"
         self.timings = path / "timings.jsonl"
@@ -235,9 +244,10 @@ class SeedStore:
         Raises
         ------
         StoreError
-            If it is damaged.
+            If it is damaged, names another seed, entry or task than the folder, or is reached by a link.
         """
         path = self.path / "run.json"
+        genuine.require_no_link(self.path, path, self.lines, self.table, self.timings, self.agent)
         if not path.exists():
             return None
         record = read_json(path)
@@ -252,6 +262,7 @@ class SeedStore:
             and all(isinstance(origin, dict) for origin in made_with)
         ):
             raise StoreError(f"{path} is not a run's record; restore the file or delete the seed's folder")
+        genuine.require_seed(self.path, self.seed, record, {} if self.of is None else self.of.names)
         return record
 
     def write_record(self, content: Mapping[str, Any]) -> None:
@@ -523,9 +534,10 @@ class EntryStore:
         Raises
         ------
         StoreError
-            If a folder of another format version or another entry is in its place.
+            If a folder of another format version or another entry is in its place, or a link.
         """
         store = cls(runs / entry.task.name / entry.name)
+        genuine.require_no_link(store.path.parent, store.path)
         if (store.path / "entry.json").exists() and store.record().get("hash") != entry.hash:
             raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
         return store
@@ -560,9 +572,10 @@ class EntryStore:
         Raises
         ------
         StoreError
-            If it is damaged.
+            If it is damaged, its hashes and name are not those of what it says was run, or it is reached by a link.
         """
         path = self.path / "entry.json"
+        genuine.require_no_link(self.path.parent, self.path, path)
         record = read_json(path)
         identity = record.get("identity")
         try:
@@ -575,6 +588,7 @@ class EntryStore:
             for name, value in named.items():
                 if not isinstance(value, str):
                     raise ValueError(f"{name} is not text")
+            genuine.require_entry(record)
             if record.get("tuning") is not None:
                 tuning = EntryTuning.model_validate(record["tuning"])
                 record["tuning"] = tuning.model_dump(mode="json", exclude_unset=True)
@@ -582,6 +596,19 @@ class EntryStore:
         except (ValueError, RecursionError) as error:  # pydantic's error is a ValueError
             raise StoreError(f"{path} is not an entry's record: {_first_line(error)}") from None
         return {"preset": None, "tuning": None, **record}
+
+    @functools.cached_property
+    def names(self) -> dict[str, Any]:
+        """What each seed's record has to name: `entry`, `task`, `task_hash`; empty where `entry.json` is damaged."""
+        try:
+            record = read_json(self.path / "entry.json")
+        except StoreError:
+            return {}
+        return {
+            "entry": record.get("name"),
+            "task": record.get("task_name"),
+            "task_hash": record.get("task_hash"),
+        }
 
     def entry(self) -> Entry:
         """Build the entry that the folder belongs to.
@@ -599,10 +626,10 @@ class EntryStore:
 
     def seed(self, seed: int) -> SeedStore:
         """Return the folder of one seed (it need not exist)."""
-        return SeedStore(self.path / f"seed-{seed:04d}", seed)
+        return SeedStore(self.path / f"seed-{seed:04d}", seed, self)
 
     def seeds(self) -> list[int]:
-        """Return the seeds that have a folder, sorted."""
+        """Return the seeds that have a folder, sorted; `seed-00007` is none, for seed 7 has `seed-0007`."""
         matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
         return sorted(int(match.group(1)) for match in matches if match)
 

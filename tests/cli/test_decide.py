@@ -60,7 +60,14 @@ def put(store: EntryStore, seed: int, epochs: int, start: int) -> None:
     timings = [json_line({"epoch": t, "cpu": 36 / epochs}) for t in range(1, epochs + 1)]
     folder.timings.write_bytes(b"".join(timings))
     planned = {"plan": plan} if (plan := store.entry().plan) else {}
-    began = {**planned, "code": identity.of(store.entry()).record(), "parameters": {}, "provenance": []}
+    names = {"seed": seed, **store.names}
+    began = {
+        **planned,
+        **names,
+        "code": identity.of(store.entry()).record(),
+        "parameters": {},
+        "provenance": [],
+    }
     folder.write_record({**began, "status": "finished", "epochs": epochs})
 
 

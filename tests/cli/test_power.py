@@ -31,7 +31,16 @@ def put(width: int, *starts: int, epochs: int = EPOCHS) -> None:
             json_line({"epoch": t, "train": 0.4, "validate": 0.1, "group": 1}) for t in range(1, epochs + 1)
         ]
         write_atomically(folder.timings, b"".join(lines))
-        folder.write_record({"status": "finished", "epochs": epochs, "parameters": {}, "provenance": []})
+        folder.write_record(
+            {
+                "seed": seed,
+                **store.names,
+                "status": "finished",
+                "epochs": epochs,
+                "parameters": {},
+                "provenance": [],
+            }
+        )
 
 
 @pytest.fixture(autouse=True)

@@ -62,14 +62,14 @@ def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     (tmp_path / "runs" / "tiny").rename(elsewhere)
     (tmp_path / "runs" / "tiny").symlink_to(elsewhere)
-    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
+    said = call(tmp_path / "runs", "rm", f"tiny/{two[0].name}", "--yes")
     assert isinstance(said.exception, StoreError)
     assert "links are not followed" in str(said.exception)
     (tmp_path / "runs" / "tiny").unlink()
     (tmp_path / "runs" / "tiny").mkdir()
     link = tmp_path / "runs" / "tiny" / two[0].name
     link.symlink_to(elsewhere / two[0].name)
-    assert isinstance(call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exception, StoreError)
+    assert isinstance(call(tmp_path / "runs", "rm", two[0].name, "--yes").exception, StoreError)
     link.unlink()
     (elsewhere / two[0].name).rename(link)
     (link / "data").symlink_to(elsewhere)

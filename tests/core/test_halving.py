@@ -60,7 +60,8 @@ class Recorder:
             )  # plain writes: forcing hundreds of files to the disk takes a minute
             folder.table.write_bytes(table_bytes(rows))
             folder.timings.write_text('{"epoch":1,"cpu":36.0}\n')
-            record = {"format_version": FORMAT_VERSION, "status": "finished", "epochs": epochs}
+            names = {"format_version": FORMAT_VERSION, "seed": seed, **store.names}
+            record = {**names, "status": "finished", "epochs": epochs}
             (folder.path / "run.json").write_text(json.dumps(record))
         return store
 

@@ -146,7 +146,7 @@ def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(
     entry = train("runs", [0, 1], 2)
     train("runs", [2], 1)
     store = EntryStore(entry)
-    store.seed(2).write_record({"status": "running", "epochs": 1, "parameters": {}})
+    store.seed(2).write_record({"seed": 2, **store.names, "status": "running", "epochs": 1, "parameters": {}})
     runs = str(entry.parent.parent)
 
     def say(*words: str) -> str:
@@ -176,7 +176,7 @@ def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch
     entry = train("runs", [0, 1], 1)
     store = EntryStore(entry)
     write_json(entry / "slurm" / "submitted.json", {"tasks": [{"job": "9_3", "seeds": [5, 6], "epochs": 3}]})
-    store.seed(1).write_record({"status": "running", "epochs": 1})
+    store.seed(1).write_record({"seed": 1, **store.names, "status": "running", "epochs": 1})
     claim = acquire(store, [0])
     monkeypatch.setattr(subprocess, "run", lambda *arguments, **options: pytest.fail("it asked a queue"))
     found = {group.state: group for group in survey.groups(store)}
@@ -190,7 +190,7 @@ def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch
 def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Callable[..., Path]) -> None:
     store = EntryStore(train("runs", [0, 1], 1))
     for seed in (0, 1):
-        store.seed(seed).write_record({"status": "running", "epochs": 1})
+        store.seed(seed).write_record({"seed": seed, **store.names, "status": "running", "epochs": 1})
     write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "9", "seeds": [1], "epochs": 3}]})
     assert survey.look(store).seeds == {"interrupted": 1, "submitted": 1}
     assert survey.look(store, queued=[]).seeds == {"interrupted": 2}, "it has left the queue"

@@ -40,7 +40,7 @@ def put(study: decisions.DecisionStudy, looks: int) -> DecisionOutcome:
                 lines = (json_line({"epoch": epoch, "cpu": 1.8}) for epoch in range(1, 21))
                 write_atomically(folder.timings, b"".join(lines))
                 record = {"status": "finished", "epochs": 20, "parameters": {}, "provenance": []}
-                folder.write_record({"plan": study.file.hash, **record})
+                folder.write_record({"plan": study.file.hash, "seed": seed, **store.names, **record})
         decision = study.look()
     return DecisionOutcome(study, decision)
 

@@ -147,7 +147,7 @@ def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: boo
         typer.echo(json.dumps({"groups": rows, "size": total, "freed": freed, "problems": problems}))
         return
     for problem in problems:
-        typer.echo(f"left alone: {problem}", err=True)
+        typer.echo(f"left alone: {printable(problem)}", err=True)
     if not items:
         typer.echo("nothing to remove: no finished group has a checkpoint")
         return

@@ -1,0 +1,140 @@
+"""Folders are what they say: a seed's folder is that seed's, and no seed is another one's copy.
+
+Folders are copied, linked and renamed, by hand and by scripts, and results folders come from others. What is read from
+them is checked here against what they say of themselves.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment.task import digest
+
+if TYPE_CHECKING:
+    from qrlsuite.results.store import EntryStore, SeedRun
+
+_CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]")
+"""All but tabs and line feeds; of the marks that reverse the direction of writing, those that do so by force."""
+
+
+def require_no_link(*paths: Path) -> None:
+    """Refuse links below a results folder; the results folder itself may be one.
+
+    Raises
+    ------
+    StoreError
+        Naming the link.
+    """
+    for path in paths:
+        if path.is_symlink():
+            raise StoreError(
+                f"{path} is a link: links below a results folder are not followed, for what they lead to would count "
+                "twice; move the folder or file itself there"
+            )
+
+
+def require_plain(path: Path, content: object) -> None:
+    """Refuse a file's content if a text in it could control the terminal that shows it.
+
+    Raises
+    ------
+    StoreError
+        Showing the text.
+    """
+    left = [content]
+    while left:
+        value = left.pop()
+        if isinstance(value, str) and _CONTROLS.search(value):
+            raise StoreError(f"{path} holds a text that controls a terminal: {ascii(value)[:80]}")
+        if isinstance(value, Mapping):
+            left += [*value, *value.values()]
+        elif isinstance(value, list):
+            left += value
+
+
+def require_entry(record: Mapping[str, Any]) -> None:
+    """Refuse an entry's record whose hashes and name do not stand for what it says was run.
+
+    Raises
+    ------
+    ValueError
+        Saying what is wrong.
+    """
+    identity = record["identity"]
+    if not isinstance(identity.get("task"), dict):
+        raise ValueError("the task is not a table")
+    for name in ("name", "label", "task_name"):
+        if not record[name].isprintable():
+            raise ValueError(f"{name} {record[name]!r} is not one line of text")
+    if digest(identity["task"]) != record["task_hash"]:
+        raise ValueError("the task's definition does not have its hash")
+    if digest(identity) != record["hash"]:
+        raise ValueError("the options do not have the entry's hash")
+    expected = f"{identity['algorithm']}-{identity['model']}-{record['hash'][:8]}"
+    if record["name"] != expected:
+        raise ValueError(f"it is named {record['name']!r}, and should be {expected!r}")
+
+
+def require_seed(folder: Path, seed: int, record: Mapping[str, Any], names: Mapping[str, Any]) -> None:
+    """Refuse a record of another seed, entry or task than the seed's folder is of.
+
+    Parameters
+    ----------
+    names:
+        `entry`, `task` and `task_hash` of the entry that the folder lies in; empty where its own record is damaged.
+
+    Raises
+    ------
+    StoreError
+        Saying what the record names.
+    """
+    for name, expected in {"seed": seed, **names}.items():
+        if record.get(name) != expected:
+            of_entry = f" of {names['entry']} on task {names['task']}" if names else ""
+            raise StoreError(
+                f"{folder}: its run.json does not say that it is seed {seed}{of_entry} ({name} is "
+                f"{record.get(name)!r} in it): delete the folder if it is a copy, or move it back where it belongs"
+            )
+
+
+def copies(store: EntryStore, runs: Sequence[SeedRun]) -> Iterator[tuple[int, ...]]:
+    """Yield the seeds that are copies of each other: no two seeds learn the same by chance.
+
+    Seeds of equal scores are, unless their curves have two values or fewer: agents that never learn, and those that
+    solve a deterministic task at a blow, may coincide. These are copies where their trained parameters are equal, and
+    finite: of two agents whose parameters are not numbers, all are.
+    """
+    equal: dict[bytes, list[SeedRun]] = {}
+    for run in runs:
+        equal.setdefault(run.scores.tobytes(), []).append(run)
+    for alike in equal.values():
+        if len(alike) == 1:
+            continue
+        if len(np.unique(alike[0].curve)) > 2:
+            yield tuple(run.seed for run in alike)
+            continue
+        agents: dict[bytes, list[int]] = {}
+        for run in alike:
+            if agent := _finite_agent(store.seed(run.seed).agent):
+                agents.setdefault(agent, []).append(run.seed)
+        yield from (tuple(seeds) for seeds in agents.values() if len(seeds) > 1)
+
+
+def _finite_agent(path: Path) -> bytes | None:
+    """Return a trained agent's file, None where there is none or not all of its parameters are numbers."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        content = path.read_bytes()
+        arrays = load(content)
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError):
+        return None
+    finite = all(np.isfinite(array).all() for array in arrays.values())
+    return content if arrays and finite else None
