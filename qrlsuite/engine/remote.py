@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import registry
+from qrlsuite.engine.answers import Asked, Expected, expected_of, require_fit
 from qrlsuite.engine.api import Answer, EngineOutcome, Link, RemoteEngine, Show, Work
 from qrlsuite.engine.local import ATTEMPTS
 from qrlsuite.engine.worker import checkpoint_seconds
@@ -50,8 +51,8 @@ HEADER_BYTES = 1 << 20
 
 
 @functools.lru_cache(maxsize=64)
-def _bytes_per_seed(entry_hash: str, record: bytes) -> int:
-    """Return the size of one seed's checkpoint and agent."""
+def _expected(entry_hash: str, record: bytes) -> Expected:
+    """Return what an answer holds of one seed."""
     import torch
 
     from qrlsuite.training.trainer import Trainer
@@ -62,7 +63,7 @@ def _bytes_per_seed(entry_hash: str, record: bytes) -> int:
     finally:
         torch.set_num_threads(threads)  # this may be a user's notebook
     trainer.start()
-    return sum(array.nbytes for arrays in (trainer.capture(), trainer.policy()) for array in arrays.values())
+    return expected_of(trainer)
 
 
 def seeds_per_task(entry: Entry) -> int:
@@ -75,7 +76,7 @@ def seeds_per_task(entry: Entry) -> int:
     QrlSuiteError
         If the entry cannot be built.
     """
-    size = _bytes_per_seed(entry.hash, json_line(entry.record()))
+    size = _expected(entry.hash, json_line(entry.record())).seed_bytes
     if size > MOST_BYTES - HEADER_BYTES:
         raise OptionError(f"'{entry.label}': {too_large(size, 1)}")
     return (MOST_BYTES - HEADER_BYTES) // size
@@ -131,6 +132,7 @@ class _Run:
         found = versions([*PACKAGES, *self.entry.distributions()])
         self.versions = {name: version for name, version in found.items() if version is not None}
         self.seconds = checkpoint_seconds(TASK_SECONDS)
+        self.expected = _expected(self.entry.hash, json_line(self.entry.record()))
         self.outcome = EngineOutcome()
         self.members = [_Member(work, group) for group in work.groups]
         self.files: dict[str, GroupFiles] = {}
@@ -225,7 +227,8 @@ class _Run:
             header, arrays = unpack(answer.content)
             refused = header.get("refused")
             if refused is None:
-                _require_fit(header, arrays, answer.key, member, self.work.epochs)
+                asked = Asked(answer.key, member.group.seeds, member.epoch, self.work.epochs)
+                require_fit(header, arrays, asked, self.entry.task.file, self.expected)
         except StoreError as error:
             refused = str(error)
         if refused is not None:
@@ -275,39 +278,6 @@ class _Run:
         member.write()
         self.files.pop(member.group.id, None)
         self.claims.release(member.group.seeds)
-
-
-def _require_fit(header: Mapping[str, Any], arrays: Arrays, token: str, member: _Member, epochs: int) -> None:
-    """Refuse an answer that is not one to the task that is waited for.
-
-    Raises
-    ------
-    StoreError
-        Saying what does not fit.
-    """
-    seeds, first = list(member.group.seeds), member.epoch + 1
-    last, lines, timings = header.get("epoch"), header.get("lines"), header.get("timings")
-    problem = ""
-    if (header.get("token"), header.get("seeds")) != (token, seeds):
-        problem = "it answers another task"
-    elif not isinstance(last, int) or not isinstance(lines, list) or not isinstance(timings, list):
-        problem = "it has no epochs"
-    elif not last <= epochs or not len(lines) == len(timings) == last - member.epoch:
-        problem = f"it ends at epoch {last} with {len(lines)} epochs after {member.epoch}"
-    elif last == member.epoch < epochs and header.get("error") is None:
-        problem = "it has no new epoch and names no error"
-    else:
-        for number, (of_seeds, timing) in enumerate(zip(lines, timings), start=first):
-            numbers = [line.get("epoch") for line in of_seeds] if isinstance(of_seeds, list) else []
-            if numbers != [number] * len(seeds) or timing.get("epoch") != number:
-                problem = f"the lines of epoch {number} are not one for each seed"
-        if lines and not arrays:
-            problem = "it has no checkpoint"
-        for name, array in arrays.items():
-            if array.ndim == 0 or array.shape[0] != len(seeds):
-                problem = f"array '{name}' of shape {array.shape} is not seed-first"
-    if problem:
-        raise StoreError(f"an answer does not fit its task: {problem}")
 
 
 class _Claims(threading.Thread):

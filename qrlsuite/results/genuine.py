@@ -39,8 +39,8 @@ def require_no_link(*paths: Path) -> None:
             )
 
 
-def require_plain(path: Path, content: object) -> None:
-    """Refuse a file's content if a text in it could control the terminal that shows it.
+def require_plain(path: Path | str, content: object) -> None:
+    """Refuse content, as of a file, if a text in it could control the terminal that shows it.
 
     Raises
     ------

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from qrlsuite.engine import api, execution, remote
 from qrlsuite.engine.api import Answer, EngineOutcome, Link
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.leaderboard import collect
 from qrlsuite.options import parse_setting
 from qrlsuite.results import checkpoint, claims
 from qrlsuite.results.progress import ProgressFile
@@ -152,6 +154,142 @@ def test_an_answer_is_accepted_once_and_only_where_it_fits(
     for seed in (0, 1):
         assert results(store.path, seed) == results(straight, seed)
         assert [line["epoch"] for line in read_lines(store.seed(seed).timings)] == [1, 2, 3, 4]
+
+
+def line(header: dict[str, Any], **values: Any) -> dict[str, Any]:
+    """Change the first seed's line of the first epoch."""
+    header["lines"][0][0] |= values
+    return header
+
+
+def time_of(header: dict[str, Any], **values: Any) -> dict[str, Any]:
+    header["timings"][0] |= values
+    return header
+
+
+def without(header: dict[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in header.items() if key != name}
+
+
+ALTERED: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
+    "one score": (lambda h: line(h, scores=[0.5]), "epoch 1 has not 5 scores for each seed"),
+    "too many scores": (lambda h: line(h, scores=[0.5] * 6), "epoch 1 has not 5 scores"),
+    "no scores": (lambda h: line(h, scores=None), "epoch 1 has not 5 scores"),
+    "a text in the scores": (lambda h: line(h, scores=[0.5] * 4 + ["1"]), "no finite number"),
+    "nothing in the scores": (lambda h: line(h, scores=[0.5] * 4 + [None]), "no finite number"),
+    "a truth in the scores": (lambda h: line(h, scores=[0.5] * 4 + [True]), "no finite number"),
+    "a score that is no number": (lambda h: line(h, scores=[0.5] * 4 + [math.nan]), "no finite number"),
+    "an infinite score": (lambda h: line(h, scores=[0.5] * 4 + [math.inf]), "no finite number"),
+    "a score above 1": (lambda h: line(h, scores=[0.5] * 4 + [1.5]), r"from 0\.5 to 1\.5, outside \[0, 1\]"),
+    "a score below 0": (lambda h: line(h, scores=[0.5] * 4 + [-0.5]), "outside"),
+    "an epoch that is a truth": (lambda h: line(h, epoch=True), "lines of epoch 1 are not one for each seed"),
+    "an epoch that is a text": (lambda h: line(h, epoch="1"), "lines of epoch 1 are not one for each seed"),
+    "a loss that is no number": (lambda h: line(h, loss=math.nan), "has 'loss' = nan"),
+    "a loss that is a text": (lambda h: line(h, loss="low"), "has 'loss' = 'low'"),
+    "a loss that is a list": (lambda h: line(h, loss=[1.0]), "has 'loss' = "),
+    "a further value": (lambda h: line(h, **{"loss.other": 1.0}), r"has 'loss\.other' = 1\.0"),
+    "negative executions": (lambda h: line(h, executions={"forward": -1}), "has 'executions'"),
+    "executions that are a number": (lambda h: line(h, executions=7), "has 'executions'"),
+    "a line that is a number": (lambda h: {**h, "lines": [[7]]}, "not one for each seed"),
+    "no line": (lambda h: {**h, "lines": [[]]}, "not one for each seed"),
+    "lines that are a table": (lambda h: {**h, "lines": {"0": []}}, "it has no epochs"),
+    "a time that is a number": (lambda h: {**h, "timings": [7]}, "times of epoch 1 are not its own"),
+    "a negative time": (lambda h: time_of(h, train=-1.0), "have 'train' = -1"),
+    "a time that is a text": (lambda h: time_of(h, cpu="long"), "have 'cpu' = 'long'"),
+    "another group": (lambda h: time_of(h, group=50), "times of epoch 1 are not its own"),
+    "an epoch too many": (lambda h: {**h, "epoch": 2}, "ends at epoch 2 with 1 epochs after 0"),
+    "no epoch": (lambda h: without(h, "epoch"), "it has no epochs"),
+    "no parameters": (lambda h: without(h, "parameters"), "it counts other parameters"),
+    "other parameters": (
+        lambda h: {**h, "parameters": {**h["parameters"], "classical": 1}},
+        "other parameters",
+    ),
+    "parameters that are a text": (lambda h: {**h, "parameters": "many"}, "it counts other parameters"),
+    "no provenance": (lambda h: without(h, "provenance"), "does not say where it was made"),
+    "provenance that is a list": (lambda h: {**h, "provenance": []}, "does not say where it was made"),
+    "nested provenance": (
+        lambda h: {**h, "provenance": {**h["provenance"], "versions": {"torch": {"is": "2"}}}},
+        "is no table of texts",
+    ),
+    "an escape sequence": (
+        lambda h: {**h, "provenance": {**h["provenance"], "host": "\x1b]0;owned\x07"}},
+        "text that controls a terminal",
+    ),
+    "no warnings": (lambda h: without(h, "warnings"), "its warnings are no texts"),
+    "warnings that are numbers": (lambda h: {**h, "warnings": [7]}, "its warnings are no texts"),
+    "an error that is a number": (lambda h: {**h, "error": 7}, "its error is no text"),
+}
+
+
+def alter_header(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[bytes], bytes]:
+    def altered(content: bytes) -> bytes:
+        header, arrays = unpack(content)
+        return pack(change(header), arrays)
+
+    return altered
+
+
+def alter_arrays(change: Callable[[dict[str, Any]], object]) -> Callable[[bytes], bytes]:
+    def altered(content: bytes) -> bytes:
+        header, arrays = unpack(content)
+        change(arrays)
+        return pack(header, arrays)
+
+    return altered
+
+
+def cast(arrays: dict[str, Any], name: str) -> None:
+    arrays[name] = arrays[name].astype(np.float64)
+
+
+ALTERED_ARRAYS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "no arrays": (lambda a: a.clear(), "its checkpoint has another"),
+    "no agent": (
+        lambda a: [a.pop(name) for name in [*a] if name.startswith("policy.")],
+        "its trained agent has another '.*' than the entry, or none",
+    ),
+    "an agent's part is missing": (lambda a: a.pop("policy.w0"), "trained agent has another 'w0'"),
+    "an agent of another shape": (
+        lambda a: a.update({"policy.w0": a["policy.w0"][:, :3]}),
+        "trained agent has another 'w0'",
+    ),
+    "an agent of another type": (lambda a: cast(a, "policy.w0"), "trained agent has another 'w0'"),
+    "a further part": (lambda a: a.update({"policy.x": a["policy.w0"]}), "trained agent has another 'x'"),
+    "a part that is a number": (lambda a: a.update({"policy.w0": np.float32(1)}), "agent has another 'w0'"),
+    "a checkpoint's part is missing": (
+        lambda a: a.pop(sorted(name for name in a if not name.startswith("policy."))[0]),
+        "its checkpoint has another",
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("alter", "problem"),
+    [
+        *(pytest.param(alter_header(change), said, id=name) for name, (change, said) in ALTERED.items()),
+        *(
+            pytest.param(alter_arrays(change), said, id=name)
+            for name, (change, said) in ALTERED_ARRAYS.items()
+        ),
+    ],
+)
+def test_an_altered_answer_costs_its_group_and_the_entry_stays_readable(
+    alter: Callable[[bytes], bytes], problem: str, store: EntryStore, train_locally: Callable[..., Path]
+) -> None:
+    class Altering(Here):
+        def answers(self, key: str, task: bytes) -> list[Answer]:
+            content = advance(task)
+            return [Answer(key, alter(content) if unpack(task)[0]["seeds"] == [0] else content)]
+
+    (message,) = train(Altering(), store, [(0,), (1,)], 1).failed.values()
+    assert re.search(problem, message)
+    assert "\n" not in message
+    assert store.finished([0, 1], 1) == {1}, "the other group goes on"
+    entry = collect.read_entry(store)
+    assert entry is not None
+    assert (entry.seeds, entry.refused) == ((1,), ())
+    assert train(Here(), store, [(0,)], 1) == EngineOutcome()
+    assert results(store.path, 0) == results(train_locally("straight", [0], 1), 0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,217 @@
+"""What is accepted of a remote worker's answer: nothing in it is believed before it is written.
+
+A worker that is broken, out of date or somebody else's costs the group that it answers for, and no more: what is
+written can be read, ranked and continued like what was trained here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qrlsuite.errors import StoreError
+from qrlsuite.experiment.task import TaskFile
+from qrlsuite.results.checkpoint import Arrays
+from qrlsuite.results.genuine import require_plain
+from qrlsuite.training.advance import POLICY
+
+if TYPE_CHECKING:
+    from qrlsuite.training.trainer import Trainer
+
+Layout = tuple[tuple[int, ...], str]
+"""Shape of one seed's part of an array, and type."""
+
+MOST_SECONDS = 1e12
+_METRIC = re.compile(r"[A-Za-z_]\w{0,63}", re.ASCII)
+_TIMES = ("train", "validate", "cpu")
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What an entry's own code says of its answers.
+
+    Attributes
+    ----------
+    parameters:
+        As `ModelBuilder.trained` counts them.
+    state, policy:
+        Names and layouts of the arrays of a checkpoint, and of a trained agent.
+    seed_bytes:
+        Size of both, of one seed.
+    """
+
+    parameters: Mapping[str, int]
+    state: Mapping[str, Layout]
+    policy: Mapping[str, Layout]
+    seed_bytes: int
+
+
+def expected_of(trainer: Trainer) -> Expected:
+    """Return what answers of a trainer's entry hold; it has begun with one seed."""
+    state, policy = trainer.capture(), trainer.policy()
+    size = sum(array.nbytes for arrays in (state, policy) for array in arrays.values())
+    return Expected(trainer.models.trained(), _layouts(state), _layouts(policy), size)
+
+
+def _layouts(arrays: Arrays) -> dict[str, Layout]:
+    return {name: (array.shape[1:], str(array.dtype)) for name, array in arrays.items()}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The task that an answer is waited for: its token, the seeds, the epoch it begins after, and the last one."""
+
+    token: str
+    seeds: Sequence[int]
+    epoch: int
+    epochs: int
+
+
+def require_fit(
+    header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
+) -> None:
+    """Refuse an answer that is not one to the task that is waited for.
+
+    Raises
+    ------
+    StoreError
+        With the first thing that does not fit.
+    """
+    problem = next(_problems(header, arrays, asked, task, expected), None)
+    if problem is not None:
+        raise StoreError(f"an answer does not fit its task: {problem}")
+    require_plain("an answer", dict(header))
+
+
+def _problems(
+    header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
+) -> Iterator[str]:
+    """Yield what does not fit; what follows the first may be nonsense."""
+    last, lines, timings, error = (header.get(name) for name in ("epoch", "lines", "timings", "error"))
+    if (header.get("token"), header.get("seeds")) != (asked.token, list(asked.seeds)):
+        yield "it answers another task"
+    if type(last) is not int or not isinstance(lines, list) or not isinstance(timings, list):
+        yield "it has no epochs"
+    if not last <= asked.epochs or not len(lines) == len(timings) == last - asked.epoch:
+        yield f"it ends at epoch {last} with {len(lines)} epochs after {asked.epoch}"
+    if error is not None and not isinstance(error, str):
+        yield "its error is no text"
+    if error is None and not lines and asked.epoch < asked.epochs:
+        yield "it has no new epoch and names no error"
+    warnings = header.get("warnings")
+    if not isinstance(warnings, list) or not all(isinstance(text, str) for text in warnings):
+        yield "its warnings are no texts"
+    for number, (of_seeds, timing) in enumerate(zip(lines, timings), start=asked.epoch + 1):
+        yield from _line_problems(of_seeds, number, len(asked.seeds), task)
+        yield from _timing_problems(timing, number, len(asked.seeds))
+    if lines or error is None:
+        if header.get("parameters") != expected.parameters:
+            yield f"it counts other parameters than {json.dumps(expected.parameters)}"
+        yield from _origin_problems(header.get("provenance"))
+    yield from _array_problems(arrays, asked, bool(lines), last == asked.epochs and error is None, expected)
+
+
+def _line_problems(of_seeds: object, number: int, seeds: int, task: TaskFile) -> Iterator[str]:
+    """Check the lines of one epoch."""
+    if not isinstance(of_seeds, list) or len(of_seeds) != seeds:
+        yield f"the lines of epoch {number} are not one for each seed"
+        return
+    for line in of_seeds:
+        if not isinstance(line, dict) or type(line.get("epoch")) is not int or line["epoch"] != number:
+            yield f"the lines of epoch {number} are not one for each seed"
+            return
+        yield from _score_problems(line.get("scores"), number, task)
+        if line.keys() - _OPTIONAL != of_seeds[0].keys() - _OPTIONAL:
+            yield f"the lines of epoch {number} hold different values"
+        for name, value in line.items():
+            if name in ("epoch", "scores"):
+                continue
+            if name == "diverged":
+                fits = value is True
+            elif name == "executions":
+                fits = isinstance(value, dict) and all(map(_is_executions, value.items()))
+            else:
+                fits = value is None or (type(value) is float and math.isfinite(value))
+            if not fits or not _METRIC.fullmatch(name):
+                yield f"a line of epoch {number} has {ascii(name)[:40]} = {ascii(value)[:40]}"
+
+
+_OPTIONAL = {"diverged", "executions"}
+
+
+def _is_executions(item: tuple[str, object]) -> bool:
+    """Tell whether these are a number of circuit executions with its name; None counts nothing."""
+    name, count = item
+    return bool(_METRIC.fullmatch(name)) and (count is None or (type(count) is int and 0 <= count < 2**53))
+
+
+def _score_problems(scores: object, number: int, task: TaskFile) -> Iterator[str]:
+    """Check the scores of one validation."""
+    episodes = task.protocol.validation_episodes
+    if not isinstance(scores, list) or len(scores) != episodes:
+        yield f"epoch {number} has not {episodes} scores for each seed"
+    elif not all(type(score) is float and abs(score) <= np.finfo(np.float32).max for score in scores):
+        yield f"a score of epoch {number} is no finite number"
+    elif task.ranking.thresholds is None and not (
+        min(scores) >= -_TOLERANCE and max(scores) <= 1 + _TOLERANCE
+    ):
+        yield f"epoch {number} has scores from {min(scores):g} to {max(scores):g}, outside [0, 1]"
+
+
+def _timing_problems(timing: object, number: int, seeds: int) -> Iterator[str]:
+    """Check the line of times of one epoch."""
+    if not isinstance(timing, dict) or timing.get("epoch") != number or timing.get("group") != seeds:
+        yield f"the times of epoch {number} are not its own"
+        return
+    for name, value in timing.items():
+        if name in _TIMES:
+            fits = type(value) in (int, float) and 0 <= value < MOST_SECONDS
+        elif name in ("host", "time"):
+            fits = isinstance(value, str)
+        else:
+            fits = name in ("epoch", "group")
+        if not fits:
+            yield f"the times of epoch {number} have {ascii(name)[:40]} = {ascii(value)[:40]}"
+
+
+def _origin_problems(made: object) -> Iterator[str]:
+    """Check where an answer comes from: a table of texts and numbers, and of tables of these."""
+    if not isinstance(made, dict) or not isinstance(made.get("versions"), dict):
+        yield "it does not say where it was made"
+        return
+    values = [
+        value for each in made.values() for value in (each.values() if isinstance(each, dict) else [each])
+    ]
+    if not all(value is None or type(value) in (str, int, bool) for value in values):
+        yield "what it says about where it was made is no table of texts"
+
+
+def _array_problems(
+    arrays: Arrays, asked: Asked, begun: bool, finished: bool, expected: Expected
+) -> Iterator[str]:
+    """Check the checkpoint, which may hold more than at the beginning, and the trained agents, which may not."""
+    for name, array in arrays.items():
+        if array.ndim == 0 or array.shape[0] != len(asked.seeds):
+            yield f"array {ascii(name)[:60]} of shape {array.shape} is not seed-first"
+    layouts = _layouts({name: array for name, array in arrays.items() if array.ndim})
+    state = {name: layout for name, layout in layouts.items() if not name.startswith(POLICY)}
+    policy = {name.removeprefix(POLICY): layouts[name] for name in layouts.keys() - state.keys()}
+    if begun and (wrong := _differing(state, expected.state)):
+        yield f"its checkpoint has another {ascii(wrong)[:60]} than the entry, or none"
+    if finished and policy != expected.policy:
+        wrong = _differing(policy, expected.policy) or _differing(expected.policy, policy)
+        yield f"its trained agent has another {ascii(wrong)[:60]} than the entry, or none"
+    if policy and not finished:
+        yield "it has a trained agent before the last epoch"
+
+
+def _differing(found: Mapping[str, Layout], wanted: Mapping[str, Layout]) -> str | None:
+    """Return the first name of `wanted` that `found` has not, or has otherwise."""
+    return next((name for name in wanted if found.get(name) != wanted[name]), None)
