@@ -94,7 +94,10 @@ def _problems(
     header: Mapping[str, Any], arrays: Arrays, asked: Asked, task: TaskFile, expected: Expected
 ) -> Iterator[str]:
     """Yield what does not fit; what follows the first may be nonsense."""
-    last, lines, timings, error = (header.get(name) for name in ("epoch", "lines", "timings", "error"))
+    last: Any = header.get("epoch")
+    lines: Any = header.get("lines")
+    timings: Any = header.get("timings")
+    error: Any = header.get("error")
     if (header.get("token"), header.get("seeds")) != (asked.token, list(asked.seeds)):
         yield "it answers another task"
     if type(last) is not int or not isinstance(lines, list) or not isinstance(timings, list):
@@ -215,3 +218,29 @@ def _array_problems(
 def _differing(found: Mapping[str, Layout], wanted: Mapping[str, Layout]) -> str | None:
     """Return the first name of `wanted` that `found` has not, or has otherwise."""
     return next((name for name in wanted if found.get(name) != wanted[name]), None)
+
+
+def require_alike(
+    first: Mapping[str, Any], arrays: Arrays, second: Mapping[str, Any], others: Arrays
+) -> None:
+    """Refuse two workers' answers to one task that differ in a bit of the lines or the checkpoint.
+
+    On another kind of processor the last bits differ rightly: such answers say nothing about each other.
+
+    Raises
+    ------
+    StoreError
+        Naming both workers.
+    """
+    made = [header.get("provenance") or {} for header in (first, second)]
+    if made[0].get("processor") != made[1].get("processor") or made[0].get("device") != made[1].get("device"):
+        return
+    alike = first["lines"] == second["lines"] and all(
+        name in others and array.tobytes() == others[name].tobytes() for name, array in arrays.items()
+    )
+    if not alike:
+        here, there = (ascii(origin.get("host"))[1:-1] for origin in made)
+        raise StoreError(
+            f"two workers, on {here} and {there}, gave different answers to one task, and nothing of it was written: "
+            "one of them computes wrongly; stop it, and repeat the command"
+        )

@@ -134,6 +134,14 @@ class Link(Protocol):
 
 
 @runtime_checkable
+class ChoosingLink(Link, Protocol):
+    """A link that can choose who works on a task: now and then, a second worker repeats what a first one did."""
+
+    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
+        """Have a task worked on by another worker than the one that answered the task `other`, if there is another."""
+
+
+@runtime_checkable
 class RemoteEngine(Protocol):
     """Workers without a shared folder; built as `factory(options)`, `options` None for a spec without options."""
 

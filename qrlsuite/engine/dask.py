@@ -99,6 +99,7 @@ class DaskLink:
         self._versions = versions
         self._futures: dict[str, Any] = {}
         self._allowed: dict[str, frozenset[str]] = {}
+        self._done_by: dict[str, frozenset[str]] = {}
         self._unsent: list[str] = []
         self._refused: dict[str, str] = {}
         self._usable: frozenset[str] = frozenset()
@@ -144,13 +145,23 @@ class DaskLink:
 
     def send(self, key: str, task: bytes, priority: int) -> None:
         """Have a task worked on by any worker of our versions."""
+        self._submit(key, task, priority)
+
+    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
+        """Have a task worked on by another worker than the one that answered `other`, if there is another."""
+        self._submit(key, task, priority, self._done_by.get(other, frozenset()))
+
+    def _submit(self, key: str, task: bytes, priority: int, but: frozenset[str] = frozenset()) -> None:
         if time.monotonic() - self._looked >= SEND_SECONDS:
             self._look()
         if self._refused and not self._usable:
             self._unsent.append(key)  # `receive` says so
             return
-        restricted = {"workers": sorted(self._usable)} if self._refused else {}
-        self._allowed[key] = self._usable if self._refused else frozenset()
+        allowed = self._usable if self._refused else frozenset[str]()
+        if but:
+            allowed = self._usable - but or allowed
+        restricted = {"workers": sorted(allowed)} if allowed else {}
+        self._allowed[key] = allowed
         self._futures[key] = self._client.submit(
             eval, CALL, {"task": task}, key=f"advance-{key}", priority=priority, pure=False, **restricted
         )
@@ -186,6 +197,7 @@ class DaskLink:
         future = self._futures[key]
         try:
             answer = Answer(key, _bytes(future.result(timeout=FETCH_SECONDS)))
+            self._done_by[key] = frozenset(next(iter(self._client.who_has([future]).values()), ()))
         except TimeoutError:
             return None
         except Exception as error:

@@ -2,7 +2,8 @@
 
 This process holds the claims, tells the trackers and writes the results folder. A group is with one worker at a time,
 for about a minute: a task has its newest checkpoint, the answer the next one with the lines between. A worker that is
-lost costs that minute. An answer is accepted once, for the group, epoch and token of the task that is waited for.
+lost costs that minute. An answer is accepted once, for the group, epoch and token of the task that is waited for, and
+checked before it is written. Of every `REPEATED` answers, a second worker repeats the first, to the bit.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import registry
-from qrlsuite.engine.answers import Asked, Expected, expected_of, require_fit
-from qrlsuite.engine.api import Answer, EngineOutcome, Link, RemoteEngine, Show, Work
+from qrlsuite.engine.answers import Asked, Expected, expected_of, require_alike, require_fit
+from qrlsuite.engine.api import Answer, ChoosingLink, EngineOutcome, Link, RemoteEngine, Show, Work
 from qrlsuite.engine.local import ATTEMPTS
 from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
@@ -42,6 +43,12 @@ TASK_SECONDS = 60.0
 
 MOST_SENT = 512 << 20
 """Bytes of tasks that are with the engine at a time, at most: a scheduler keeps them in memory."""
+
+REPEATED = 20
+"""Of so many answers, the first is compared with that of a second worker, where the engine can choose one."""
+
+AT_LENGTH = 1e9
+"""Seconds for which a task trains that ends at an epoch."""
 
 WAIT_SECONDS = 0.5
 """For which an answer is waited for at a time."""
@@ -110,6 +117,8 @@ class _Member:
         self.size = 0
         self.losses = 0
         self.begun = False
+        self.first: tuple[str, dict[str, Any], Arrays] | None = None
+        """An answer, with its token, that a second worker repeats before it is accepted."""
 
     def write(self, error: str | None = None) -> None:
         """Write the progress."""
@@ -136,6 +145,7 @@ class _Run:
         self.outcome = EngineOutcome()
         self.members = [_Member(work, group) for group in work.groups]
         self.files: dict[str, GroupFiles] = {}
+        self.answered = 0
         self.sent: dict[str, _Member] = {}
         self.link: Link = engine.connect(work.workers, self.versions)
         try:
@@ -198,14 +208,14 @@ class _Run:
         self._send(member, arrays)
 
     def _send(self, member: _Member, arrays: Arrays) -> None:
-        token = secrets.token_hex(16)
+        token, first = secrets.token_hex(16), member.first
         header = {
             "token": token,
             "entry": self.entry.record(),
             "seeds": list(member.group.seeds),
             "epoch": member.epoch,
-            "epochs": self.work.epochs,
-            "seconds": self.seconds,
+            "epochs": self._last_epoch(member),
+            "seconds": self.seconds if first is None else AT_LENGTH,
             "device": self.work.device,
             "versions": self.versions,
             "code": self.code.record()["parts"],
@@ -216,7 +226,14 @@ class _Run:
         member.size, member.progress.phase = len(task), "sent"
         member.write()
         self.sent[token] = member
-        self.link.send(token, task, member.epoch)
+        if first is not None and isinstance(self.link, ChoosingLink):
+            self.link.send_apart(token, task, member.epoch, first[0])
+        else:
+            self.link.send(token, task, member.epoch)
+
+    def _last_epoch(self, member: _Member) -> int:
+        """Return the epoch that a task ends at the latest; one that is repeated ends where it did."""
+        return self.work.epochs if member.first is None else int(member.first[1]["epoch"])
 
     def _take(self, member: _Member, answer: Answer) -> None:
         """Accept an answer, or send the task again."""
@@ -227,7 +244,7 @@ class _Run:
             header, arrays = unpack(answer.content)
             refused = header.get("refused")
             if refused is None:
-                asked = Asked(answer.key, member.group.seeds, member.epoch, self.work.epochs)
+                asked = Asked(answer.key, member.group.seeds, member.epoch, self._last_epoch(member))
                 require_fit(header, arrays, asked, self.entry.task.file, self.expected)
         except StoreError as error:
             refused = str(error)
@@ -235,7 +252,24 @@ class _Run:
             self._again(member, str(refused))
             return
         member.losses = 0
+        if member.first is not None:
+            _, own, own_arrays = member.first
+            member.first = None
+            require_alike(own, own_arrays, header, arrays)
+            header, arrays = own, own_arrays
+        elif self._repeated(header):
+            member.first = (answer.key, header, arrays)
+            self._send(member, self.files[member.group.id].resume()[1])
+            return
         self._accept(member, header, arrays)
+
+    def _repeated(self, header: Mapping[str, Any]) -> bool:
+        """Tell whether a second worker is to repeat an answer before it is accepted."""
+        if header["error"] is not None or not header["lines"]:
+            return False
+        self.answered += 1
+        choosing = isinstance(self.link, ChoosingLink) and self.work.workers > 1
+        return choosing and self.answered % REPEATED == 1
 
     def _again(self, member: _Member, problem: str) -> None:
         """Send a task that was lost once more, unless that has happened too often."""
@@ -247,6 +281,7 @@ class _Run:
 
     def _accept(self, member: _Member, header: Mapping[str, Any], arrays: Arrays) -> None:
         """Write the lines and the checkpoint of an answer; then finish the group, or send its next task."""
+        self.claims.require_held(member.group.seeds)
         files, progress = self.files[member.group.id], member.progress
         if header["lines"] or header["error"] is None:
             if member.begun:
@@ -307,9 +342,14 @@ class _Claims(threading.Thread):
         ------
         SeedsClaimedError
             Saying whose.
+        StoreError
+            If another process took seeds over.
         """
         if seeds in self._refused:
             raise self._refused[seeds]
+        with self._lock:
+            self._lost |= seeds in self._held and not self._held[seeds].refresh()
+        self.require()
 
     def release(self, seeds: tuple[int, ...]) -> None:
         """Give seeds back, if they are held."""

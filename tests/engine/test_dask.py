@@ -17,7 +17,7 @@ import pytest
 
 from qrlsuite import __version__, api
 from qrlsuite.engine import execution
-from qrlsuite.engine.dask import DaskEngine, DaskOptions
+from qrlsuite.engine.dask import DaskEngine, DaskLink, DaskOptions
 from qrlsuite.engine.status import survey
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
@@ -261,3 +261,29 @@ def test_a_scheduler_that_is_not_there(scheduler: str, task: Path, tmp_path: Pat
     line = only_line(qrlsuite(*words(task, tmp_path / "runs", scheduler, 1, "--engine-set", "timeout=0.5")))
     assert line.startswith(f"qrlsuite: no Dask scheduler answers at {scheduler} within 0.5 s (")
     assert line.endswith("): is it running there, and can this machine reach it?")
+
+
+def test_a_task_that_is_repeated_goes_to_another_worker(cluster: Cluster) -> None:
+    for _ in range(2):
+        cluster.add()
+    link = DaskEngine(DaskOptions(cluster.address)).connect(2, {})
+    try:
+        while len(link._usable) < 2:
+            link.receive(0.1)
+        for turn in range(5):
+            link.send(f"first {turn}", b"no task", 0)
+            received(link)
+            link.send_apart(f"second {turn}", b"no task", 0, f"first {turn}")
+            received(link)
+            first, second = (link._done_by[f"{name} {turn}"] for name in ("first", "second"))
+            assert first
+            assert second
+            assert first.isdisjoint(second)
+    finally:
+        link.close()
+
+
+def received(link: DaskLink) -> None:
+    """Wait for the answer to the one task that was sent."""
+    while not link.receive(1.0):
+        pass

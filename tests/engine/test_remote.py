@@ -292,6 +292,88 @@ def test_an_altered_answer_costs_its_group_and_the_entry_stays_readable(
     assert results(store.path, 0) == results(train_locally("straight", [0], 1), 0)
 
 
+class Pair(Here):
+    """Two workers, of which the second repeats answers; what it changes of them is given."""
+
+    def __init__(self, change: Callable[[bytes], bytes] = lambda content: content) -> None:
+        super().__init__()
+        self.change = change
+        self.apart: dict[str, str] = {}
+        self.repeated: list[dict[str, Any]] = []
+
+    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
+        self.apart[key] = other
+        self.repeated.append(unpack(task)[0])
+        self.send(key, task, priority)
+
+    def answers(self, key: str, task: bytes) -> list[Answer]:
+        content = advance(task)
+        return [Answer(key, self.change(content) if key in self.apart else content)]
+
+
+def test_a_second_worker_repeats_some_answers(
+    store: EntryStore, train_locally: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote, "REPEATED", 3)
+    engine = Pair()
+    assert train(engine, store, [(0, 1), (2,)]) == EngineOutcome()
+    assert len(engine.repeated) == 3, "the 1st, 4th and 7th of 8 answers"
+    assert engine.sent == 2 * EPOCHS + 3
+    assert all(task["epochs"] == task["epoch"] + 1 for task in engine.repeated)
+    straight = train_locally("straight", [0, 1, 2], EPOCHS)
+    assert [results(store.path, seed) for seed in range(3)] == [results(straight, seed) for seed in range(3)]
+    one = Pair()
+    assert (
+        train(one, EntryStore.create(store.path.parents[2] / "one", store.entry()), [(0,)]) == EngineOutcome()
+    )
+    assert one.repeated == [], "there is no second worker"
+
+
+def one_bit(arrays: dict[str, Any]) -> None:
+    name = max(name for name in arrays if not name.startswith("policy."))
+    arrays[name].reshape(-1).view(np.uint8)[0] ^= 1
+
+
+def one_digit(header: dict[str, Any]) -> dict[str, Any]:
+    return line(header, loss=math.nextafter(header["lines"][0][0]["loss"] or 0.0, math.inf))
+
+
+def on_another_processor(header: dict[str, Any]) -> dict[str, Any]:
+    return {**one_digit(header), "provenance": {**header["provenance"], "processor": "another"}}
+
+
+@pytest.mark.parametrize("change", [alter_arrays(one_bit), alter_header(one_digit)])
+def test_two_workers_that_disagree_end_their_group_alone(
+    change: Callable[[bytes], bytes], store: EntryStore
+) -> None:
+    (message,) = train(Pair(change), store, [(0,), (1,)], 2).failed.values()
+    assert re.fullmatch(r"two workers, on \S+ and \S+, gave different answers to one task, .*", message)
+    assert [len(store.seed(seed).epochs()) for seed in store.seeds()] == [2], "nothing of it was written"
+
+
+def test_answers_of_other_processors_say_nothing_about_each_other(
+    store: EntryStore, train_locally: Callable[..., Path]
+) -> None:
+    engine = Pair(alter_header(on_another_processor))
+    assert train(engine, store, [(0,), (1,)], 2) == EngineOutcome()
+    assert len(engine.repeated) == 1
+    straight = train_locally("straight", [0, 1], 2)
+    assert [results(store.path, seed) for seed in (0, 1)] == [results(straight, seed) for seed in (0, 1)]
+
+
+def test_nothing_is_written_once_another_process_has_the_seeds(store: EntryStore) -> None:
+    class Suspended(Here):
+        def answers(self, key: str, task: bytes) -> list[Answer]:
+            if unpack(task)[0]["epoch"] == 1:
+                (claim,) = claims.claims(store)
+                claim.path.unlink()
+            return super().answers(key, task)
+
+    with pytest.raises(StoreError, match="its seeds were taken over"):
+        train(Suspended(), store, [(0,)], 3)
+    assert len(store.seed(0).epochs()) == 1
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
