@@ -389,8 +389,8 @@ class SeedStore:
             )
         shaped = scores if rows else np.empty((0, 0), np.float32)
         seconds, clocked = self._timed()
-        diverged = next((int(row["epoch"]) for row in rows if row.get("diverged") is True), None)
-        return SeedRun(self.seed, record, shaped, seconds, self._executions(rows), clocked, diverged)
+        executions = self._executions(rows)
+        return SeedRun(self.seed, record, shaped, seconds, executions, clocked, first_diverged(rows))
 
     def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
         total = 0
@@ -403,6 +403,11 @@ class SeedStore:
                     raise StoreError(f"{self.path}: {count!r} is not a number of circuit executions")
                 total += count
         return total
+
+
+def first_diverged(rows: Iterable[Mapping[str, Any]]) -> int | None:
+    """Return the first epoch after which numbers of the agent were not finite; None where they always were."""
+    return next((int(row["epoch"]) for row in rows if row.get("diverged") is True), None)
 
 
 def parameters_of(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:

@@ -197,6 +197,9 @@ class GroupFiles:
                 "status": "finished",
                 "epochs": epoch,
             }
+            diverged = store.first_diverged(folder.epochs(decimals=False))
+            if diverged is not None:
+                record["diverged"] = diverged
             del record["format_version"]
             folder.write_record(record)
             self.events.send("run_finished", run={**record, "folder": str(folder.path)})
@@ -342,11 +345,7 @@ class GroupRun:
 
     def _record(self, epoch: Epoch) -> None:
         """Append one line per seed, and show the progress."""
-        if not self.held():
-            raise StoreError(
-                "another worker has taken these seeds over, and goes on from their last checkpoint: nothing more is "
-                "written here"
-            )
+        self._require_held()
         lines, timing = lines_of(epoch), timing_of(epoch, len(self.trainer.seeds))
         for files, places in self.parts():
             files.record(lines[places], timing)
@@ -354,6 +353,20 @@ class GroupRun:
             epoch.number, epoch.scores.mean(axis=1).tolist(), epoch.diverged.tolist()
         )
         self.report(self.progress)
+
+    def _require_held(self) -> None:
+        """Refuse to write what is another worker's by now.
+
+        Raises
+        ------
+        StoreError
+            If it is.
+        """
+        if not self.held():
+            raise StoreError(
+                "another worker has taken these seeds over, and goes on from their last checkpoint: nothing more is "
+                "written here"
+            )
 
     def _save(self) -> None:
         """Write the checkpoint of the last finished epoch, if it is newer than the one on disk."""
@@ -365,6 +378,7 @@ class GroupRun:
 
     def _finish(self) -> None:
         """Publish the trained agents, and mark every seed as finished."""
+        self._require_held()
         policy = self.trainer.policy()
         for files, places in self.parts():
             files.finish(self.trainer.epoch, {name: array[places] for name, array in policy.items()})

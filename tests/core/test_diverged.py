@@ -31,6 +31,13 @@ def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores
     train("stopped", [0, 1], 2, settings=TOO_FAST)
     stopped = train("stopped", [0, 1], 3, settings=TOO_FAST)
     assert results(entry, 1) == results(stopped, 1), "as never stopped"
+    assert [
+        (EntryStore(path).seed(0).record() or {}).get("diverged") for path in (entry, stopped, sound)
+    ] == [
+        1,
+        1,
+        None,
+    ]
     loaded = api.load("mlp width=16 lr=1e+30", runs=tmp_path / "straight")
     assert loaded.diverged == (0, 1)
     assert "2, 2 diverged" in loaded.facts["seeds"]

@@ -242,11 +242,22 @@ def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(entry: EntrySt
     assert [header.epoch for header in checkpoint.headers(entry)] == [1], "no checkpoint is overwritten"
 
 
+def test_a_worker_whose_seeds_were_taken_over_at_last_marks_none_as_finished(
+    train: Callable[..., Path],
+) -> None:
+    entry = EntryStore(train("runs", [0], 1))
+    answers = iter([True, True, False])  # to the line of epoch 2, to its checkpoint, and to the end
+    run = GroupRun(entry.entry(), entry, [0], 2, held=lambda: next(answers))
+    with pytest.raises(StoreError, match="another worker has taken these seeds over"):
+        run.run()
+    assert (entry.seed(0).record() or {})["status"] == "running"
+
+
 def test_lines_of_two_workers_are_put_in_order_when_the_run_goes_on(train: Callable[..., Path]) -> None:
     straight = train("straight", [0], 4)
     entry = EntryStore(train("runs", [0], 2))
     folder = entry.seed(0)
-    folder.write_record({"status": "running", "epochs": 2})
+    folder.write_record({**(folder.record() or {}), "status": "running"})
     further = [store.json_line(row) for row in EntryStore(straight).seed(0).epochs()[2:]]
     folder.lines.write_bytes(further[0] + further[0] + further[1] + further[1])
     with pytest.raises(StoreError, match="epoch 4 is missing"):
