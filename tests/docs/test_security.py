@@ -1,0 +1,35 @@
+"""What SECURITY.md says is held by tests that exist."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "SECURITY.md").read_text()
+PROMISES = re.findall(r"^- .*(?:\n  .*)*", TEXT.partition("## What can still")[0], re.MULTILINE)
+TEST = re.compile(r"`([\w/]+\.py)::(test_\w+)`")
+
+
+def test_every_promise_names_the_tests_that_hold_it() -> None:
+    assert len(PROMISES) > 20
+    assert not [promise for promise in PROMISES if not TEST.search(promise)]
+
+
+def test_the_named_tests_exist() -> None:
+    missing = []
+    for file, name in TEST.findall(TEXT):
+        path = ROOT / "tests" / file
+        tree = ast.parse(path.read_text()) if path.exists() else ast.Module([], [])
+        if not any(isinstance(node, ast.FunctionDef) and node.name == name for node in ast.walk(tree)):
+            missing.append(f"{file}::{name}")
+    assert not missing
+
+
+def test_every_door_has_its_promises() -> None:
+    doors = ("Plugins", "Task, study", "Entries", "Published plans", "Results folders", "Released files")
+    for door in (*doors, "Trackers", "Remote workers", "The leaderboard's page"):
+        (section,) = re.findall(rf"^\*\*{door}.*?(?=^\*\*|^## )", TEXT, re.MULTILINE | re.DOTALL)
+        assert re.search(r"\b(?:is|are) (?:not )?trusted|are plugins", section), door
+        assert TEST.search(section), door
