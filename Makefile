@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long verify docs tutorials site pictures dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-long test-lowest verify docs tutorials site pictures dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -22,6 +22,17 @@ test: install-dev
 # What is long by nature, before a release: CONTRIBUTING.md says what, and when it last passed.
 test-long: install-dev
 	$(BIN)/python -m pytest -q -m long --durations=0
+
+# The lowest versions that pyproject.toml allows, in an environment of its own: the tests of the commands, of what is on
+# disk and of circuits exported to PennyLane and Qiskit. Warnings of old versions about each other are no errors here.
+LOWEST := tests/cli/test_cli.py tests/core/test_options.py tests/core/test_parquet.py tests/core/test_store.py \
+  tests/circuits/test_export.py
+test-lowest:
+	$(PYTHON) -m venv $(VENV)-lowest
+	$(VENV)-lowest/bin/pip install --quiet uv
+	$(VENV)-lowest/bin/uv pip install --quiet --python $(VENV)-lowest/bin/python --resolution lowest-direct \
+	  --torch-backend cpu --editable . 'pytest>=8.2' 'hypothesis>=6.100' 'qiskit-qasm3-import>=0.6'
+	$(VENV)-lowest/bin/python -m pytest -q -W default $(LOWEST) -k 'not what_comes_next'
 
 # Published entries and plans in which this checkout differs from BASE: hashes, files, and RERUN seeds of each entry
 # trained again. What they are called reaches no shell, and neither do BASE and RERUN.

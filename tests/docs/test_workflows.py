@@ -148,6 +148,16 @@ def test_who_judges_has_to_approve_what_judges() -> None:
     assert all((ROOT / place.strip("/")).exists() for place in owned if "*" not in place)
 
 
+def test_the_lowest_versions_are_tested() -> None:
+    """By files that are there, in a job of the workflow of every change."""
+    text = (ROOT / "Makefile").read_text().replace("\\\n", "")
+    assert re.search(r"^test-lowest:\n(?:\t.*\n)*\t.* --resolution lowest-direct ", text, re.MULTILINE)
+    (files,) = re.findall(r"^LOWEST := (.*)$", text, re.MULTILINE)
+    assert all((ROOT / file).is_file() for file in files.split())
+    steps = loaded(ROOT / ".github" / "workflows" / "tests.yml")["jobs"]["lowest"]["steps"]
+    assert steps[-1]["run"].startswith("make test-lowest ")
+
+
 def git(folder: Path, *words: str) -> str:
     author = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
     return subprocess.run(
