@@ -16,7 +16,7 @@ from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
-from qrlsuite.results import codes, genuine, lookup
+from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.lookup import Stored
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
@@ -405,9 +405,11 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         if refused:
             raise StoreError("; ".join(refused))
         return None
+    found = _require_independent(store, runs)
     length = _common_length(runs)
     kept = [run for run in runs if len(run.scores) >= length]
     provenance = [made for run in runs for made in run.record.get("provenance", [])]
+    foreign = any(probes.third_party(made) for made in provenance)
     parameters = parameters_of(run.record for run in runs)
     identity = record["identity"]
     preset = record["preset"]
@@ -444,6 +446,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         tuning=record["tuning"],
         plan=record.get("plan"),
         codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
+        unprobed=foreign and probes.EQUAL not in found,
         executions=sum(run.executions for run in runs),
         records={
             run.seed: {
@@ -485,6 +488,24 @@ def _readable(
         for seed in seeds:
             del runs[seed]
     return list(runs.values()), refused
+
+
+def _require_independent(store: EntryStore, runs: Sequence[SeedRun]) -> set[str]:
+    """Return what probes of an entry's runs have found (`qrlsuite.results.probes`).
+
+    Raises
+    ------
+    StoreError
+        If one has found that a seed depends on the others.
+    """
+    made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
+    for probe in made:
+        if probe["result"] == probes.DIFFERS:
+            raise StoreError(
+                f"{store.path}: not ranked, for its seeds are not independent: trained alone, seed {probe.get('seed')} "
+                f"differs in {probe.get('difference')}; `qrlsuite check` looks for the cause"
+            )
+    return {probe["result"] for probe in made}
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

@@ -72,6 +72,8 @@ class EntryCurves(Shown):
         Whether the curves were read from a results folder or from a published entry.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
+    unprobed:
+        Whether code of others has part in it and no probe has shown that its seeds are independent.
     records:
         By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
         `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
@@ -111,6 +113,7 @@ class EntryCurves(Shown):
     clocked: bool | None = None
     codes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+    unprobed: bool = False
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""

@@ -103,6 +103,12 @@ def notes(section: Section) -> list[str]:
             "parameters of the first network alone (older records count no other, such as a critic): "
             + ", ".join(alone)
         )
+    unprobed = [row.entry.label for row in section.rows if row.entry.unprobed]
+    if unprobed:
+        lines.append(
+            f"not probed: {', '.join(unprobed)}; made with code of others, and no seed was trained again alone to show "
+            "that seeds do not depend on each other (`qrlsuite run` does, where it trains)"
+        )
     missing = sorted({name for row in section.rows for name in absent(row.entry)})
     if missing:
         lines.append(f"not installed here: {', '.join(missing)}; ranked from the stored curves")

@@ -303,6 +303,7 @@ def _diff_method(options: PennyLaneOptions) -> str:
 def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
     """Open a device by name."""
     seeded = {} if seed is None else {"seed": seed}
+    state = np.random.get_state()  # noqa: NPY002 - without a seed, a device draws one from this generator
     try:
         return qml.device(options.device, wires=qubits, **seeded)
     except Exception as error:
@@ -316,6 +317,8 @@ def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
         raise OptionError(
             f"{message}: PennyLane knows no such device{nearest(options.device, known)}"
         ) from error
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
 
 
 def _one_line(error: Exception) -> str:

@@ -77,6 +77,12 @@ def _short(seconds: float) -> str:
     return duration(seconds) if seconds >= 10 else f"{seconds:.2g} s"
 
 
+PROBING = (
+    "probing: the middle seed of a group is trained again alone in a fresh process, to show that it does not depend on "
+    "the others"
+)
+
+
 class CostEstimate:
     """Estimates the remaining time: from rounds during the first epoch, then from whole epochs.
 
@@ -228,6 +234,8 @@ class RunDisplay:
         """What is said at the beginning about how long it will take."""
         self.endless = False
         """Whether more than a day is left, by what was measured."""
+        self.probing = False
+        """Whether a group has made a probe, see `qrlsuite.engine.probe`."""
         self._announced = False
         self._began = time.monotonic()
         self._last_line = time.monotonic()
@@ -279,6 +287,9 @@ class RunDisplay:
         """Show where every group stands."""
         now = time.monotonic()
         self._last = snapshot
+        if not self.probing and any(state.get("phase") == "probing" for state in snapshot.values()):
+            self.probing = True
+            self.console.print(PROBING, markup=False, soft_wrap=True)
         left = self.estimate.remaining(snapshot, now)
         epoch_done = any(state.get("epoch_seconds") for state in snapshot.values())
         if left is not None and not self._announced and (epoch_done or now - self._began >= SILENCE_SECONDS):

@@ -25,7 +25,7 @@ from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.results import codes, speed
+from qrlsuite.results import codes, probes, speed
 from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup, plan_groups
@@ -338,6 +338,8 @@ def train(
         raise
     finally:
         display.close()
+    if display.probing and (probe := _newest_probe(work)):
+        display.console.print(probe, markup=False, soft_wrap=True)
     for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
         display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
     if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
@@ -410,6 +412,15 @@ def _remove(folder: Path) -> None:
     with contextlib.suppress(OSError):
         folder.parent.rmdir()
         folder.parent.parent.rmdir()
+
+
+def _newest_probe(work: Plan) -> str | None:
+    """Say what the probe of a plan's seeds has found, and what it took; None where there is none."""
+    for seed in work.missing:
+        probe = probes.of_record(work.store.seed(seed).record() or {})
+        if probe and probe["result"] != probes.DIFFERS:
+            return probes.sentence(probe)
+    return None
 
 
 def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:

@@ -19,9 +19,11 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from qrlsuite.engine import probe as probing
 from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import group_id
-from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire
+from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire, living
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.seeds import parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
@@ -73,7 +75,8 @@ def train_group(
     SeedsClaimedError
         If another worker holds one of the seeds; entries of which nobody holds any are trained before.
     QrlSuiteError
-        If the entry cannot be built, its environment fails, or results cannot be written.
+        If the entry cannot be built, its environment fails, its seeds depend on each other, or results cannot be
+        written.
     KeyboardInterrupt
         After an interruption, with everything saved.
     """
@@ -104,16 +107,22 @@ def train_group(
                 taken = error
                 continue
             files[store.path] = ProgressFile(store, group_id(seeds))
+            probes.require_independent(store)
             for group in plan_groups(store, seeds, epochs, workers=1):
                 parts.setdefault(group.epoch, []).append((store, group.seeds))
         for _, [(store, own), *further] in sorted(parts.items()):
-            run = GroupRun(store.entry(), store, own, epochs, device, report, further, held)
+            probe = probing.prepare([(store, own), *further], epochs, device)
+            if probe is not None:
+                claims.append(probe.claim)
+            run = GroupRun(store.entry(), store, own, epochs, device, report, further, held, probe)
             places |= {part.store.path: its for part, its in run.parts()}
             state = run.progress
             run.run()
         state.phase, state.epoch = "finished", epochs
         report(state, force=True)
     except QrlSuiteError as error:
+        if isinstance(error, probes.DependentSeedsError):
+            _stop_others(claims)
         with contextlib.suppress(StoreError):  # on a full disk the message goes to stderr alone
             report(state, str(error), force=True)
         raise
@@ -125,7 +134,15 @@ def train_group(
         raise taken
 
 
-def _end_with(parent: int) -> bool:
+def _stop_others(claims: Sequence[Claim]) -> None:
+    """Have the other workers of the entries whose seeds are claimed here save and end; started again, they refuse."""
+    for folder in {claim.path.parent.parent for claim in claims}:
+        for other in living(EntryStore(folder)):
+            if other not in claims:
+                other.request_stop()
+
+
+def end_with(parent: int) -> bool:
     """Have SIGTERM sent to this process when its parent ends; returns False where it has ended already."""
     with contextlib.suppress(
         OSError, AttributeError
@@ -178,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--follow-parent", type=int, metavar="PID", help="stop, saving, when this parent process ends"
     )
     options = parser.parse_args(arguments)
-    if options.follow_parent is not None and not _end_with(options.follow_parent):
+    if options.follow_parent is not None and not end_with(options.follow_parent):
         return 130
     try:
         _set_checkpoint_seconds()

@@ -123,6 +123,10 @@ class Entry:
         """Return the distributions whose code makes the entry's numbers, each once."""
         return list(dict.fromkeys(each.distribution for each in self.registered().values()))
 
+    def third_party(self) -> list[str]:
+        """Return those of the distributions that are not this suite."""
+        return [name for name in self.distributions() if name != "qrlsuite"]
+
     def record(self) -> dict[str, Any]:
         """Return what `entry.json` stores: enough to build the entry again anywhere."""
         tuned = {} if self.tuning is None else {"tuning": self.tuning}

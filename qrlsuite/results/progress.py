@@ -42,8 +42,8 @@ class Progress:
 class ProgressFile:
     """A group's progress on disk, read by any display.
 
-    Its worker writes it at most twice a second, and always at the last round of an epoch's training, after which there
-    may be long silence: PPO and REINFORCE learn when all rounds are played.
+    Its worker writes it at most twice a second, and always before what may take long in silence: at the last round of
+    an epoch's training, for PPO and REINFORCE learn when all rounds are played, and where it waits for a probe.
     """
 
     def __init__(self, store: EntryStore, group: str) -> None:
@@ -57,7 +57,7 @@ class ProgressFile:
         force: bool = False,
         places: slice = slice(None),
     ) -> None:
-        """Write the progress; if it was just written, only at the last round of training.
+        """Write the progress; if it was just written, only before a long silence.
 
         Parameters
         ----------
@@ -65,8 +65,9 @@ class ProgressFile:
             Of the seeds in the group whose scores count here.
         """
         now = time.monotonic()
-        last = progress.phase == "training" and 0 < progress.total <= progress.done
-        if not (force or last) and now - self._written < 0.5:
+        silent = progress.phase == "training" and 0 < progress.total <= progress.done
+        silent |= progress.phase == "probing"
+        if not (force or silent) and now - self._written < 0.5:
             return
         self._written = now
         scores, diverged = progress.seed_scores[places], progress.seed_diverged[places]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib
 import json
 import os
@@ -12,6 +13,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from qrlsuite import hookspecs, registry, specs
+from qrlsuite import options as option_values
+from qrlsuite.testing.findings import BrokenRuleError
 
 HEAVY = (
     "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "plotly", "pandas", "sklearn",
@@ -19,6 +22,8 @@ HEAVY = (
 )  # fmt: skip
 """Packages that take long to import, and so must wait until a command needs them."""
 
+ORDERS = ((0, 1), (1, 0))
+_BUILD = "build"
 _MARK = "qrlsuite.testing.fresh "
 """Before the result, for imported modules may print."""
 
@@ -84,6 +89,65 @@ def resolved(references: Sequence[str]) -> dict[str, str | None]:
     return errors
 
 
+def built_in_order(subject: Any, inputs: int, outputs: int) -> dict[int, tuple[str, str]]:
+    """Build two seeds of a model in two new interpreters, one in each order.
+
+    Returns
+    -------
+    dict
+        By seed, digests of its parameters and buffers where it was built first and second.
+
+    Raises
+    ------
+    BrokenRuleError
+        If an interpreter ends without an answer.
+    """
+    common = [subject.spec.build, subject.spec.options, dict(subject.settings), inputs, outputs]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([_BUILD, *common, order])],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment(),
+        )
+        for order in ORDERS
+    ]
+    answers = []
+    for process in processes:
+        out, err = process.communicate()
+        answer = next((line for line in out.splitlines() if line.startswith(_MARK)), None)
+        if answer is None:
+            raise BrokenRuleError(
+                f"it cannot be built in a fresh process: {(err.strip() or 'no message').splitlines()[-1]}"
+            )
+        answers.append(json.loads(answer.removeprefix(_MARK)))
+    return {seed: (answers[seed][str(seed)], answers[1 - seed][str(seed)]) for seed in ORDERS[0]}
+
+
+def _build(
+    build: str, options: str, settings: dict[str, Any], inputs: int, outputs: int, order: Sequence[int]
+) -> dict[int, str]:
+    """Build seeds in this process, one after the other; returns digests of their parameters and buffers."""
+    import torch
+
+    from qrlsuite.training.fences import seeded
+
+    chosen = option_values.build(specs.resolve(options), settings, "the model")
+    digests = {}
+    for seed in order:
+        with seeded(seed):
+            module = specs.resolve(build)(inputs, outputs, chosen, torch.Generator().manual_seed(seed))
+        content = hashlib.sha256()
+        for name, value in module.state_dict().items():
+            content.update(
+                name.encode() + value.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes()
+            )
+        digests[seed] = content.hexdigest()
+    return digests
+
+
 if __name__ == "__main__":
-    _result = _look(*json.loads(sys.argv[1]))
+    _given = json.loads(sys.argv[1])
+    _result = _build(*_given[1:]) if _given[0] == _BUILD else _look(*_given)
     print(f"\n{_MARK}{json.dumps(_result)}")

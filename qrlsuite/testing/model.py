@@ -6,7 +6,6 @@ import copy
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,7 +14,9 @@ from qrlsuite import specs
 from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
+from qrlsuite.testing.fresh import built_in_order
 from qrlsuite.training import hidden
+from qrlsuite.training.fences import Fence, seeded
 
 OBS, OUT, B, S = 4, 3, 6, 5
 ODD = 5
@@ -45,7 +46,8 @@ class Subjects:
     def agent(self, seed: int, options: Any = None) -> nn.Module:
         """Return one agent, from a generator of that seed."""
         own = self.options if options is None else options
-        agent: nn.Module = self.build(OBS, OUT, own, torch.Generator().manual_seed(seed))
+        with seeded(seed):  # as `run` builds it
+            agent: nn.Module = self.build(OBS, OUT, own, torch.Generator().manual_seed(seed))
         return agent
 
     def population(self, seeds: Sequence[int], options: Sequence[Any] | None = None) -> nn.Module:
@@ -81,10 +83,15 @@ def check(subject: Subject) -> list[Finding]:
         rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(subjects))
         rules.run("same seed", "the generator alone decides the parameters", lambda: _same(subjects))
         rules.run("different seed", "every generator gives other parameters", lambda: _different(subjects))
-        rules.run(
-            "global randomness", "torch's is untouched by building and running", lambda: _global(subjects)
-        )
+        if subject.modules and subject.distribution != "qrlsuite":  # whose streams its tests hold
+            rules.run(
+                "build order", "a seed has its parameters, whichever is built first", lambda: _order(subject)
+            )
+        rules.run("global randomness", "a pass moves no global generator", lambda: _global(subjects))
         rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(subjects))
+        if not subjects.sampled:
+            rules.run("rows apart", "an input alone and in a batch: equal outputs", lambda: _rows(subjects))
+            rules.run("no cache", "nothing is kept from a pass of the same shape", lambda: _cache(subjects))
         flows = rules.run("gradients", "reach every trainable parameter", lambda: _flow(subjects))
         if flows and not subjects.sampled:
             rules.run("finite differences", "equal the gradients", lambda: _differences(subjects))
@@ -177,7 +184,7 @@ def _registered(subjects: Subjects) -> None:
 
 def _hidden(subjects: Subjects) -> None:
     try:
-        hidden.require_none(subjects.agent, OBS, subjects.spec.name)
+        hidden.require_none(subjects.agent, OBS, subjects.spec.name, subjects.spec.population is None)
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
 
@@ -215,53 +222,82 @@ def _equal(a: dict[str, Tensor], b: dict[str, Tensor]) -> str | None:
 
 
 _DRAW = (
-    "draw every number from the generator that build is given; layers of torch.nn draw from torch's global one, so "
-    "build them inside `with torch.random.fork_rng(devices=[]): torch.manual_seed(torch.randint(2**62, (), "
-    "generator=generator).item())`"
+    "draw every number from the generator that build is given, or from torch's default one as layers of torch.nn do: "
+    "while build runs, it follows from the seed, too"
 )
 
 
 def _same(subjects: Subjects) -> None:
-    kept = np.random.get_state()  # noqa: NPY002
-    with torch.random.fork_rng(devices=[]):
-        built = []
-        for noise in (1, 2):
-            torch.manual_seed(noise)
-            np.random.seed(noise)  # noqa: NPY002
-            built.append(_values(subjects.agent(7)))
-        np.random.set_state(kept)  # noqa: NPY002
-    name = _equal(*built)
+    name = _equal(*(_values(subjects.agent(7)) for _ in range(2)))
     require(name is None, f"two builds from generators of the same seed differ in '{name}': {_DRAW}")
 
 
 def _different(subjects: Subjects) -> None:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(1)
-        first = _values(subjects.agent(7))
-        torch.manual_seed(1)
-        second = _values(subjects.agent(8))
-        require(
-            _equal(first, second) is not None,
-            f"generators of different seeds give the same parameters: {_DRAW}",
-        )
-        generator = torch.Generator().manual_seed(7)
-        torch.manual_seed(1)
-        values = _values(subjects.build(OBS, OUT, subjects.options, generator))
-        torch.manual_seed(1)
-        two = _values(subjects.build(OBS, OUT, subjects.options, generator))
     require(
-        _equal(values, two) is not None,
+        _equal(_values(subjects.agent(7)), _values(subjects.agent(8))) is not None,
+        f"generators of different seeds give the same parameters: {_DRAW}",
+    )
+    generator, built = torch.Generator().manual_seed(7), []
+    for call in range(2):
+        with seeded(call):
+            built.append(_values(subjects.build(OBS, OUT, subjects.options, generator)))
+    require(
+        _equal(*built) is not None,
         "the second network from one generator (a critic, say) equals the first: draw from the generator, do not "
         "only read its seed",
     )
 
 
+def _order(subject: Subject) -> None:
+    """Build two seeds in fresh processes, in both orders."""
+    for seed, (first, second) in built_in_order(subject, OBS, OUT).items():
+        require(
+            first == second,
+            f"seed {seed} has other parameters where another seed is built before it: something is kept from the first "
+            "build (a global variable, a class attribute, a default argument, functools.cache), and shared by all "
+            "seeds; draw it in every `build`",
+        )
+
+
 def _global(subjects: Subjects) -> None:
-    before = torch.get_rng_state()
-    subjects.agent(0)(_x())
+    agent = subjects.agent(0)
+    try:
+        with Fence(closed=True).around("a pass"):
+            agent(_x())
+    except PluginError as error:
+        raise BrokenRuleError(str(error)) from None
+
+
+def _require_close(values: Tensor, others: Tensor, message: str) -> None:
+    """Require equal outputs up to rounding: products round differently by the size of a batch."""
+    difference = float((values - others).detach().abs().max())
     require(
-        torch.equal(before, torch.get_rng_state()),
-        f"building or running it draws from torch's global generator, which all seeds share: {_DRAW}",
+        difference <= 1e-4 * max(1.0, float(others.detach().abs().max())), f"{message} (by {difference:.2g})"
+    )
+
+
+def _rows(subjects: Subjects) -> None:
+    agent, x = subjects.agent(0), _x()
+    values = agent(x)
+    for row in (0, B - 1):
+        _require_close(
+            agent(x[row : row + 1]),
+            values[row : row + 1],
+            f"row {row} of a batch of {B} gives another output alone: batch normalization, or a mean, maximum or "
+            "softmax over the first axis, lets episodes that run side by side change each other",
+        )
+
+
+def _cache(subjects: Subjects) -> None:
+    first, second = _x(seed=0), _x(seed=1)
+    subjects.agent(0)(first)
+    agent = subjects.agent(1)
+    values = agent(second)
+    _require_close(
+        agent(torch.cat([second, second[:-1]]))[:B],  # a shape that nothing has had yet
+        values,
+        "the output depends on an earlier pass with inputs of the same shape, perhaps another agent's: a cache by "
+        "shape holds only what follows from the shape alone",
     )
 
 

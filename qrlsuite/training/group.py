@@ -11,22 +11,35 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from safetensors.numpy import save as encode
 
 from qrlsuite import options, registry
-from qrlsuite.errors import EnvironmentFailure, StoreError
+from qrlsuite.errors import EnvironmentFailure, PluginError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.identity import CodeIdentity
-from qrlsuite.results import checkpoint, codes, provenance, store
+from qrlsuite.results import checkpoint, codes, probes, provenance, store
 from qrlsuite.training.interrupts import Interruptible
 from qrlsuite.training.trackers import EventSink, asked
 from qrlsuite.training.trainer import Epoch, Report, Trainer
 
 CHECKPOINT_SECONDS = 60.0
+
+
+class Probe(Protocol):
+    """Shows, while a group is trained, that its middle seed does not depend on the others: `qrlsuite.engine.probe`."""
+
+    def begin(self, trainer: Trainer) -> bool:
+        """Look at a training before its first epoch; returns whether `judge` can be called."""
+
+    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: checkpoint.Arrays) -> bool:
+        """Add an epoch; returns whether `judge` can be called."""
+
+    def judge(self) -> dict[str, Any]:
+        """Return what `run.json` stores under `probe`."""
 
 
 def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
@@ -120,11 +133,12 @@ class GroupFiles:
             folder = self.store.seed(seed)
             old = folder.record() or {}
             begun = {"code": self.code.record()} if epoch == 0 else {}
+            kept = {name: old[name] for name in ("code", "probe") if name in old}
             record = {
                 **self._seed_record(seed),
+                **kept,
                 "status": "running",
                 "epochs": epoch,
-                **({"code": old["code"]} if "code" in old else {}),
                 **begun,
                 "provenance": _with_origin(old, origin),
             }
@@ -141,6 +155,14 @@ class GroupFiles:
             if made_with != record.get("provenance"):
                 del record["format_version"]
                 folder.write_record({**record, "provenance": made_with})
+
+    def add_probe(self, probe: Mapping[str, Any]) -> None:
+        """Note in `run.json` of every seed what a probe found."""
+        for seed in self.seeds:
+            folder = self.store.seed(seed)
+            record = folder.record() or {}
+            del record["format_version"]
+            folder.write_record({**record, "probe": dict(probe)})
 
     def _seed_record(self, seed: int) -> dict[str, Any]:
         planned = {} if self.entry.plan is None else {"plan": self.entry.plan}
@@ -244,6 +266,8 @@ class GroupRun:
         population, and left as if each had been trained alone.
     held:
         Whether the seeds are still this process's own; nothing is written any more once they are not.
+    probe:
+        Of the middle seed of the population; None for none.
 
     Attributes
     ----------
@@ -268,8 +292,9 @@ class GroupRun:
         report: Report = lambda progress: None,
         others: Sequence[tuple[store.EntryStore, Sequence[int]]] = (),
         held: Callable[[], bool] = lambda: True,
+        probe: Probe | None = None,
     ) -> None:
-        self.epochs, self.held = epochs, held
+        self.epochs, self.held, self.probe = epochs, held, probe
         parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
         found = [_required_code(*part[:2]) for part in parts]
         self.trainer = Trainer(
@@ -283,6 +308,7 @@ class GroupRun:
         self.files = [GroupFiles(*part, events, code) for part, code in zip(parts, found)]
         self.progress.epochs, self.progress.warnings = epochs, events.problems
         self._snapshot: tuple[int, checkpoint.Arrays] | None = None
+        self._lines: list[dict[str, Any]] = []
 
     def run(self) -> None:
         """Train to the last epoch; on an interruption, save the last finished epoch and raise it again.
@@ -291,13 +317,20 @@ class GroupRun:
         ------
         KeyboardInterrupt
             After an interruption, with everything saved.
-        EnvironmentFailure, StoreError
-            If the environment raises, or results cannot be written or are another worker's; finished epochs stay.
+        EnvironmentFailure, PluginError, StoreError
+            If the environment raises, a plugin breaks a rule, or results cannot be written or are another worker's;
+            finished epochs stay.
         """
         with Interruptible() as guard:
             try:
                 with guard.deferred():
                     self._begin()
+                if (
+                    self.probe is not None
+                    and self.epochs > self.trainer.epoch
+                    and self.probe.begin(self.trainer)
+                ):
+                    self._judge(guard, self.probe)
                 self.trainer.models.compile_circuits()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
@@ -308,9 +341,13 @@ class GroupRun:
                         if time.monotonic() - last_save >= CHECKPOINT_SECONDS or epoch.number == self.epochs:
                             self._save()
                             last_save = time.monotonic()
+                    if self.probe is not None and self.probe.add(
+                        self.trainer, self._lines, self._snapshot[1]
+                    ):
+                        self._judge(guard, self.probe)
                 with guard.deferred():
                     self._finish()
-            except (KeyboardInterrupt, EnvironmentFailure):
+            except (KeyboardInterrupt, EnvironmentFailure, PluginError):
                 with guard.deferred():
                     self._save()
                 raise
@@ -343,10 +380,29 @@ class GroupRun:
         for files in self.files:
             files.begin(self.trainer.epoch, parameters, origin)
 
+    def _judge(self, guard: Interruptible, probe: Probe) -> None:
+        """Make the probe, and note what it found; an interruption ends it, and the same command makes it again.
+
+        Raises
+        ------
+        DependentSeedsError
+            If the seeds depend on each other.
+        """
+        self.progress.phase = "probing"
+        self.report(self.progress)
+        found = probe.judge()
+        with guard.deferred():
+            for files in self.files:
+                files.add_probe(found)
+        if found["result"] == probes.DIFFERS:
+            middle = self.trainer.S // 2
+            raise probes.refusal(next(f.store for f, places in self.parts() if middle < places.stop), found)
+
     def _record(self, epoch: Epoch) -> None:
         """Append one line per seed, and show the progress."""
         self._require_held()
         lines, timing = lines_of(epoch), timing_of(epoch, len(self.trainer.seeds))
+        self._lines = lines
         for files, places in self.parts():
             files.record(lines[places], timing)
         self.progress.finished_epoch(

@@ -84,7 +84,7 @@ def _inside(value: Any, path: str, cure: str, seen: set[int]) -> Iterator[tuple[
                 yield from _inside(item, f"{path}[{index}]", cure, seen)
 
 
-def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> None:
+def require_none(build: Callable[[int], nn.Module], inputs: int, model: str, stacked: bool = True) -> None:
     """Refuse a model that holds values which differ between two seeds, or which a forward pass changes.
 
     Parameters
@@ -93,6 +93,9 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> 
         Builds the module of the first seed (0), and that of another (1), anew at every call.
     inputs:
         Number of inputs.
+    stacked:
+        Whether `qrlsuite.population.stack` makes the population: `torch.vmap` hands buffers to a pass and drops what
+        it makes of them, so that a pass may change none.
 
     Raises
     ------
@@ -104,6 +107,7 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> 
     for path, (value, cure) in before.items():
         if path not in other or not _equal(value, other[path][0]):
             _refuse(model, path, "differs between seeds, and torch does not know it", cure)
+    buffers = {name: buffer.clone() for name, buffer in probe.named_buffers()} if stacked else {}
     source = torch.Generator().manual_seed(0)
     try:
         with torch.no_grad(), torch.random.fork_rng(devices=()):
@@ -116,6 +120,14 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str) -> 
         known = before.get(path)
         if not isinstance(value, float | complex) and (known is None or not _equal(value, known[0])):
             _refuse(model, path, "is changed by a forward pass, and torch does not know it", cure)
+    for name, buffer in probe.named_buffers():
+        if name in buffers and not _equal(buffers[name].cpu(), buffer.cpu()):
+            raise PluginError(
+                f"model '{model}': the buffer self.{name} is changed by a forward pass: agents that are trained "
+                "together would lose what the pass writes; a network is a function of its input alone, so keep no "
+                "state between passes (batch normalization, a recurrent state, running means), or give the model a "
+                "`population`"
+            )
 
 
 def _equal(first: Any, second: Any) -> bool:

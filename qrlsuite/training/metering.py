@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.environment import LaneEnv, State, batched_spaces
-from qrlsuite.errors import EnvironmentFailure
+from qrlsuite.errors import EnvironmentFailure, PluginError
 from qrlsuite.experiment.task import ScoreSection
+from qrlsuite.training.fences import Fence
 
 
 class MeteredEnv(LaneEnv):
@@ -26,7 +27,15 @@ class MeteredEnv(LaneEnv):
         (lane, return, score) of every episode that ended since `take_finished` was last called.
     """
 
-    def __init__(self, inner: LaneEnv, name: str, score: ScoreSection, tick: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        inner: LaneEnv,
+        name: str,
+        score: ScoreSection,
+        tick: Callable[[], None],
+        fence: Fence | None = None,
+    ) -> None:
+        self.fence = fence or Fence(closed=False)
         self.inner = inner
         self.environment_name = name
         self.score = score
@@ -42,16 +51,22 @@ class MeteredEnv(LaneEnv):
         """Reset every lane."""
         self.returns[:] = 0.0
         try:
-            return self.inner.reset(seed=seed, options=options)
+            with self.fence.around(f"environment '{self.environment_name}', reset"):
+                return self.inner.reset(seed=seed, options=options)
+        except PluginError:
+            raise
         except Exception as error:
             raise self._failure(error) from error
 
     def step(self, actions: NDArray[np.int64]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step every lane."""
         try:
-            observations, rewards, terminated, truncated, infos = self.inner.step(actions)
+            with self.fence.around(f"environment '{self.environment_name}', step"):
+                observations, rewards, terminated, truncated, infos = self.inner.step(actions)
             if self.observe is not None:
                 self.observe(observations)
+        except PluginError:
+            raise
         except Exception as error:
             raise self._failure(error) from error
         self.returns += rewards

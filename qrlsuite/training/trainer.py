@@ -30,9 +30,10 @@ from qrlsuite.experiment.entry import Entry
 from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.progress import Progress
-from qrlsuite.seeding import Streams, pack, unpack
+from qrlsuite.seeding import Streams, pack, stream_key, unpack
 from qrlsuite.training import hidden
 from qrlsuite.training.device import find as find_device
+from qrlsuite.training.fences import Fence, seeded
 from qrlsuite.training.metering import MeteredEnv
 from qrlsuite.training.standardization import PREFIX, RunningStatistics
 
@@ -68,8 +69,8 @@ def _building(kind: str, name: str) -> Iterator[None]:
         ) from error
 
 
-def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv:
-    """Build the task's environment with a number of lanes."""
+def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence | None = None) -> MeteredEnv:
+    """Build the task's environment with a number of lanes; `fence` watches its calls."""
     spec = entry.task.environment
     settings = entry.task.environment_options
     inner: LaneEnv
@@ -79,7 +80,7 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None]) -> MeteredEnv
         else:
             qrlsuite.register_environments()
             inner = GymLanes(spec.gymnasium_id, lanes, dataclasses.asdict(settings))
-    return MeteredEnv(inner, spec.name, entry.task.file.score, tick)
+    return MeteredEnv(inner, spec.name, entry.task.file.score, tick, fence)
 
 
 def first_network(entry: Entry) -> nn.Module:
@@ -98,7 +99,7 @@ def first_network(entry: Entry) -> nn.Module:
             f"{envs.single_action_space}, not discrete, so that the size of the model is not known before it is trained"
         )
     outputs = int(envs.single_action_space.n)
-    with _building("models", entry.model.name):
+    with _building("models", entry.model.name), seeded(0):
         agent: nn.Module = specs.resolve(entry.model.build)(
             inputs, outputs, entry.model_options, torch.Generator()
         )
@@ -174,7 +175,8 @@ class ModelBuilder:
     `entry` is that of all agents, or one for each.
 
     With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
-    refused (PluginError), see `qrlsuite.training.hidden`.
+    refused (PluginError), see `qrlsuite.training.hidden`. While an agent is built, the global generators have states
+    of its own stream, so that layers of torch may be built as they are. `fence` watches the passes.
     """
 
     def __init__(
@@ -183,7 +185,9 @@ class ModelBuilder:
         observation_size: int,
         streams: Sequence[Streams],
         statistics: RunningStatistics | None = None,
+        fence: Fence | None = None,
     ) -> None:
+        self.fence = fence or Fence(closed=False)
         self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
         self.entry = self.entries[0]
         self.observation_size = observation_size
@@ -201,16 +205,18 @@ class ModelBuilder:
             build = specs.resolve(spec.build)
 
             def agent(streams: Streams, own: Any) -> nn.Module:
-                model: nn.Module = build(self.observation_size, out_dim, own, streams.torch("init", call))
+                with seeded(stream_key(streams.task_hash, streams.seed, "build", call)):
+                    model: nn.Module = build(self.observation_size, out_dim, own, streams.torch("init", call))
                 return model
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
             both = options[0], options[0]
-            if spec.population is None:  # a stack keeps one agent's plain attributes for all
+            stacked = spec.population is None
+            if stacked:  # a stack keeps one agent's plain attributes for all
                 both = options[0], next((own for own in options if own != options[0]), options[0])
             hidden.require_none(
-                lambda which: agent(two[which], both[which]), self.observation_size, spec.name
+                lambda which: agent(two[which], both[which]), self.observation_size, spec.name, stacked
             )
             agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
@@ -221,6 +227,7 @@ class ModelBuilder:
                 together = specs.resolve(spec.population)(agents, population.joined(options))
         if self.statistics is not None:
             self.statistics.attach(together)
+        self.fence.watch(together, f"model '{spec.name}', forward")
         self.built.append(together)
         return together
 
@@ -343,13 +350,14 @@ class Trainer:
         protocol = entry.task.file.protocol
         self.S, self.E, self.V = len(self.seeds), protocol.environments, protocol.validation_episodes
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
-        self.envs = build_envs(entry, self.S * self.E, self._tick)
+        self.fence = Fence(closed=bool(entry.third_party()))
+        self.envs = build_envs(entry, self.S * self.E, self._tick, self.fence)
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
         self.statistics: RunningStatistics | None = None
         if self.envs.inner.running_statistics:
             self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
-        self.models = ModelBuilder(entries, size, self.streams, self.statistics)
+        self.models = ModelBuilder(entries, size, self.streams, self.statistics, self.fence)
         with _building("algorithms", entry.algorithm.name):
             factory = specs.resolve(entry.algorithm.factory)
             own_options = population.joined([each.algorithm_options for each in entries])
@@ -358,7 +366,7 @@ class Trainer:
     @functools.cached_property
     def validation(self) -> MeteredEnv:
         """The validation's lanes, built when first needed: trained agents are also played without them."""
-        envs = build_envs(self.entry, self.S * self.V, self._tick)
+        envs = build_envs(self.entry, self.S * self.V, self._tick, self.fence)
         envs.inner.autoreset = False
         return envs
 
@@ -385,7 +393,8 @@ class Trainer:
         self._phase("training", rounds)
         if self.statistics is not None:
             self.statistics.adopt()
-        metrics = dict(self.algorithm.train_epoch(rounds))
+        with self.fence.around(f"{self._called()}, train_epoch", fine=False):
+            metrics = dict(self.algorithm.train_epoch(rounds))
         metrics["train_return"], metrics["train_score"] = self._training_episodes()
         trained, between = time.perf_counter(), self.models.executions()
         self.progress.warnings += [p for p in self.models.problems() if p not in self.progress.warnings]
@@ -489,7 +498,8 @@ class Trainer:
         self._phase("validating", self.progress.done if self.progress.phase == "validating" else 0)
         self.validation.seed_lanes([streams.numpy("validation", epoch) for streams in self.streams])
         try:
-            episodes = play_episodes(self.validation, lambda: self.act)
+            with self.fence.around(f"{self._called()}, validation", fine=False):
+                episodes = play_episodes(self.validation, lambda: self.act)
         finally:
             with torch.no_grad():
                 for buffer, value in zip(buffers, before):
@@ -500,8 +510,19 @@ class Trainer:
     def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the greedy actions (S * L,) for observations (S * L, ...) of seed-major lanes."""
         stacked = np.ascontiguousarray(observations, np.float32)
-        actions: NDArray[np.int64] = self.algorithm.act(stacked.reshape(self.S, len(stacked) // self.S, -1))
+        with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
+            actions: NDArray[np.int64] = self.algorithm.act(
+                stacked.reshape(self.S, len(stacked) // self.S, -1)
+            )
         return actions.reshape(-1)
+
+    def _called(self) -> str:
+        """Name what is called in an epoch: a generator that a single call moves is said of that call, see `Fence`."""
+        entry = self.entry
+        return (
+            f"algorithm '{entry.algorithm.name}', or what it calls of model '{entry.model.name}' and environment "
+            f"'{entry.task.environment.name}'"
+        )
 
     def _require_scores(self, scores: Floats) -> None:
         """Refuse scores that no leaderboard would rank now, not after hours."""

@@ -115,6 +115,25 @@ class Counts(Base):
         return super().forward(x)
 
 
+class Recurrent(Base):
+    state: Tensor
+
+    def add(self, obs: int, generator: torch.Generator) -> None:
+        self.register_buffer("state", torch.zeros(obs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.state = torch.tanh(self.state + x.mean(0))
+        return super().forward(x + self.state)
+
+
+class Normalized(Base):
+    def add(self, obs: int, generator: torch.Generator) -> None:
+        self.norm = nn.BatchNorm1d(obs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(self.norm(x))
+
+
 REFUSED: dict[type[Base], str] = {
     Attribute: r"self\.w differs between seeds.*self\.register_buffer\('name', tensor\)",
     ArraysInAList: r"self\.frequencies\[0\] differs between seeds.*register_buffer",
@@ -126,6 +145,8 @@ REFUSED: dict[type[Base], str] = {
     Source: r"self\.generator differs between seeds.*draw what is random in `build`",
     Remembers: r"self\.last is changed by a forward pass.*register_buffer",
     Counts: r"self\.passes is changed by a forward pass",
+    Recurrent: r"the buffer self\.state is changed by a forward pass.*would lose what the pass writes",
+    Normalized: r"the buffer self\.norm\.running_mean is changed by a forward pass",
 }
 
 
@@ -166,6 +187,10 @@ def test_constants_and_shared_objects_are_legal() -> None:
     hidden.require_none(of(Legal), 3, "acme")
 
 
+def test_a_population_of_its_own_may_count_passes_in_a_buffer() -> None:
+    hidden.require_none(of(Recurrent), 3, "acme", stacked=False)
+
+
 def test_global_randomness_is_not_disturbed() -> None:
     class Noisy(Base):
         def forward(self, x: Tensor) -> Tensor:
@@ -195,7 +220,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Base]], ModelSpec
     return register
 
 
-@pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers])
+@pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
 @pytest.mark.parametrize("seeds", [(1,), (0, 1)], ids=["alone", "together"])
 def test_run_refuses_it_before_training(
     cls: type[Base],
@@ -227,7 +252,7 @@ def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: 
     assert results(together, 1) == results(alone, 1)
 
 
-@pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers])
+@pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
 def test_check_names_attribute_and_cure(cls: type[Base], install: Callable[[type[Base]], ModelSpec]) -> None:
     findings = rules.check(Subject("models", install(cls), None, (), {}))
     (broken,) = [finding for finding in findings if finding.rule == "nothing hidden"]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import random
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pytest
 import torch
 from pydantic import Field
@@ -15,6 +19,8 @@ from torch import Tensor, nn
 from qrlsuite import population
 from qrlsuite.options import Tuned
 from qrlsuite.specs import ModelSpec
+from qrlsuite.testing import model as rules
+from qrlsuite.testing.common import Subject
 from tests.testing.broken import Broken, Cases, assert_breaks, ids, own_rules
 
 HERE = __name__
@@ -28,6 +34,9 @@ class Options:
 @dataclass(frozen=True)
 class GainOptions:
     gain: Annotated[float, Tuned(0.1, 10, per_agent=True)] = 1.0
+
+
+CALLS = itertools.count(0, 1000)
 
 
 class Good(nn.Module):
@@ -142,7 +151,7 @@ class Misspelled(Good):
 class Unseeded(Good):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
-        self.linear.bias.data += np.random.rand()  # noqa: NPY002
+        self.linear.bias.data += os.urandom(1)[0] + next(CALLS)
 
 
 class Constant(Good):
@@ -156,9 +165,9 @@ class Reseeded(Good):
 
 
 class Greedy(Good):
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
-        torch.rand(1)
+    def forward(self, x: Tensor) -> Tensor:
+        random.random()
+        return super().forward(x)
 
 
 class InPlace(Good):
@@ -179,6 +188,22 @@ class Counting(Good):
     def forward(self, x: Tensor) -> Tensor:
         self.count += 1
         return super().forward(x) * self.count
+
+
+class Centered(Good):
+    def forward(self, x: Tensor) -> Tensor:
+        y = super().forward(x)
+        return y - y.mean(0)
+
+
+SCALES: dict[tuple[int, ...], float] = {}
+
+
+class Cached(Good):
+    def forward(self, x: Tensor) -> Tensor:
+        if tuple(x.shape) not in SCALES:
+            SCALES[tuple(x.shape)] = float(x.detach().abs().max())
+        return super().forward(x) / SCALES[tuple(x.shape)]
 
 
 class Detached(Good):
@@ -310,7 +335,7 @@ def spec(build: str = f"{HERE}:good", **more: Any) -> ModelSpec:
 
 
 NO_GRADIENT = frozenset({"gradients", "seed independence"})
-COUNTS = frozenset({"finite differences"})
+COUNTS = frozenset({"finite differences", "nothing hidden", "rows apart", "no cache"})
 
 BROKEN: Cases = [
     ("builds", Broken(spec(f"{HERE}:nothing"), r"returned NoneType, not a torch.nn.Module: is `return` there")),
@@ -326,11 +351,17 @@ BROKEN: Cases = [
         frozenset({"population"}),
     )),
     ("different seed", Broken(spec(build_of(Constant)), r"different seeds give the same parameters")),
-    ("global randomness", Broken(spec(build_of(Greedy)), r"draws from torch's global generator")),
+    ("global randomness", Broken(spec(build_of(Greedy)), r"a pass: it moved Python's `random`")),
+    ("rows apart", Broken(
+        spec(build_of(Centered)), r"row 0 of a batch of 6 gives another output alone", frozenset({"no cache"})
+    )),
+    ("no cache", Broken(
+        spec(build_of(Cached)), r"earlier pass with inputs of the same shape", frozenset({"rows apart"})
+    )),
     ("pure", Broken(
         spec(build_of(InPlace)),
         r"changes its input in place: avoid",
-        frozenset({"finite differences", "copies", "population"}),
+        frozenset({"finite differences", "copies", "population", "rows apart", "no cache"}),
     )),
     ("gradients", Broken(
         spec(build_of(Unused)), r"'unused' gets no gradient", frozenset({"seed independence"})
@@ -388,3 +419,46 @@ def test_every_rule_has_a_model_that_breaks_it() -> None:
     findings = own_rules("models", spec())
     assert all(finding.ok for finding in findings), findings
     assert {finding.rule for finding in findings} == {rule for rule, _ in BROKEN}
+
+
+SHARING = """
+import torch
+from pydantic.dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Options:
+    pass
+
+
+WEIGHTS = {}
+
+
+def good(obs, out, options, generator):
+    return torch.nn.Linear(obs, out)  # from torch's own generator, which `build` may use
+
+
+def shared(obs, out, options, generator):
+    network = torch.nn.Sequential(torch.nn.Linear(obs, 5), torch.nn.Linear(5, out))
+    with torch.no_grad():
+        network[0].weight.copy_(WEIGHTS.setdefault("body", network[0].weight.detach().clone()))
+    return network
+"""
+
+
+def test_weights_that_all_seeds_share_show_in_the_order_of_building(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a process of its own for either order: here, and in any other rule, all seeds have the first one's alike."""
+    (tmp_path / "acme_sharing.py").write_text(SHARING)
+    monkeypatch.syspath_prepend(tmp_path)
+    broken = {}
+    for name in ("good", "shared"):
+        given = spec(f"acme_sharing:{name}", options="acme_sharing:Options")
+        findings = rules.check(Subject("models", given, "acme", ("acme_sharing",), {}))
+        broken[name] = {finding.rule: finding.message for finding in findings if not finding.ok}
+    assert broken["good"] == {}
+    assert broken["shared"].keys() == {"build order"}
+    assert re.match(
+        r"seed \d has other parameters where another seed is built before", broken["shared"]["build order"]
+    )

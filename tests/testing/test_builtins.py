@@ -22,8 +22,8 @@ RULES = {
     "circuit_backends": ["builds", "shapes", "values", "gradients", "repeatable", "seed independence"],
     "models": [
         "builds", "shapes", "parameters registered", "nothing hidden", "quantum parameters", "same seed",
-        "different seed", "global randomness", "pure", "gradients", "finite differences", "copies", "population",
-        "seed independence", "options per agent", "state",
+        "different seed", "global randomness", "pure", "rows apart", "no cache", "gradients",
+        "finite differences", "copies", "population", "seed independence", "options per agent", "state",
     ],
     "environments": [
         "gymnasium", "spaces", "shapes", "episodes end", "score", "same seed", "different seed",

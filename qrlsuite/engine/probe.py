@@ -1,0 +1,305 @@
+"""Probes that a seed does not depend on its company: the middle one of a group, trained again alone in a fresh process.
+
+Statistics over seeds mean nothing where seeds influence each other. `qrlsuite check` looks for that at toy size before
+anything is trained; a probe looks at what is trained. Both trainings go from nothing until the parameters have changed,
+and must agree in every record and every number of the state, to the last bit. The built-in things are held by the
+suite's tests and are not probed.
+
+- The middle seed shows most: what a process keeps is the first seed's (a cache, a stack's plain attributes), or the
+  last one's (a class attribute).
+- A group that begins is one side itself, and its middle seed, alone, the other. A group of one is the other side, and
+  three seeds are trained in a fresh process. Of a group of two, or one that goes on from a checkpoint, both sides are
+  trained in fresh processes.
+- A probe is made once for the same code on the same kind of device, by whoever holds its claim; what it found is in
+  `run.json` of the seeds that were there. Seeds that depend on their company are trained no further and never ranked.
+
+`python -m qrlsuite.engine.probe ANSWER PARENT` is the fresh process: it reads what to train from stdin.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.results import probes, provenance
+from qrlsuite.results.checkpoint import Arrays
+from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
+from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training.advance import pack, unpack
+
+if TYPE_CHECKING:
+    from qrlsuite.training.trainer import Trainer
+
+MOST_EPOCHS = 10
+"""After which a probe ends although no parameter has changed; it then shows nothing."""
+
+_FOLDER = "probe"
+
+
+def code_of(entry: Entry) -> str:
+    """Return what tells the code of an entry from other code: a probe of the same code is not repeated."""
+    return ", ".join(f"{name} {provenance.version(name)}" for name in sorted(entry.distributions()))
+
+
+@dataclass
+class Side:
+    """What a training gave for one seed, up to the epoch after which its parameters had changed."""
+
+    lines: list[Mapping[str, Any]]
+    arrays: Arrays
+    changed: bool = False
+
+
+class Recorder:
+    """Takes down the middle seed of a training that begins, epoch by epoch."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.side = Side([], {})
+        self._place = trainer.S // 2
+        self._first = self._parameters(trainer)
+
+    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: Arrays) -> bool:
+        """Add an epoch; returns whether the parameters have changed by now.
+
+        Parameters
+        ----------
+        lines:
+            The epoch's line of every seed.
+        state:
+            What `Trainer.capture` returned after it.
+        """
+        self.side.lines.append(lines[self._place])
+        self.side.arrays = {name: array[self._place, None] for name, array in state.items()}
+        self.side.changed = bool(_different(self._first, self._parameters(trainer)))
+        return self.side.changed
+
+    def _parameters(self, trainer: Trainer) -> Arrays:
+        tensors = trainer.algorithm.policy_state()
+        return {name: value[self._place].detach().cpu().numpy().copy() for name, value in tensors.items()}
+
+
+def _different(first: Arrays, second: Arrays) -> str:
+    """Return the first name that only one has, or whose arrays differ in a bit; nothing where all are equal."""
+    for name in sorted({*first, *second}):
+        a, b = first.get(name), second.get(name)
+        if (
+            a is None
+            or b is None
+            or a.dtype != b.dtype
+            or not np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+        ):
+            return name
+    return ""
+
+
+def difference(together: Side, alone: Side) -> str:
+    """Say what differs first; nothing where all is equal."""
+    for number, (line, other) in enumerate(zip(together.lines, alone.lines), start=1):
+        for name in line:
+            if line[name] != other.get(name):
+                return f"'{name}' of epoch {number}"
+    if len(together.lines) != len(alone.lines):
+        return "the epoch in which it first learns"
+    name = _different(together.arrays, alone.arrays)
+    return f"the state '{name}' after epoch {len(together.lines)}" if name else ""
+
+
+def train(entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu") -> Side:
+    """Train seeds from nothing until the parameters of the middle one have changed, for some epochs at most.
+
+    Raises
+    ------
+    QrlSuiteError
+        If the entry cannot be built, or its training fails.
+    """
+    from qrlsuite.training.group import lines_of
+    from qrlsuite.training.trainer import Trainer
+
+    trainer = Trainer(entry, seeds, device)
+    trainer.start()
+    recorder = Recorder(trainer)
+    for _ in range(epochs):
+        lines = lines_of(trainer.train_epoch())
+        if recorder.add(trainer, lines, trainer.capture()):
+            break
+    return recorder.side
+
+
+class _ProbeFailed(Exception):
+    """The fresh process ended without an answer, for a reason that says nothing about seeds."""
+
+
+def in_fresh_process(entry: Entry, seeds: Sequence[int], epochs: int, device: str) -> tuple[Side, float]:
+    """Do what `train` does in a process that has run nothing else; returns its processor time, too.
+
+    Raises
+    ------
+    PluginError
+        If the training fails there.
+    _ProbeFailed
+        If the process was killed, or no process can be started.
+    """
+    task = {"entry": entry.record(), "seeds": list(seeds), "epochs": epochs, "device": device}
+    command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as output:
+        answer = Path(folder) / "answer"
+        (Path(folder) / "task").write_text(json.dumps(task))
+        with (Path(folder) / "task").open("rb") as given:
+            process = subprocess.Popen(
+                [*command, str(answer), str(os.getpid())], stdin=given, stdout=output, stderr=output
+            )
+        try:
+            code = process.wait()
+        finally:
+            if process.poll() is None:  # Ctrl-C
+                process.kill()
+                process.wait()
+        if not answer.exists():
+            output.seek(0)
+            last = output.read().decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            raise _ProbeFailed(f"the process of the probe ended with code {code}: {last[0]}")
+        header, arrays = unpack(answer.read_bytes())
+    if header["error"] is not None:
+        raise PluginError(header["error"])
+    return Side(header["lines"], arrays, header["changed"]), header["cpu"]
+
+
+class Probe:
+    """The probe of a group of seeds, made while it is trained.
+
+    Parameters
+    ----------
+    entry, seed:
+        The middle one of the group.
+    claim:
+        With which this process keeps others from making it, too.
+    """
+
+    def __init__(self, entry: Entry, seed: int, epochs: int, device: str, claim: Claim) -> None:
+        self.entry, self.seed, self.device, self.claim = entry, seed, device, claim
+        self.epochs = min(epochs, MOST_EPOCHS)
+        self._recorder: Recorder | None = None
+        self._alone = False
+        self._made = False
+
+    def begin(self, trainer: Trainer) -> bool:
+        """Look at a training before its first epoch; returns whether `judge` can be called."""
+        if trainer.epoch == 0 and trainer.S != 2:
+            self._recorder, self._alone = Recorder(trainer), trainer.S == 1
+        return self._recorder is None
+
+    def add(self, trainer: Trainer, lines: Sequence[Mapping[str, Any]], state: Arrays) -> bool:
+        """Add an epoch; returns whether `judge` can be called."""
+        if self._made or self._recorder is None:
+            return False
+        changed = self._recorder.add(trainer, lines, state)
+        return changed or len(self._recorder.side.lines) >= self.epochs
+
+    def judge(self) -> dict[str, Any]:
+        """Train in fresh processes what is missing, and compare; returns what `run.json` stores under `probe`."""
+        self._made = True
+        began, seed = time.monotonic(), self.seed
+        found: dict[str, Any] = {
+            "seed": seed,
+            "device": self.device.partition(":")[0],
+            "code": code_of(self.entry),
+        }
+        try:
+            epochs, changed, what, cpu = self._compare()
+        except _ProbeFailed as error:
+            return {**found, "result": NOT_PROBED, "reason": str(error)}
+        cost = {"seconds": round(time.monotonic() - began, 2), "cpu": round(cpu, 2)}
+        if what:
+            return {**found, "result": DIFFERS, "epochs": epochs, "difference": what, **cost}
+        if not changed:
+            reason = f"no parameter has changed within {epochs} epochs"
+            return {**found, "result": NOT_PROBED, "reason": reason, **cost}
+        return {**found, "result": EQUAL, "epochs": epochs, **cost}
+
+    def _compare(self) -> tuple[int, bool, str, float]:
+        """Return the epochs that were compared, whether parameters changed, what differs, and the processor time."""
+        seed, cpu = self.seed, 0.0
+        sides = []
+        for seeds in ([abs(seed - 1), seed, seed + 1 + (seed == 0)], [seed]):
+            if self._recorder is not None and (seeds == [seed]) == self._alone:
+                sides.append(self._recorder.side)  # the group itself
+                continue
+            try:
+                side, seconds = in_fresh_process(self.entry, seeds, self.epochs, self.device)
+            except PluginError as error:
+                return 0, False, f"that it fails: {error}", cpu
+            sides.append(side)
+            cpu += seconds
+        together, alone = sides
+        return len(together.lines), together.changed, difference(together, alone), cpu
+
+
+def prepare(parts: Sequence[tuple[EntryStore, Sequence[int]]], epochs: int, device: str) -> Probe | None:
+    """Return the probe that a group is to make; None where none is needed, or another process makes it.
+
+    Seeds for tuning are not probed: nothing ranks them.
+
+    Parameters
+    ----------
+    parts:
+        The group's seeds, by the folder of their entry.
+
+    Raises
+    ------
+    StoreError
+        If the entry's folder cannot be written.
+    """
+    agents = [(store, seed) for store, seeds in parts for seed in seeds]
+    store, seed = agents[len(agents) // 2]
+    entry = store.entry()
+    if not entry.third_party() or seed >= TUNING_SEEDS:
+        return None
+    key = {"result": EQUAL, "device": device.partition(":")[0], "code": code_of(entry)}
+    if any({name: probe.get(name) for name in key} == key for probe in probes.of_entry(store)):
+        return None
+    try:
+        claim = acquire(EntryStore(store.path / _FOLDER), [0])
+    except SeedsClaimedError:
+        return None
+    return Probe(entry, seed, epochs, device, claim)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Be the fresh process; returns its exit code."""
+    from qrlsuite.engine.worker import end_with
+
+    answer, parent = arguments
+    if not end_with(int(parent)):
+        return 130
+    task = json.load(sys.stdin)
+    header: dict[str, Any] = {"error": None}
+    arrays: Arrays = {}
+    try:
+        side = train(from_record(task["entry"], "the probe"), task["seeds"], task["epochs"], task["device"])
+        header |= {"lines": side.lines, "changed": side.changed}
+        arrays = side.arrays
+    except QrlSuiteError as error:
+        header["error"] = str(error)
+    header["cpu"] = time.process_time()
+    unfinished = Path(f"{answer}.part")
+    unfinished.write_bytes(pack(header, arrays))
+    unfinished.replace(answer)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,76 @@
+"""What probes of independent seeds found, as `run.json` has it under `probe`; `qrlsuite.engine.probe` makes them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import Any
+
+from qrlsuite.errors import PluginError, StoreError
+from qrlsuite.results.provenance import PACKAGES
+from qrlsuite.results.store import EntryStore
+
+EQUAL, DIFFERS, NOT_PROBED = "equal", "differs", "not probed"
+
+
+class DependentSeedsError(PluginError):
+    """A seed gives another result in company than alone."""
+
+
+def of_record(record: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the probe in a `run.json`; None where it has none."""
+    probe = record.get("probe")
+    return probe if isinstance(probe, dict) and isinstance(probe.get("result"), str) else None
+
+
+def of_entry(store: EntryStore) -> list[dict[str, Any]]:
+    """Return the probes in an entry's folder, one for each seed that has one; damaged seeds count as having none."""
+    if not store.path.is_dir():
+        return []
+    found = []
+    for seed in store.seeds():
+        with contextlib.suppress(StoreError):
+            found.append(of_record(store.seed(seed).record() or {}))
+    return [probe for probe in found if probe is not None]
+
+
+def sentence(probe: Mapping[str, Any]) -> str:
+    """Say what a probe has found that did not end the run, and what it took."""
+    if probe["result"] != EQUAL:
+        return f"not probed: {probe.get('reason')}"
+    return (
+        f"probed: seed {probe.get('seed')} is the same alone, to the last bit, up to epoch {probe.get('epochs')} "
+        f"({probe.get('seconds')} s, {probe.get('cpu')} s of processor time)"
+    )
+
+
+def third_party(made_with: Mapping[str, Any]) -> bool:
+    """Tell from a provenance whether code of others than this suite has part in the numbers."""
+    versions = made_with.get("versions")
+    return isinstance(versions, Mapping) and not set(versions) <= set(PACKAGES)
+
+
+def require_independent(store: EntryStore) -> None:
+    """Refuse to go on with an entry of which a probe has found that its seeds depend on each other.
+
+    Raises
+    ------
+    DependentSeedsError
+        Saying what differs, the likely causes, and what to type.
+    """
+    for probe in of_entry(store):
+        if probe["result"] == DIFFERS:
+            raise refusal(store, probe)
+
+
+def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
+    """Return the error that says how the seeds of an entry depend on each other, why that may be, and what to type."""
+    identity = store.record()["identity"]
+    return DependentSeedsError(
+        f"seed {probe['seed']} depends on its company: trained alone in a fresh process, it differs from the same seed "
+        f"in a group in {probe.get('difference')}. So no seed is what it says, and boards leave the entry out. Likely "
+        "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
+        "cache), a global random generator, the time, or statistics over a batch. `qrlsuite check "
+        f"model:{identity['model']}` looks for them, and for those of an environment or algorithm likewise. What was "
+        f"trained is kept in {store.path}; correct the code, remove that folder, and run again"
+    )

@@ -1,0 +1,171 @@
+"""Twenty-two plugins whose seeds are not what they are alone, or that were not: what `run` and `check` make of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qrlsuite.engine.probe import Side, difference
+from qrlsuite.training.advance import unpack
+from tests.conftest import HANGS, TINY, install, installed
+
+PLUGIN = """
+from qrlsuite import hookimpl, specs
+
+@hookimpl
+def register_models(register):
+    for name in {models!r}:
+        register(specs.ModelSpec(name, "bad", family="classical", options="bad_plugins:Options",
+                                 build=f"bad_plugins:{{name}}"))
+
+@hookimpl
+def register_environments(register):
+    for name in {environments!r}:
+        register(specs.EnvironmentSpec(name, "bad", options="bad_plugins:Options", gymnasium_id=f"bad/{{name}}-v0",
+                                       entry_point=f"bad_plugins:{{name.title().replace('_', '')}}"))
+"""
+
+PROBE, FENCE, HIDDEN = "the probe", "it moved", "is changed by a forward pass"
+
+MODELS: dict[str, tuple[str | None, set[str]]] = {
+    "good": (None, set()),
+    "closure": (PROBE, {"build order"}),
+    "class_attribute": (PROBE, {"population"}),
+    "module_global": (PROBE, {"build order"}),
+    "build_counter": (PROBE, {"same seed"}),
+    "default_argument": (PROBE, {"build order"}),
+    "cached_function": (PROBE, {"build order"}),
+    "torch_in_build": (None, set()),
+    "numpy_in_build": (None, set()),
+    "torch_in_forward": (FENCE, {"global randomness"}),
+    "numpy_in_forward": (FENCE, {"global randomness"}),
+    "time_in_build": (PROBE, {"same seed"}),
+    "urandom_in_build": (PROBE, {"same seed"}),
+    "urandom_in_forward": (PROBE, {"pure"}),
+    "batch_norm": (HIDDEN, {"nothing hidden"}),
+    "batch_mean": (None, {"rows apart"}),
+    "recurrent_buffer": (HIDDEN, {"nothing hidden"}),
+    "cache_by_shape": (PROBE, {"no cache"}),
+    "plain_integer": (PROBE, {"population"}),
+}
+"""By model: what `run` says of it, None where it trains; and the rules that `check` finds broken, these among them.
+
+What `build` draws from a global generator follows from the seed, so that these two are no longer bad. A mean over a
+batch mixes episodes of one seed, not seeds: `run` cannot object, and `check` does.
+"""
+
+ENVIRONMENTS: dict[str, tuple[str | None, set[str]]] = {
+    "hop": (None, set()),
+    "lanes_share_a_list": (PROBE, {"seed independence"}),
+    "environment_counter": (PROBE, {"seed independence"}),
+    "numpy_in_reset": (FENCE, {"same seed"}),
+    "urandom_in_reset": (PROBE, {"same seed"}),
+}
+
+SIDES = """
+import json, sys
+from pathlib import Path
+from qrlsuite.engine.probe import train
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.training.advance import pack
+out, seeds, cases = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
+for name, (task, model) in cases.items():
+    header, arrays = {"error": None}, {}
+    try:
+        side = train(resolve(task, model), seeds, 2)
+        header, arrays = {**header, "lines": side.lines}, side.arrays
+    except QrlSuiteError as error:
+        header["error"] = str(error)
+    (out / name).write_bytes(pack(header, arrays))
+"""
+"""Does for all of them, one after the other in one process, what a group and its probe do."""
+
+RULES = """
+import json, sys
+from qrlsuite import testing
+broken = {}
+for kind, name in json.loads(sys.argv[1]):
+    broken[name] = [finding.rule for finding in testing.check(kind, name) if not finding.ok]
+print("\\n" + json.dumps(broken))
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bad") / "site"
+    folder.mkdir()
+    install(folder, "bad", PLUGIN.format(models=list(MODELS), environments=list(ENVIRONMENTS)))
+    shutil.copy(Path(__file__).parent / "bad_plugins.py", folder)
+    return folder
+
+
+def cases(folder: Path) -> dict[str, tuple[str, str]]:
+    """Return task and model by plugin."""
+    (folder / "tiny.toml").write_text(TINY)
+    found = {name: (str(folder / "tiny.toml"), name) for name in MODELS}
+    begin, end = TINY.index("[environment]"), TINY.index("[protocol]")
+    for name in ENVIRONMENTS:
+        text = TINY[:begin] + f'[environment]\nname = "{name}"\n' + TINY[end:]
+        (folder / f"{name}.toml").write_text(text.replace('name = "tiny"', f'name = "{name}"'))
+        found[name] = (str(folder / f"{name}.toml"), "mlp")
+    return found
+
+
+@pytest.fixture(scope="module")
+def verdicts(site: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | None]:
+    """What `run` would say of each plugin; None where it would train it."""
+    folder = tmp_path_factory.mktemp("sides")
+    given, processes = cases(folder), []
+    for where, seeds in (("together", [0, 1, 2]), ("alone", [1])):
+        (folder / where).mkdir()
+        words = [sys.executable, "-c", SIDES, str(folder / where), json.dumps(seeds), json.dumps(given)]
+        environment = {**installed(site), "OMP_NUM_THREADS": "1"}
+        processes.append(subprocess.Popen(words, env=environment))
+    assert [process.wait(HANGS) for process in processes] == [0, 0]
+    found: dict[str, str | None] = {}
+    for name in given:
+        sides = []
+        for where in ("together", "alone"):
+            header, arrays = unpack((folder / where / name).read_bytes())
+            found[name] = found.get(name) or header["error"]
+            sides.append(Side(header.get("lines", []), arrays))
+        found[name] = found[name] or difference(*sides) or None
+    return found
+
+
+@pytest.mark.parametrize("name", [*MODELS, *ENVIRONMENTS])
+def test_what_run_says(name: str, verdicts: dict[str, str | None]) -> None:
+    expected, _ = {**MODELS, **ENVIRONMENTS}[name]
+    said = verdicts[name]
+    assert (said is None) == (expected is None), said
+    if expected == PROBE:
+        assert re.match(r"'\w+' of epoch \d|the state '[\w.]+' after epoch \d", said or ""), said
+    elif expected is not None:
+        assert re.search(expected, said or ""), said
+
+
+@pytest.mark.long
+def test_what_check_says(site: Path) -> None:
+    named = [("model", name) for name in MODELS] + [("environment", name) for name in ENVIRONMENTS]
+    words = [sys.executable, "-W", "ignore", "-c", RULES, json.dumps(named)]
+    done = subprocess.run(
+        words, env=installed(site), capture_output=True, text=True, check=False, timeout=HANGS
+    )
+    assert done.returncode == 0, done.stderr
+    broken = json.loads(done.stdout.splitlines()[-1])
+    for name, (_, rules) in {**MODELS, **ENVIRONMENTS}.items():
+        assert rules <= set(broken[name]), (name, broken[name])
+        assert bool(rules) == bool(set(broken[name]) - {"options documented"}), (name, broken[name])
+
+
+def test_there_are_twenty_two_of_them() -> None:
+    assert len(MODELS) + len(ENVIRONMENTS) - 2 == 22
+    assert os.path.exists(Path(__file__).parent / "bad_plugins.py")
