@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.results import probes, provenance
@@ -151,7 +151,7 @@ def in_fresh_process(entry: Entry, seeds: Sequence[int], epochs: int, device: st
     PluginError
         If the training fails there.
     _ProbeFailed
-        If the process was killed, or no process can be started.
+        If the process was killed, or cannot train for another reason: it finds no such device, say.
     """
     task = {"entry": entry.record(), "seeds": list(seeds), "epochs": epochs, "device": device}
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
@@ -241,6 +241,8 @@ class Probe:
             try:
                 side, seconds = in_fresh_process(self.entry, seeds, self.epochs, self.device)
             except PluginError as error:
+                if self._recorder is None and not sides:  # it fails in company, too
+                    raise _ProbeFailed(str(error)) from error
                 return 0, False, f"that it fails: {error}", cpu
             sides.append(side)
             cpu += seconds
@@ -292,8 +294,11 @@ def main(arguments: Sequence[str]) -> int:
         side = train(from_record(task["entry"], "the probe"), task["seeds"], task["epochs"], task["device"])
         header |= {"lines": side.lines, "changed": side.changed}
         arrays = side.arrays
-    except QrlSuiteError as error:
+    except (PluginError, EnvironmentFailure) as error:
         header["error"] = str(error)
+    except QrlSuiteError as error:  # there is no such device here, say
+        print(error)
+        return 2
     header["cpu"] = time.process_time()
     unfinished = Path(f"{answer}.part")
     unfinished.write_bytes(pack(header, arrays))

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite import registry
+from qrlsuite.engine import probe as probing
 from qrlsuite.engine.answers import Asked, Expected, expected_of, require_alike, require_fit
 from qrlsuite.engine.api import Answer, ChoosingLink, EngineOutcome, Link, RemoteEngine, Show, Work
 from qrlsuite.engine.local import ATTEMPTS
@@ -26,6 +27,7 @@ from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
+from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire_each
 from qrlsuite.results.progress import Progress, ProgressFile
@@ -142,6 +144,8 @@ class _Run:
         self.versions = {name: version for name, version in found.items() if version is not None}
         self.seconds = checkpoint_seconds(TASK_SECONDS)
         self.expected = _expected(self.entry.hash, json_line(self.entry.record()))
+        self.found: dict[str, Any] | None = None
+        """What a probe has found, see `qrlsuite.engine.probe`."""
         self.outcome = EngineOutcome()
         self.members = [_Member(work, group) for group in work.groups]
         self.files: dict[str, GroupFiles] = {}
@@ -159,6 +163,7 @@ class _Run:
         waiting = deque(self.members)
         for member in self.members:
             member.progress_file.clear()
+        self._probe(show)
         while waiting or self.sent:
             while waiting and len(self.sent) < self.work.workers and self._room():
                 self._guarded(waiting.popleft(), self._resume)
@@ -175,6 +180,29 @@ class _Run:
             self.link.close()
         finally:
             self.claims.close()
+
+    def _probe(self, show: Show) -> None:
+        """Make the entry's probe here, where one is needed: both sides are trained in fresh processes.
+
+        Raises
+        ------
+        DependentSeedsError
+            If the seeds depend on each other; nothing has been sent then.
+        """
+        probes.require_independent(self.store)
+        first = self.members[0]
+        probe = probing.prepare([(self.store, first.group.seeds)], self.work.epochs, self.work.device)
+        if probe is None:
+            return
+        try:
+            first.progress.phase = "probing"
+            show({first.group.id: dataclasses.asdict(first.progress)})
+            self.found = probe.judge()
+        finally:
+            probe.claim.release()
+            first.progress.phase = "waiting"
+        if self.found["result"] == probes.DIFFERS:
+            raise probes.refusal(self.store, self.found)
 
     def _room(self) -> bool:
         return sum(member.size for member in self.sent.values()) < MOST_SENT
@@ -288,6 +316,8 @@ class _Run:
                 files.add_origin(header["provenance"])
             else:
                 files.begin(member.epoch, header["parameters"], header["provenance"])
+                if self.found is not None:
+                    files.add_probe(self.found)
                 member.begun = True
         for lines, timing in zip(header["lines"], header["timings"]):
             files.record(lines, timing)

@@ -23,7 +23,7 @@ from qrlsuite.engine import probe as probing
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import group_id
-from qrlsuite.results.claims import HEARTBEAT, Claim, SeedsClaimedError, acquire, living
+from qrlsuite.results.claims import HEARTBEAT, HEARTBEAT_THREAD, Claim, SeedsClaimedError, acquire, living
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.seeds import parse_seeds, plan_groups
 from qrlsuite.results.store import EntryStore
@@ -35,7 +35,7 @@ class ClaimHeartbeat(threading.Thread):
     """Refreshes the claims; interrupts this process when one or its parent is lost, or it is asked to stop."""
 
     def __init__(self, claims: Sequence[Claim], parent: int | None) -> None:
-        super().__init__(daemon=True)
+        super().__init__(name=HEARTBEAT_THREAD, daemon=True)
         self.claims = claims
         self.parent = parent
         self.stopped = threading.Event()

@@ -30,6 +30,9 @@ from qrlsuite.results.store import EntryStore
 HEARTBEAT = 5.0
 """Seconds between two refreshes of a claim."""
 
+HEARTBEAT_THREAD = "qrlsuite heartbeat"
+"""Name of the threads that refresh claims."""
+
 ABANDONED = 120.0
 """Seconds without a refresh after which another host's claim is suspected to be abandoned."""
 

@@ -262,7 +262,7 @@ def _order(subject: Subject) -> None:
 def _global(subjects: Subjects) -> None:
     agent = subjects.agent(0)
     try:
-        with Fence(closed=True).around("a pass"):
+        with Fence(closed=True, alone=True).around("a pass"):
             agent(_x())
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None

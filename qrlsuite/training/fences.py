@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 
 from qrlsuite.errors import PluginError
+from qrlsuite.results.claims import HEARTBEAT_THREAD
 
 FINE_CALLS = 50
 """Calls of each kind that are watched one by one; later ones by the whole epoch, which costs nothing."""
@@ -27,15 +29,27 @@ def _states() -> tuple[Any, Any, torch.Tensor]:
     return random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
 
 
-def _moved(before: tuple[Any, Any, torch.Tensor]) -> list[str]:
-    """Return the generators that are not in the state that `_states` returned."""
+def _moved(before: tuple[Any, Any, torch.Tensor], others_draw: bool) -> list[str]:
+    """Return the generators that are not in the state that `_states` returned.
+
+    Parameters
+    ----------
+    others_draw:
+        Whether other threads may draw from Python's and numpy's meanwhile.
+    """
     after = _states()
     same = (
-        before[0] == after[0],
-        before[1][2:] == after[1][2:] and bool(np.array_equal(before[1][1], after[1][1])),
+        others_draw or before[0] == after[0],
+        others_draw or (before[1][2:] == after[1][2:] and bool(np.array_equal(before[1][1], after[1][1]))),
         torch.equal(before[2], after[2]),
     )
     return [name for name, equal in zip(_GENERATORS, same) if not equal]
+
+
+def _other_threads() -> bool:
+    """Tell whether there are threads that are not the suite's own: a tracker's, or those of a Dask worker."""
+    main = threading.main_thread()
+    return any(thread is not main and thread.name != HEARTBEAT_THREAD for thread in threading.enumerate())
 
 
 @contextlib.contextmanager
@@ -60,10 +74,12 @@ class Fence:
     ----------
     closed:
         Whether calls are watched.
+    alone:
+        Whether no other thread is thought to draw meanwhile; None looks which threads there are.
     """
 
-    def __init__(self, closed: bool) -> None:
-        self.closed = closed
+    def __init__(self, closed: bool, alone: bool | None = None) -> None:
+        self.closed, self.alone = closed, alone
         self._calls: Counter[str] = Counter()
 
     @contextlib.contextmanager
@@ -88,7 +104,7 @@ class Fence:
             return
         before = _states()
         yield
-        if moved := _moved(before):
+        if moved := _moved(before, _other_threads() if self.alone is None else not self.alone):
             raise PluginError(
                 f"{call}: it moved {' and '.join(moved)}, which all seeds of a process share, so that no seed would be "
                 "what it is alone; draw from the generator or the streams that are handed to the plugin"
