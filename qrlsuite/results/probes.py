@@ -70,7 +70,8 @@ def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
         f"seed {probe['seed']} depends on its company: trained alone in a fresh process, it differs from the same seed "
         f"in a group in {probe.get('difference')}. So no seed is what it says, and boards leave the entry out. Likely "
         "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
-        "cache), a global random generator, the time, or statistics over a batch. `qrlsuite check "
+        "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
+        "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
         f"model:{identity['model']}` looks for them, and for those of an environment or algorithm likewise. What was "
         f"trained is kept in {store.path}; correct the code, remove that folder, and run again"
     )
