@@ -32,9 +32,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
-from qrlsuite.results import probes, provenance
+from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
@@ -52,7 +53,7 @@ _FOLDER = "probe"
 
 def code_of(entry: Entry) -> str:
     """Return what tells the code of an entry from other code: a probe of the same code is not repeated."""
-    return ", ".join(f"{name} {provenance.version(name)}" for name in sorted(entry.distributions()))
+    return identity.of(entry).digest
 
 
 @dataclass

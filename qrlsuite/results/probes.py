@@ -73,5 +73,5 @@ def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
         "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
         "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
         f"model:{identity['model']}` looks for them, and for those of an environment or algorithm likewise. What was "
-        f"trained is kept in {store.path}; correct the code, remove that folder, and run again"
+        f"trained is kept in {store.path}; correct the code, and repeat the command with --fresh"
     )
