@@ -279,7 +279,7 @@ def build(
 
 
 def of_one_definition(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], list[str]]:
-    """Leave out entries of decision plans, and those made under another definition of their task than most.
+    """Leave out entries of decision plans or chosen seeds, and those made under another definition than most.
 
     Returns
     -------
@@ -287,7 +287,8 @@ def of_one_definition(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves]
         The entries that stay, task by task, and one line for each that was left out.
     """
     problems = [f"{entry.folder}: {_PLANNED}" for entry in entries if entry.plan]
-    fixed = [entry for entry in entries if not entry.plan]
+    problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
+    fixed = [entry for entry in entries if not entry.plan and not entry.chosen_seeds]
     kept = []
     for task in sorted({entry.task for entry in fixed}):
         members = [entry for entry in fixed if entry.task == task]
@@ -465,6 +466,8 @@ def compare_entries(
     for entry in (first, second):
         if entry.plan:
             raise QrlSuiteError(f"'{entry.label}' was {_PLANNED}")
+        if entry.chosen_seeds:
+            raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     rule = rule or rule_of([first, second])

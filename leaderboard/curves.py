@@ -74,6 +74,8 @@ class EntryCurves(Shown):
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     unprobed:
         Whether code of others has part in it and no probe has shown that its seeds are independent.
+    chosen_seeds:
+        Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
     records:
         By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
         `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
@@ -114,6 +116,7 @@ class EntryCurves(Shown):
     codes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     unprobed: bool = False
+    chosen_seeds: str = ""
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""

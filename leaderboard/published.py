@@ -85,6 +85,17 @@ class PublishedEntry:
         made = self.record["published"]["provenance"]
         return [made[index] for index in self.origins]
 
+    @property
+    def chosen_seeds(self) -> str:
+        """Why no board ranks an entry whose seeds may have been chosen; empty where they are 0 to N - 1.
+
+        A decision plan has a block of its own, and takes no seeds beside it.
+        """
+        if "plan" in self.record or self.seeds == tuple(range(len(self.seeds))):
+            return ""
+        missing = next(seed for seed, held in enumerate(self.seeds) if seed != held)
+        return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
+
     def entry_curves(self) -> EntryCurves:
         """Return what a leaderboard ranks."""
         record, identity = self.record, self.record["identity"]
@@ -122,6 +133,7 @@ class PublishedEntry:
             plan=record.get("plan"),
             codes=codes.distinct([codes.read(record, self.folder / "entry.json")]),
             source="published",
+            chosen_seeds=self.chosen_seeds,
             records={
                 seed: {
                     "epochs": int(self.curves.shape[1]),
@@ -311,7 +323,21 @@ def _curves(folder: Path, task_file: TaskFile, rows: int) -> tuple[tuple[int, ..
             f"seed {seed} has {count} of {length} epochs: some are missing",
         )
     require_scores(scores, task_file, folder)
-    return tuple(int(seed) for seed in seeds), round_means(scores[order].reshape(len(seeds), length))
+    curves = round_means(scores[order].reshape(len(seeds), length))
+    _refuse_copies(folder, seeds.tolist(), curves)
+    return tuple(seeds.tolist()), curves
+
+
+def _refuse_copies(folder: Path, seeds: list[int], curves: NDArray[np.float64]) -> None:
+    """Refuse two seeds with one curve, but for curves of one or two values, which runs that learn nothing share."""
+    first: dict[bytes, int] = {}
+    for seed, curve in zip(seeds, curves):
+        other = first.setdefault(curve.tobytes(), seed)
+        _require(
+            other == seed or len(np.unique(curve)) <= 2,
+            folder,
+            f"seeds {other} and {seed} have the same curve",
+        )
 
 
 def _table(path: Path, columns: Mapping[str, str], rows: int, values: int) -> dict[str, list[Any]]:

@@ -20,9 +20,23 @@ if TYPE_CHECKING:
 
 PACKAGES = ("qrlsuite", "torch", "numpy", "scipy", "gymnasium", "numba", "pennylane", "qiskit")
 
+INSTRUCTIONS = {
+    "NUMBA_CPU_NAME": "x86-64-v3",
+    "NUMBA_CPU_FEATURES": "",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_CBWR": "COMPATIBLE",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "OPENBLAS_CORETYPE": "Haswell",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+}
+"""Variables that fix the instruction sets that bits depend on, with the values of the Containerfile.
+
+Where all are set alike, the name of the processor does not count, see `qrlsuite.leaderboard.verify`.
+"""
+
 
 def collect(distributions: Sequence[str], device: torch.device | None = None) -> dict[str, Any]:
-    """Return versions, device, processor, threads and git commit.
+    """Return versions, device, processor, threads, git commit, and by which variables instruction sets were fixed.
 
     Parameters
     ----------
@@ -40,6 +54,7 @@ def collect(distributions: Sequence[str], device: torch.device | None = None) ->
         "device": {"kind": "cpu", "name": processor()} if device is None else _device(device),
         "cores": os.cpu_count(),
         "threads": 1,
+        "instructions": {name: os.environ[name] for name in INSTRUCTIONS if name in os.environ},
         "commit": _commit(),
     }
 
