@@ -123,11 +123,18 @@ def by_either(stated: Curves, again: Curves, places: list[int]) -> bool:
 Check = Callable[[Curves, Curves, list[int]], bool]
 
 
-def share(check: Check, stated: Curves, again: Curves, seeds: int, draws: int) -> float:
-    """Return how often a check finds something, over draws of the seeds that are trained again."""
-    generator = np.random.default_rng(0)
-    picks = (generator.choice(len(stated), seeds, replace=False) for _ in range(draws))
-    return float(np.mean([check(stated, again, sorted(pick.tolist())) for pick in picks]))
+def share(check: Check, stated: Curves, again: Curves, seeds: int, draws: int, r: float = 1) -> float:
+    """Return how often a check finds something, over draws of the seeds that are trained again.
+
+    With r below 1, each twin is the seed's own run with this probability, else another seed's: M of twins then has
+    this correlation.
+    """
+    generator, found, own = np.random.default_rng(0), 0, np.arange(len(stated))
+    for _ in range(draws):
+        places = sorted(generator.choice(len(stated), seeds, replace=False).tolist())
+        other = generator.integers(0, len(stated), len(stated))
+        found += check(stated, again[np.where(generator.random(len(stated)) < r, own, other)], places)
+    return found / draws
 
 
 def table(rows: Sequence[Sequence[str]], markdown: bool) -> None:
@@ -169,12 +176,10 @@ def main() -> None:
     checks = {"last scores": by_final, "M, pairs": by_pairs, "M, rank": by_rank, "either": by_either}
     rows = [["twins", "forgery", *checks]]
     for name in ("none: honest curves", *(n for n in forged if "10 percent" in n or "replaced" in n)):
-        for r in (None, 0.5, 0.0):
-            same = generator.random(len(honest)) < (r or 0)
-            other = honest[np.where(same, np.arange(len(honest)), generator.permutation(len(honest)))]
-            there = twins if r is None else other
-            found = [share(check, forged[name], there, again, draws // 4) for check in checks.values()]
-            rows.append(["measured" if r is None else f"r = {r:g}", name, *(f"{p:.2f}" for p in found)])
+        for r in (1, 0.5, 0):
+            there = twins if r == 1 else honest
+            found = [share(check, forged[name], there, again, draws // 4, r) for check in checks.values()]
+            rows.append(["measured" if r == 1 else f"r = {r:g}", name, *(f"{p:.2f}" for p in found)])
     table(rows, markdown)
 
     few = (2, 10)
