@@ -395,14 +395,9 @@ def far(fourteen: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def shift(amount: float, first: int = 1) -> Callable[[dict[str, list[Any]]], None]:
-    """Return what changes every score from an epoch on."""
-
-    def change(columns: dict[str, list[Any]]) -> None:
-        moved = [s + amount * (e >= first) for s, e in zip(columns["score"], columns["epoch"])]
-        columns["score"] = [min(1.0, s) for s in moved]
-
-    return change
+def part(columns: dict[str, list[Any]]) -> None:
+    """Change the last bits of every score from the second epoch on."""
+    columns["score"] = [s - 1e-6 * (e > 1) for s, e in zip(columns["score"], columns["epoch"])]
 
 
 def test_equal_bits_are_verified_wherever_they_were_made(far: Path) -> None:
@@ -413,7 +408,7 @@ def test_equal_bits_are_verified_wherever_they_were_made(far: Path) -> None:
 
 
 def test_elsewhere_the_beginning_must_agree_and_the_end_be_plausible(far: Path) -> None:
-    rewrite(far / "curves.parquet", shift(1e-6, first=2))
+    rewrite(far / "curves.parquet", part)
     verdict = verify.verify(far, rerun="auto")
     assert (verdict.ok, verdict.check) == (True, "plausible"), verdict.message
     assert "another processor there" in verdict.message
@@ -422,10 +417,14 @@ def test_elsewhere_the_beginning_must_agree_and_the_end_be_plausible(far: Path) 
 
 
 def test_elsewhere_scores_that_no_rerun_comes_near_are_not_plausible(far: Path) -> None:
-    rewrite(far / "curves.parquet", lambda c: c.update(score=[s + (1 - s) / 3 for s in c["score"]]))
+    def ruin(columns: dict[str, list[Any]]) -> None:
+        pairs = zip(columns["score"], columns["epoch"])
+        columns["score"] = [s / 1e3 if e > plausible.FIRST else s for s, e in pairs]
+
+    rewrite(far / "curves.parquet", ruin)
     verdict = verify.verify(far, rerun=12)
     assert not verdict.ok, verdict.message
-    assert "steps below the thresholds not plausible" in verdict.message or "not its own" in verdict.message
+    assert "steps below the thresholds not plausible" in verdict.message
 
 
 def test_elsewhere_curves_of_other_seeds_are_found_out(far: Path) -> None:
@@ -509,7 +508,7 @@ def test_the_reruns_own_count_decides_circuit_executions(train: Callable[..., Pa
 def test_fixed_instruction_sets_make_bits_comparable_across_processors(
     far: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rewrite(far / "curves.parquet", shift(1e-6, first=2))
+    rewrite(far / "curves.parquet", part)
     for name, value in provenance.INSTRUCTIONS.items():
         monkeypatch.setenv(name, value)
     verdict = verify.verify(far, rerun=1)
