@@ -529,6 +529,12 @@ def test_the_container_fixes_the_instruction_sets_that_are_recorded() -> None:
     assert all(f"{name}==" in text for name in provenance.PACKAGES if name != "qrlsuite")
 
 
+def test_the_page_says_how_many_seeds_are_trained_again() -> None:
+    page = " ".join((Path(published.PUBLISHED).parents[1] / "docs" / "verification.md").read_text().split())
+    said = ", ".join(f"{plausible.needed(count)} of {count}" for count in (100, 20))
+    assert f"probability .95: {said}." in page
+
+
 def test_hours_of_published_entries_rank_nothing(folder: Path) -> None:
     assert costs.price(published.read(folder).entry_curves(), "core-hours").problem
 
