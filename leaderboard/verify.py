@@ -307,9 +307,13 @@ def _counts(
     if not any(_same_parameters(stated, counted) for counted in allowed):
         return f"its record has parameters {dict(stated)}, counted here: {dict(again.parameters[0])}"
     executions = entry.executions[list(places)]
-    for place, here, there in zip(places, again.executions[equal], executions[equal]):
-        if here != there:
-            return f"seed {entry.seeds[place]}: {there:,} circuit executions in its record, {here:,} counted here"
+    wrong = np.flatnonzero(equal & (executions != again.executions))
+    if len(wrong):
+        row = wrong[0]
+        return (
+            f"seed {entry.seeds[places[row]]}: {executions[row]:,} circuit executions in its record, "
+            f"{again.executions[row]:,} counted here"
+        )
     here, there = int(again.executions.sum()), int(executions.sum())
     if abs(here - there) > EXECUTIONS * here:
         return f"{there:,} circuit executions in its record, {here:,} counted here"
