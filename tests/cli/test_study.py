@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from typer.testing import CliRunner, Result
 
 from qrlsuite import registry
@@ -21,6 +22,7 @@ from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.experiment import task
 from qrlsuite.leaderboard import published, studies
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
@@ -164,16 +166,16 @@ def reduced(name: str, folder: Path) -> str:
     text = re.sub(r"\b(episodes|trajectories|shots) = \d+", r"\1 = 5", text)
     text = LONG_LIST.sub(lambda found: f"[{', '.join(re.findall(QUOTED, found[0])[::10])}]", text)
 
-    def task(match: re.Match[str]) -> str:
-        content = Path(registry.task(match[1]).path).read_text()
+    def written(match: re.Match[str]) -> str:
+        content = task.load(match[1]).file.model_dump(mode="json", exclude_none=True)
         for key, value in REDUCED.items():
-            content, count = re.subn(rf"^{key} = \d+$", f"{key} = {value}", content, flags=re.MULTILINE)
-            assert count == 1, key
-        (folder / f"{match[1]}.toml").write_text(content)
+            (table,) = (part for part in (content["protocol"], content["environment"]["options"]) if key in part)
+            table[key] = value
+        (folder / f"{match[1]}.toml").write_text(tomli_w.dumps(content))
         return f'"{folder / match[1]}.toml"'
 
     tasks = re.compile(r'^task = (?:"[^"]*"|\[[^]]*\])', re.MULTILINE)
-    (folder / f"{name}-study.toml").write_text(tasks.sub(lambda m: re.sub(r'"([^"]*)"', task, m[0]), text))
+    (folder / f"{name}-study.toml").write_text(tasks.sub(lambda m: re.sub(r'"([^"]*)"', written, m[0]), text))
     return str(folder / f"{name}-study.toml")
 
 
