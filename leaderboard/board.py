@@ -19,6 +19,7 @@ from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
 from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
@@ -182,39 +183,81 @@ class Leaderboard(Shown):
         return tables.board_html(self)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class EntryComparison(Shown, Comparison):
-    """The result of `compare_entries`. It shows itself as a table of signs and a sentence.
+    """The result of `compare_entries`. It shows itself as a verdict, a table of thresholds, and the cells in a line.
 
     Attributes
     ----------
     labels:
         What the two entries are called.
+    pair:
+        The verdict by steps below threshold, and the final scores.
     remarks:
         What may flatter one of them.
+    show_cells:
+        Whether the cells are shown one by one: a rule was asked for.
+    among:
+        The same pair on the board of its task; None where it was not looked for, or there is no other entry.
     """
 
-    labels: tuple[str, str] = ("", "")
+    labels: tuple[str, str]
+    pair: PairVerdict
     remarks: tuple[str, ...] = ()
+    show_cells: bool = False
+    among: OnBoard | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Which entry needs fewer steps, by how much and how surely, in a sentence."""
+        return self.pair.sentence
 
     @property
     def headline(self) -> str:
-        """Who is compared with whom, and at how many seeds and steps."""
+        """Who is compared with whom cell by cell, and at how many seeds and steps."""
         one, other = self.labels
         rule = "" if self.rule == DEFAULT else f", rule '{self.rule}'"
         return f"{one} against {other}, {self.n_runs} seeds each, {self.horizon} steps{rule}"
 
     @property
+    def cells_line(self) -> str:
+        """What the rule for cells of the sample-complexity surface says."""
+        rule = "the paper's rule" if self.rule == DEFAULT else f"rule '{self.rule}'"
+        return f"by {rule}, cell by cell: {self.sentence}"
+
+    @property
+    def further(self) -> list[str]:
+        """What follows the table of thresholds, line by line."""
+        board = self.among.text if self.among is not None else ""
+        return [line for line in (board, self.pair.final, self.cells_line, *self.remarks) if line]
+
+    @property
     def legend(self) -> str:
-        """What the signs in the table mean."""
+        """What the signs in the table of cells mean."""
         return tables.legend(self)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the comparison as plain values, for JSON: the cells, and `verdict` and `times` beside them."""
+        return {
+            **super().as_dict(),
+            "verdict": self.verdict,
+            "times": self.pair.as_dict(),
+            "board": None if self.among is None else asdict(self.among),
+        }
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield tables.comparison_table(self)
-        yield Text("\n".join([self.legend, f"{self.headline}:", self.sentence, *self.remarks]))
+        yield Text(self.verdict)
+        yield tables.pair_table(self.pair)
+        yield Text("\n".join(self.further))
+        if self.show_cells:
+            yield Text(f"\n{self.headline}:")
+            yield tables.comparison_table(self)
+            yield Text(self.legend)
 
     def _repr_html_(self) -> str:
-        return tables.comparison_html(self, self.headline, self.remarks)
+        pair = self.pair
+        shown = tables.html_table(pair.columns(), pair.rows(), self.verdict, [*pair.notes, *self.further])
+        return shown + (tables.comparison_html(self, self.headline) if self.show_cells else "")
 
 
 def learning_curves(entry: EntryCurves) -> LearningCurves:
@@ -442,15 +485,15 @@ def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
 def compare_entries(
     first: EntryCurves, second: EntryCurves, rule: SignificanceRule | None = None
 ) -> EntryComparison:
-    """Compare two entries of one task on its ranking grid.
+    """Compare two entries of one task: by steps below threshold, by final score, and cell by cell of its ranking grid.
 
     Parameters
     ----------
     first, second:
         The entries.
     rule:
-        What counts as significant; None means the task's own, the paper's where it names none. For a paired rule
-        both are reduced to the seeds that they share.
+        What counts as significant in a cell; None means the task's own, the paper's where it names none. For a paired
+        rule both are reduced to the seeds that they share, in the cells.
 
     Raises
     ------
@@ -470,10 +513,11 @@ def compare_entries(
             raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
+    grid, asked = ranking_of([first, second]).grid, rule is not None
+    pair = judge_pair(first, second, grid, ALPHA)
     rule = rule or rule_of([first, second])
     if getattr(rule, "paired", False):
         first, second = _common_seeds(first, second)
-    grid = ranking_of([first, second]).grid
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
     remarks = [
@@ -481,7 +525,7 @@ def compare_entries(
         for entry in (first, second)
         if entry.on_protocol_seeds
     ]
-    return EntryComparison(**values, labels=(first.label, second.label), remarks=tuple(remarks))
+    return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
 
 
 def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:

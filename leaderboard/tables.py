@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.across import AcrossBoard
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
     from qrlsuite.leaderboard.costs import CostBoard, CostSection
+    from qrlsuite.leaderboard.pair import PairVerdict
 
 COLUMNS = (
     "tier",
@@ -436,6 +437,15 @@ SYMBOLS = {
 """What a cell of a comparison looks like; the sign says everything, the color only helps."""
 
 
+def pair_table(pair: PairVerdict) -> Table:
+    """Return two entries threshold by threshold as a table."""
+    columns = pair.columns()
+    result = table(columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=(columns[0], *columns[3:]))
+    for row in pair.rows():
+        result.add_row(*map(Text, row))
+    return result
+
+
 def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
     """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
     grid = comparison.grid
@@ -461,9 +471,9 @@ def legend(comparison: Comparison) -> str:
     return ", ".join(f"{sign} {meaning}" for name, (sign, _, meaning) in SYMBOLS.items() if name in occurring)
 
 
-def comparison_html(comparison: Comparison, headline: str, further: Sequence[str] = ()) -> str:
-    """Return a comparison as HTML for a notebook: the result in words, and a sign per cell of the grid."""
+def comparison_html(comparison: Comparison, headline: str) -> str:
+    """Return a comparison's cells as HTML for a notebook: the result in words, and a sign per cell of the grid."""
     heading, rows, deltas = _levels(comparison)
     signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
-    remarks = [heading, legend(comparison), *further]
+    remarks = [heading, legend(comparison)]
     return html_table(["", *deltas], signs, f"{headline}: {comparison.sentence}", remarks)

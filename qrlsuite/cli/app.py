@@ -45,7 +45,7 @@ BUILT_IN = {
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
         LazyCommand("runs", "List the results folder, and what is running in it.", f"{_ROOM}.runs:app"),
         LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
-        LazyCommand("compare", "Compare two entries cell by cell, and in words.", f"{_ROOM}.compare:compare"),
+        LazyCommand("compare", "Say which of two entries needs fewer steps.", f"{_ROOM}.compare:compare"),
         LazyCommand(
             "calibrate", "Measure how often the significance rules err.", f"{_ROOM}.calibrate:calibrate"
         ),

@@ -6,10 +6,10 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `estimator`: S_hat and its two marks. `bootstrap`: its percentile intervals.
 - `significance`: rules that judge one pair, cell by cell. `compare`: one pair, in words.
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
-- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times.
+- `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times; `pair`: one of them.
 - `sequential`: as many runs as it takes to decide, at one error for all looks.
 - `calibration`: how often all this errs. `planning`: how many runs it takes.
-- `across`: several tasks at once.
+- `across`: several tasks at once. `final`: entries by their scores at the end, or over all of training.
 """
 
 from qrlsuite.statistics.across import (
@@ -44,7 +44,9 @@ from qrlsuite.statistics.estimator import (
     sample_complexity,
     unsettled,
 )
+from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, final_scores, last_epochs
 from qrlsuite.statistics.grid import Grid
+from qrlsuite.statistics.pair import TimesPair, times_pair
 from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
 from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
@@ -93,26 +95,32 @@ __all__ = [
     "Ranking",
     "Rates",
     "Resampling",
+    "ScoreBoard",
     "SignificanceRule",
     "SmoothedRuns",
     "Spending",
     "TimesBoard",
+    "TimesPair",
     "TimesRates",
     "TimesRule",
     "Verdict",
     "across_tasks",
+    "areas",
     "at_cap",
     "board_false_winners",
     "bootstrap_draws",
     "bootstrap_interval",
     "common_horizon",
     "compare",
+    "compare_scores",
     "decide",
     "decision_rates",
     "false_winners",
+    "final_scores",
     "holm",
     "horizon_shares",
     "interquartile_mean",
+    "last_epochs",
     "mean_time",
     "nominal_levels",
     "outperformance",
@@ -129,5 +137,6 @@ __all__ = [
     "split_halves",
     "times_below",
     "times_board",
+    "times_pair",
     "unsettled",
 ]

@@ -166,7 +166,10 @@ def times_board(
         ).astype(np.int64)
         signs[i, j], signs[j, i] = signs_by_threshold, -signs_by_threshold
         sign = direction(test.t[index], signs_by_threshold) if corrected[index] <= alpha else None
-        directions[i][j], directions[j][i] = _named(sign), _named(None if sign is None else -sign)
+        directions[i][j], directions[j][i] = (
+            named_direction(sign),
+            named_direction(None if sign is None else -sign),
+        )
     difference, interval = _differences(times, 1 - alpha)
     better = np.array([[each is Direction.FEWER for each in row] for row in directions], bool).reshape(
         size, -1
@@ -243,7 +246,8 @@ def direction(t: FloatArray, signs: IntArray) -> int:
     return int(np.sign(t[np.abs(t).argmax()]))
 
 
-def _named(sign: int | None) -> Direction:
+def named_direction(sign: int | None) -> Direction:
+    """Return what the sign of a decided pair means, see `direction`; None is a pair that is not decided."""
     if sign is None:
         return Direction.NOT_TOLD_APART
     return {1: Direction.FEWER, -1: Direction.MORE, 0: Direction.TRADE_OFF}[sign]

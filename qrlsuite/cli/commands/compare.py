@@ -1,4 +1,4 @@
-"""`qrlsuite compare`: two entries, cell by cell, and in words."""
+"""`qrlsuite compare`: which of two entries needs fewer steps, by how much and how surely."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RuleOption, RunsOption
-from qrlsuite.leaderboard import tables
 
 
 def compare(
@@ -28,9 +27,10 @@ def compare(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Say whether the first entry outperforms the second, cell by cell of the task's ranking grid.
+    """Say which of two entries needs fewer steps, by how much and how surely; then threshold by threshold.
 
-    Both are compared at equal numbers of seeds and equal horizons.
+    The final scores and the paper's rule follow, and the verdict on the board of all entries of the task, which is
+    stricter. With --rule the cells of the task's ranking grid are shown, too, at equal numbers of seeds.
 
     Example: qrlsuite compare --task beam6g "mlp width=64" "mlp width=16"
     """
@@ -38,7 +38,4 @@ def compare(
     if json_output:
         typer.echo(json.dumps(comparison.as_dict()))
         return
-    Console().print(tables.comparison_table(comparison))
-    typer.echo(
-        "\n".join([comparison.legend, f"{comparison.headline}:", comparison.sentence, *comparison.remarks])
-    )
+    Console().print(comparison)

@@ -1,0 +1,355 @@
+"""Two entries in words: which needs fewer steps, by how much and how surely; threshold by threshold; and at the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.times import percent
+from qrlsuite.results.text import counted, steps_text
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    Direction,
+    Grid,
+    LearningCurves,
+    ScoreBoard,
+    TimesPair,
+    common_horizon,
+    compare_scores,
+    final_scores,
+    last_epochs,
+    times_board,
+    times_pair,
+)
+from qrlsuite.statistics.grid import FloatArray
+
+_DECIDED = (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
+
+
+@dataclass(frozen=True)
+class OnBoard:
+    """The same pair among all entries of its task, where Holm's procedure goes over all pairs.
+
+    Attributes
+    ----------
+    n_entries:
+        Ranked entries of the board.
+    adjusted:
+        p of the pair, adjusted for all of its pairs.
+    direction:
+        The verdict there.
+    """
+
+    n_entries: int
+    adjusted: float
+    direction: Direction
+
+    @property
+    def text(self) -> str:
+        """`on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = .074`."""
+        pairs = self.n_entries * (self.n_entries - 1) // 2
+        verdict = "told apart, too" if self.direction in _DECIDED else str(self.direction)
+        return (
+            f"on the board of {self.n_entries} entries, which is stricter ({pairs} pairs): {verdict}, "
+            f"adjusted {p_text(self.adjusted)}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PairVerdict:
+    """The result of `judge_pair`, from the first entry's side.
+
+    Attributes
+    ----------
+    labels:
+        What the two entries are called, without the algorithm where it is the same.
+    times:
+        The verdict and every threshold.
+    thresholds:
+        The grid's, in units of the score.
+    scores:
+        Both by their final scores; None where one has a single run.
+    n_last:
+        Epochs of the first that its final score is the mean of.
+    """
+
+    labels: tuple[str, str]
+    times: TimesPair
+    thresholds: tuple[str, ...]
+    scores: ScoreBoard | None
+    n_last: int
+
+    @property
+    def sentence(self) -> str:
+        """The verdict, its size and how sure it is."""
+        first, second = self.labels
+        pair = self.times
+        if (pair.at_cap == 1).all():
+            return (
+                f"neither reached {_any_of(len(self.thresholds))} within {steps_text(pair.horizon)} steps: "
+                "train longer, or lower them"
+            )
+        match pair.direction:
+            case Direction.UNDECIDED:
+                return f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); {self._not_told_apart}"
+            case Direction.NOT_TOLD_APART:
+                return f"not told apart: {self._not_told_apart} ({self._seeds}, {p_text(pair.p)})"
+            case Direction.TRADE_OFF:
+                return (
+                    f"trade-off: {first} needs fewer steps at {self._at(1)}, {second} at {self._at(-1)} "
+                    f"({self._seeds}, {p_text(pair.p)})"
+                )
+        return self._decided(pair.direction is Direction.FEWER)
+
+    def _decided(self, first_wins: bool) -> str:
+        """Say who needs fewer steps, and where the mean does not show it, at which threshold."""
+        winner, loser = self.labels if first_wins else self.labels[::-1]
+        mean = fewer(self.times.difference, first_wins)
+        if mean[1] > 0:
+            return (
+                f"{winner} needs {share(mean[0])} fewer steps than {loser} ({share(mean[1])} to "
+                f"{share(mean[2])}, {self._seeds}, {p_text(self.times.p)})"
+            )
+        if math.isnan(mean[1]):
+            return f"{winner} needs fewer steps than {loser} ({self._seeds}, {p_text(self.times.p)})"
+        return (
+            f"{winner} needs fewer steps than {loser} at {self._at(1 if first_wins else -1)} ({self._seeds}, "
+            f"{p_text(self.times.p)}); over all {counted(len(self.thresholds), 'threshold')} "
+            f"{_fewer_or_more(mean[0])} ({_fewer_or_more(mean[2])} to {_fewer_or_more(mean[1])})"
+        )
+
+    @property
+    def _not_told_apart(self) -> str:
+        first, second = self.labels
+        value, low, high = fewer(self.times.difference, True)
+        if math.isnan(value):
+            return f"{first} and {second}"
+        text = f"{first} needs {_fewer_or_more(value)} steps than {second}"
+        return text if math.isnan(low) else f"{text}, {_fewer_or_more(high)} to {_fewer_or_more(low)}"
+
+    @property
+    def _seeds(self) -> str:
+        one, other = self.times.n_runs
+        return f"{counted(one, 'seed')} each" if one == other else f"{one} and {other} seeds"
+
+    def _at(self, sign: int) -> str:
+        """Name the thresholds at which the first (1) or the second (-1) needs significantly fewer steps, and its share.
+
+        Where none is significant at the level of a sign, the verdict rests on the one with the smallest p.
+        """
+        chosen = np.flatnonzero(self.times.signs == sign)
+        places = chosen if len(chosen) else [int(self.times.p_each.argmin())]
+        texts = []
+        for place in places:
+            value, low, high = fewer(self.times.differences[place], sign > 0)
+            size = "" if math.isnan(low) else f" ({share(value)} fewer, {share(low)} to {share(high)})"
+            texts.append(f"{self.thresholds[place]}{size}")
+        return f"{'threshold' if len(texts) == 1 else 'thresholds'} {', '.join(texts)}"
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the heads of the table that `rows` fills."""
+        level = f"{100 * (1 - self.times.alpha):g}%"
+        return ("threshold", *self.labels, f"difference ({level})", "p", "first needs")
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return one row of text per threshold: steps below it of both, and the difference with its own interval."""
+        pair = self.times
+        return [
+            (
+                threshold,
+                *(_steps(pair, side, place) for side in (0, 1)),
+                _difference(pair.differences[place]),
+                p_text(float(pair.p_each[place])).removeprefix("p ").removeprefix("= ") or "-",
+                self._verdict(place),
+            )
+            for place, threshold in enumerate(self.thresholds)
+        ]
+
+    def _verdict(self, place: int) -> str:
+        if (self.times.at_cap[:, place] == 1).all():
+            return "neither reached"
+        if self.times.direction is Direction.UNDECIDED:
+            return "undecided"
+        return {1: "fewer", -1: "more", 0: "not told apart"}[int(self.times.signs[place])]
+
+    @property
+    def notes(self) -> list[str]:
+        """What the table means."""
+        return [
+            "steps below threshold: mean over seeds; a seed that never reaches it counts with "
+            f"{steps_text(self.times.horizon)}",
+            "p: adjusted for all thresholds; intervals: of each threshold by itself",
+        ]
+
+    @property
+    def final(self) -> str:
+        """Both final scores, and their difference; empty where one entry has a single run."""
+        if self.scores is None:
+            return ""
+        low, high = self.scores.difference_interval[0, 1]
+        one, other = self.scores.mean
+        p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
+        return (
+            f"final score: {one:.4g} against {other:.4g}, difference {self.scores.difference[0, 1]:+.2g} "
+            f"({low:+.2g} to {high:+.2g}{p}); mean over the last tenth of the epochs ({self.n_last})"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        pair = self.times
+        scores = self.scores
+        return {
+            "n_runs": list(pair.n_runs),
+            "verdict": str(pair.direction),
+            "p": _number(pair.p),
+            "difference": _number(pair.difference[0]),
+            "difference_interval": [_number(end) for end in pair.difference[1:]],
+            "by_threshold": [
+                {
+                    "threshold": float(threshold),
+                    "mean_times": pair.means[:, place].tolist(),
+                    "at_cap": pair.at_cap[:, place].tolist(),
+                    "difference": _number(pair.differences[place, 0]),
+                    "difference_interval": [_number(end) for end in pair.differences[place, 1:]],
+                    "p": _number(float(pair.p_each[place])),
+                    "sign": int(pair.signs[place]),
+                }
+                for place, threshold in enumerate(self.thresholds)
+            ],
+            "final_score": None
+            if scores is None
+            else {
+                "means": scores.mean.tolist(),
+                "difference": float(scores.difference[0, 1]),
+                "difference_interval": scores.difference_interval[0, 1].tolist(),
+                "p": float(scores.p[0, 1]),
+                "last_epochs": self.n_last,
+            },
+        }
+
+
+def judge_pair(first: EntryCurves, second: EntryCurves, grid: Grid, alpha: float) -> PairVerdict:
+    """Compare two entries of one task by their times below threshold and by their final scores, with all their seeds.
+
+    Raises
+    ------
+    OptionError
+        If the shorter horizon is not a whole number of epochs for both.
+    """
+    sides = [LearningCurves(each.curves, each.steps_per_epoch, each.name) for each in (first, second)]
+    end = common_horizon(*sides)
+    cut = [side.cut(end) for side in sides]
+    several = min(side.n_runs for side in cut) > 1
+    return PairVerdict(
+        labels=_short(first, second),
+        times=times_pair(*sides, grid, alpha),
+        thresholds=tuple(f"{threshold:g}" for threshold in grid.thresholds),
+        scores=compare_scores({str(k): final_scores(side) for k, side in enumerate(cut)}, alpha)
+        if several
+        else None,
+        n_last=last_epochs(cut[0].values.shape[1]),
+    )
+
+
+def _short(first: EntryCurves, second: EntryCurves) -> tuple[str, str]:
+    """Return both labels, without the algorithm where it is the same."""
+    if first.algorithm != second.algorithm:
+        return first.label, second.label
+    prefix = f"{first.algorithm} "
+    return first.label.removeprefix(prefix), second.label.removeprefix(prefix)
+
+
+def on_board(
+    first: EntryCurves, second: EntryCurves, entries: Sequence[EntryCurves], grid: Grid, alpha: float
+) -> OnBoard | None:
+    """Return what the pair comes to on the board of its task at its horizon.
+
+    Parameters
+    ----------
+    entries:
+        Those of the task. Entries of a decision plan, of another definition of the task, shorter than the pair or with
+        fewer than 20 seeds are not ranked.
+
+    Returns
+    -------
+    OnBoard or None
+        None where one of the two is not ranked, or no other is.
+    """
+    end = min(each.curves.shape[1] * each.steps_per_epoch for each in (first, second))
+    ranked = []
+    for entry in entries:
+        if entry.plan or entry.task_hash != first.task_hash or end % entry.steps_per_epoch:
+            continue
+        reached = entry.reaching(end // entry.steps_per_epoch)
+        if reached is not None and len(reached.seeds) >= MIN_RUNS:
+            ranked.append(reached)
+    folders = [entry.folder for entry in ranked]
+    if len(ranked) < 3 or first.folder not in folders or second.folder not in folders:
+        return None
+    curves = [LearningCurves(each.curves, each.steps_per_epoch, str(k)) for k, each in enumerate(ranked)]
+    board = times_board(curves, grid, alpha, end)
+    i, j = folders.index(first.folder), folders.index(second.folder)
+    return OnBoard(len(ranked), float(board.adjusted[i, j]), board.directions[i][j])
+
+
+def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:
+    """Return how many fewer steps the first needs than the second, or the second than the first: share, low, high.
+
+    Parameters
+    ----------
+    difference:
+        Shape (3,): mean of the first over that of the second, minus 1, and the ends of its interval.
+
+    >>> fewer(np.array([-0.5, -0.6, -0.25]), True)
+    (0.5, 0.25, 0.6)
+    >>> fewer(np.array([1.0, 0.25, 3.0]), False)
+    (0.5, 0.2, 0.75)
+    """
+    value, low, high = difference.tolist()
+    if first:
+        return -value, -high, -low
+    value, low, high = (1 - 1 / (1 + each) for each in (value, low, high))
+    return value, low, high
+
+
+def share(value: float) -> str:
+    """Write a share: `32%`, `3.4%`."""
+    return f"{100 * value:.0f}%" if abs(100 * value) >= 9.95 else f"{100 * value:.1f}%"
+
+
+def _fewer_or_more(value: float) -> str:
+    return f"{share(abs(value))} {'fewer' if value >= 0 else 'more'}"
+
+
+def _any_of(count: int) -> str:
+    return "the threshold" if count == 1 else f"any of the {count} thresholds"
+
+
+def _steps(pair: TimesPair, side: int, place: int) -> str:
+    never = pair.at_cap[side, place] == 1
+    return "never" if never else steps_text(float(pair.means[side, place]), digits=3)
+
+
+def _difference(values: FloatArray) -> str:
+    if np.isnan(values[0]):
+        return "-"
+    texts = [percent(each) for each in values.tolist()]
+    return texts[0] if np.isnan(values[1]) else f"{texts[0]} ({texts[1]} to {texts[2]})"
+
+
+def p_text(p: float) -> str:
+    """Write a p value in a sentence: `p = .021`, `p < .0001`; empty where there is none."""
+    if math.isnan(p):
+        return ""
+    if p < 1e-4:
+        return "p < .0001"
+    return f"p = {p:.2g}".replace("0.", ".") if p >= 0.001 else f"p = {p:.4f}".replace("0.", ".")
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,141 @@
+"""Two entries in words: the verdict, thresholds with intervals of their own, and the board that is stricter."""
+
+from __future__ import annotations
+
+import doctest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qrlsuite import api
+from qrlsuite.leaderboard import board, pair
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.statistics import Direction
+from tests.leaderboard import boards
+
+
+def entry(
+    label: str, reached_at: list[int] | np.ndarray, score: float = 0.95, start: float = 0.1
+) -> EntryCurves:
+    """One run per number: the epoch of 100 from which it has the score."""
+    curves = np.full((len(reached_at), 100), start)
+    for run, epoch in enumerate(reached_at):
+        curves[run, epoch:] = score
+    made = replace(boards.entry(label), curves=curves, folder=Path(label), name=label.replace(" ", "-"))
+    return replace(made, seeds=tuple(range(len(reached_at))))
+
+
+def spread(around: int, count: int = 30) -> np.ndarray:
+    return around + np.arange(count) % 5
+
+
+def test_the_helpers_are_right_by_hand() -> None:
+    assert doctest.testmod(pair).attempted
+    assert pair.p_text(0.0212) == "p = .021"
+    assert pair.p_text(0.0005) == "p = .0005"
+    assert pair.p_text(1 / 10_001) == "p < .0001"
+    assert pair.p_text(float("nan")) == ""
+
+
+def test_the_winner_is_the_subject_whatever_the_order() -> None:
+    fast, slow = entry("fast", spread(18)), entry("slow", spread(38))
+    sentence = "fast needs 50% fewer steps than slow (48% to 51%, 30 seeds each, p < .0001)"
+    assert board.compare_entries(fast, slow).verdict == sentence
+    assert board.compare_entries(slow, fast).verdict == sentence
+
+
+def test_every_threshold_has_numbers_of_its_own() -> None:
+    """Both reach .75 at epoch 20 on average and the first alone .95: thresholds above .75 are never reached."""
+    first, second = entry("first", spread(18)), entry("second", spread(18), score=0.75)
+    compared = board.compare_entries(first, second)
+    rows = {row[0]: row[1:] for row in compared.pair.rows()}
+    assert rows["0.9"][:2] == ("40k", "never")
+    assert rows["0.9"][2].startswith("-80% (")
+    assert rows["0.9"][-1] == "fewer"
+    assert rows["0.7"] == ("40k", "40k", "+0.0% (-3.6% to +3.8%)", "1", "not told apart")
+
+
+def test_a_verdict_that_rests_on_one_threshold_names_it_with_its_interval() -> None:
+    """The first is a little earlier at .6 in every run, and as good as the second or worse above."""
+    first, second = entry("first", spread(20), 0.62), entry("second", spread(25), 0.62)
+    noise = np.random.default_rng(0)
+    for each, seed in ((first, 0), (second, 7)):
+        for run in range(30):
+            each.curves[run, noise.integers(30, 100) + seed // 20 :] = 0.95
+    said = board.compare_entries(first, second).verdict
+    assert said.startswith(
+        "first needs fewer steps than second at threshold 0.6 (19% fewer, 16% to 21%) (30 seeds"
+    )
+    assert "; over all 7 thresholds " in said
+
+
+def test_two_that_reached_nothing_are_told_what_to_do() -> None:
+    first, second = entry("first", spread(18), 0.5), entry("second", spread(18), 0.2)
+    said = board.compare_entries(first, second).verdict
+    assert said == "neither reached any of the 7 thresholds within 200k steps: train longer, or lower them"
+    assert "difference +0.3 (+0.3 to +0.3, p < .0001)" in board.compare_entries(first, second).pair.final
+
+
+def test_equals_are_not_told_apart_and_few_are_undecided() -> None:
+    first, second = entry("first", spread(20)), entry("second", spread(20))
+    assert board.compare_entries(first, second).verdict == (
+        "not told apart: first needs 0.0% fewer steps than second, 3.3% fewer to 3.4% more (30 seeds each, p = 1)"
+    )
+    few = board.compare_entries(entry("few", spread(20, 10)), second)
+    assert few.verdict.startswith(
+        "undecided: fewer than 20 seeds (10 and 30 seeds); few needs 0.0% fewer steps"
+    )
+    assert {row[-2:] for row in few.pair.rows()} == {("-", "undecided")}
+    assert "p " not in few.pair.final.partition(";")[0]
+    one = board.compare_entries(entry("one", spread(20, 1)), second)
+    assert (
+        one.verdict
+        == "undecided: fewer than 20 seeds (1 and 30 seeds); one needs 9.1% fewer steps than second"
+    )
+    assert one.pair.final == ""
+
+
+def test_a_trade_off_names_both_sides() -> None:
+    early, late = entry("early", spread(18), 0.72), entry("late", spread(40))
+    early.curves[:, 90:] = 0.95
+    compared = board.compare_entries(early, late)
+    assert compared.pair.times.direction is Direction.TRADE_OFF
+    assert compared.verdict.startswith("trade-off: early needs fewer steps at thresholds 0.7 (52% fewer, ")
+    assert ", late at thresholds 0.9 (53% fewer, " in compared.verdict
+
+
+def test_the_board_of_more_entries_is_stricter() -> None:
+    first = entry("first", np.arange(10, 50))
+    second = entry("second", np.arange(16, 56))
+    alone = board.compare_entries(first, second)
+    assert alone.pair.times.direction is Direction.FEWER
+    others = [entry(f"other {k}", spread(20 + k)) for k in range(6)]
+    few = entry("few", spread(30, 19))
+    grid = alone.grid
+    among = pair.on_board(first, second, [first, second, *others, few], grid, 0.05)
+    assert among is not None
+    assert among.n_entries == 8
+    assert alone.pair.times.p < 0.05 < among.adjusted
+    assert among.text.startswith(
+        "on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = "
+    )
+    assert pair.on_board(first, second, [first, second], grid, 0.05) is None
+    assert pair.on_board(first, few, [first, few, *others], grid, 0.05) is None
+
+
+@pytest.mark.parametrize(
+    "order", [("vqc-native qubits=10", "mlp width=16"), ("mlp width=16", "vqc-native qubits=10")]
+)
+def test_published_entries_in_words(order: tuple[str, str]) -> None:
+    compared = api.compare(*order, task="beam6g", published=True, runs="none")
+    assert compared.verdict == (
+        "vqc-native qubits=10 needs 32% fewer steps than mlp width=16 (27% to 37%, 100 seeds each, p < .0001)"
+    )
+    assert compared.among is not None
+    assert compared.among.n_entries == 11
+    values = compared.as_dict()
+    assert values["verdict"] == compared.verdict
+    assert values["board"]["direction"] == ("needs fewer" if order[0].startswith("vqc") else "needs more")
+    assert len(values["times"]["by_threshold"]) == 7
