@@ -520,7 +520,7 @@ def compare_entries(
         first, second = _common_seeds(first, second)
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
-    remarks = [
+    remarks = tables.changed_thresholds([first, second]) + [
         f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
         for entry in (first, second)
         if entry.on_protocol_seeds

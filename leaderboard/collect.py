@@ -397,9 +397,8 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         If the entry's record is damaged, or no seed can be read.
     """
     record = store.record()
-    task_file = current(
-        TaskFile.model_validate(record["task_file"]), record["task_name"], record["task_hash"]
-    )
+    first = TaskFile.model_validate(record["task_file"])
+    task_file = current(first, record["task_name"], record["task_hash"])
     runs, refused = _readable(store, task_file, seeds)
     if not runs:
         if refused:
@@ -447,6 +446,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         plan=record.get("plan"),
         codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
         unprobed=foreign and probes.EQUAL not in found,
+        first_thresholds=first.ranking.grid.thresholds,
         executions=sum(run.executions for run in runs),
         records={
             run.seed: {

@@ -76,6 +76,8 @@ class EntryCurves(Shown):
         Whether code of others has part in it and no probe has shown that its seeds are independent.
     chosen_seeds:
         Why no board ranks it, of a published entry whose seeds may have been chosen; empty otherwise.
+    first_thresholds:
+        The thresholds in force when its first seed was trained; None where the record does not say.
     records:
         By seed, left-out ones too: its finished `epochs`, whether it is `finished`, the core-`hours` and the circuit
         `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
@@ -117,6 +119,7 @@ class EntryCurves(Shown):
     refused: tuple[str, ...] = ()
     unprobed: bool = False
     chosen_seeds: str = ""
+    first_thresholds: tuple[float, ...] | None = None
 
     def reaching(self, epochs: int) -> EntryCurves | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -162,6 +165,12 @@ class EntryCurves(Shown):
             hours=sum(float(record["hours"]) for record in records.values()),
             executions=sum(int(record["executions"]) for record in records.values()),
         )
+
+    @property
+    def changed_thresholds(self) -> bool:
+        """Whether it is judged by other thresholds than those in force when its first seed was trained."""
+        first = self.first_thresholds
+        return first is not None and sorted(first) != sorted(self.task_file.ranking.grid.thresholds)
 
     @property
     def diverged(self) -> tuple[int, ...]:

@@ -241,13 +241,13 @@ def judge_pair(first: EntryCurves, second: EntryCurves, grid: Grid, alpha: float
     OptionError
         If the shorter horizon is not a whole number of epochs for both.
     """
-    sides = [LearningCurves(each.curves, each.steps_per_epoch, each.name) for each in (first, second)]
-    end = common_horizon(*sides)
-    cut = [side.cut(end) for side in sides]
+    one, other = (LearningCurves(each.curves, each.steps_per_epoch, each.name) for each in (first, second))
+    end = common_horizon(one, other)
+    cut = [side.cut(end) for side in (one, other)]
     several = min(side.n_runs for side in cut) > 1
     return PairVerdict(
         labels=_short(first, second),
-        times=times_pair(*sides, grid, alpha),
+        times=times_pair(one, other, grid, alpha),
         thresholds=tuple(f"{threshold:g}" for threshold in grid.thresholds),
         scores=compare_scores({str(k): final_scores(side) for k, side in enumerate(cut)}, alpha)
         if several

@@ -132,6 +132,7 @@ class PublishedEntry:
             tuning=record["tuning"],
             plan=record.get("plan"),
             codes=codes.distinct([codes.read(record, self.folder / "entry.json")]),
+            first_thresholds=self.task_file.ranking.grid.thresholds,
             source="published",
             chosen_seeds=self.chosen_seeds,
             records={

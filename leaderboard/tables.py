@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.across import AcrossBoard
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
     from qrlsuite.leaderboard.costs import CostBoard, CostSection
+    from qrlsuite.leaderboard.curves import EntryCurves
     from qrlsuite.leaderboard.pair import PairVerdict
 
 COLUMNS = (
@@ -127,6 +128,7 @@ def notes(section: Section) -> list[str]:
                 f"{entry.label} ({len(entry.diverged)} of {len(entry.seeds)} seeds)" for entry in diverged
             )
         )
+    lines += changed_thresholds([row.entry for row in section.rows])
     lines += unequal_tuning(section)
     seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
     if seen:
@@ -149,6 +151,12 @@ def notes(section: Section) -> list[str]:
         "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
     )
     return [*lines, "score: median over seeds after the last epoch; hours: core-hours"]
+
+
+def changed_thresholds(entries: Sequence[EntryCurves]) -> list[str]:
+    """Say of which entries the thresholds changed after their first seed: they may have been chosen to flatter."""
+    labels = [entry.label for entry in entries if entry.changed_thresholds]
+    return [f"thresholds changed after the first seed: {', '.join(labels)}"] if labels else []
 
 
 def unequal_tuning(section: Section) -> list[str]:
@@ -440,7 +448,9 @@ SYMBOLS = {
 def pair_table(pair: PairVerdict) -> Table:
     """Return two entries threshold by threshold as a table."""
     columns = pair.columns()
-    result = table(columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=(columns[0], *columns[3:]))
+    result = table(
+        columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=(columns[0], *columns[3:])
+    )
     for row in pair.rows():
         result.add_row(*map(Text, row))
     return result

@@ -382,6 +382,13 @@ class RunDisplay:
             f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
         )
         self.console.print(f"{counted(summary['seeds'], 'seed')} complete{score_text}")
+        if summary["threshold_reached"] is False:
+            self.console.print(
+                f"no seed reached a threshold: the lowest is {summary['lowest_threshold']:.4g}, the best score seen "
+                f"{summary['best_score']:.4g}. Entries that reach none cannot be told apart: train longer "
+                "(--epochs), or lower the thresholds ([ranking] in the task file) before the next entry is trained",
+                soft_wrap=True,
+            )
         if summary["diverged"]:
             self.console.print(
                 f"{summary['diverged']} of them diverged: numbers of their agents are no longer finite. They stay in "

@@ -31,6 +31,7 @@ from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
 from qrlsuite.results.text import duration_range
+from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
 from qrlsuite.training import memory
 
@@ -382,6 +383,7 @@ def summarize(work: Plan) -> dict[str, Any]:
     curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
     runs = [run for run in curves.values() if len(run.scores) >= epochs]
     complete = [run.curve[:epochs] for run in runs]
+    grid = work.entry.task.file.ranking.grid
     return {
         "task": work.entry.task.name,
         "entry": work.entry.name,
@@ -390,6 +392,9 @@ def summarize(work: Plan) -> dict[str, Any]:
         "seeds": len(complete),
         "epochs": epochs,
         "median_score": float(np.median([curve[-1] for curve in complete])) if complete else None,
+        "best_score": float(np.max(complete)) if complete else None,
+        "lowest_threshold": min(grid.thresholds),
+        "threshold_reached": bool(reached(np.stack(complete), grid).any()) if complete else None,
         "diverged": sum(run.diverged is not None and run.diverged <= epochs for run in runs),
     }
 

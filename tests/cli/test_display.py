@@ -144,3 +144,24 @@ def test_what_is_submitted_cannot_be_stopped_by_ctrl_c(entry, tmp_path, capsys, 
     assert ("Ctrl-C saves" in shown) is not submits
     assert ("5 seeds to epoch 3, 2 tasks" in shown) is submits
     assert ("2 seeds wait in the queue" in shown) is submits
+
+
+@pytest.mark.parametrize(("epsilons", "said"), [("[0.6, 0.8]", False), ("[0.0001, 0.0002]", True)])
+def test_the_end_says_that_no_threshold_was_reached(
+    epsilons: str, said: bool, train, tiny_task: str, capsys
+) -> None:
+    path: Path = train("runs", [0, 1, 2])
+    task = Path(tiny_task)
+    lowered = task.read_text().replace("epsilons = [0.6, 0.8]", f"epsilons = {epsilons}")
+    task.write_text(lowered.replace("epsilon = 0.6", f"epsilon = {epsilons[1:].partition(',')[0]}"))
+    entry = resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+    plan = Plan(path.parents[1], entry, EntryStore(path), range(3), 3, groups=PAIR[:1])
+    summary = summarize(plan)
+    assert summary["threshold_reached"] is not said
+    RunDisplay(plan, 1).finished(summary)
+    end = capsys.readouterr().err
+    line = (
+        f"no seed reached a threshold: the lowest is {summary['lowest_threshold']:.4g}, the best score seen "
+        f"{summary['best_score']:.4g}."
+    )
+    assert (line in end) is said

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qrlsuite import api
-from qrlsuite.leaderboard import board, pair
+from qrlsuite.leaderboard import board, pair, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
@@ -139,3 +139,13 @@ def test_published_entries_in_words(order: tuple[str, str]) -> None:
     assert values["verdict"] == compared.verdict
     assert values["board"]["direction"] == ("needs fewer" if order[0].startswith("vqc") else "needs more")
     assert len(values["times"]["by_threshold"]) == 7
+
+
+def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
+    first, second = entry("first", spread(18)), entry("second", spread(38))
+    kept = first.task_file.ranking.grid.thresholds
+    changed, same = replace(first, first_thresholds=(0.9, 0.8)), replace(second, first_thresholds=kept[::-1])
+    said = "thresholds changed after the first seed: first"
+    assert said in board.compare_entries(changed, same).remarks
+    assert said in tables.markdown(boards.of([changed, same]))
+    assert "thresholds changed" not in tables.markdown(boards.of([first, same]))
