@@ -25,6 +25,7 @@ from qrlsuite.statistics import (
     Grid,
     IntervalRule,
     LearningCurves,
+    MaxT,
     PermutationRule,
     SmoothedRuns,
     TimesRule,
@@ -72,22 +73,97 @@ def head(title: str, *columns: str) -> None:
     print("|" + "---|" * len(columns), flush=True)
 
 
-def print_unequal(pairs: int) -> None:
-    """One population in which 15 percent fail, one in which all are later, of the same mean at every tolerance."""
-    head(
-        f"Rule times, equal means, unequal laws, {pairs} pairs",
-        "runs that fail",
-        "other runs",
-        "any difference",
-    )
-    generator = np.random.default_rng(0)
+def unequal_laws(
+    share: float, n_fail: int, n_other: int, pairs: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw pairs of one mean at every tolerance: some runs of the first never learn, all of the second are later."""
     large = draw_times(MODELS[W64], 1000, 100, GRID, generator).reshape(-1, len(EPSILONS))
-    later = np.rint(0.15 * (HORIZON - large.mean(axis=0))).astype(np.int64)
-    for n_fail, n_other in ((20, 20), (50, 50), (100, 100), (20, 100), (100, 20)):
-        ours = draw_times(MODELS[W64], n_fail, pairs, GRID, generator)
-        ours[generator.random(ours.shape[:2]) < 0.15] = HORIZON
-        theirs = draw_times(MODELS[W64], n_other, pairs, GRID, generator) + later
-        line(n_fail, n_other, judge_times(ours, theirs).found)
+    later = np.rint(share * (HORIZON - large.mean(axis=0))).astype(np.int64)
+    ours = draw_times(MODELS[W64], n_fail, pairs, GRID, generator)
+    ours[generator.random(ours.shape[:2]) < share] = HORIZON
+    return ours, draw_times(MODELS[W64], n_other, pairs, GRID, generator) + later
+
+
+def found(ours: np.ndarray, theirs: np.ndarray, skewed: bool) -> float:
+    """Return the share of pairs that are told apart at 5 percent."""
+    test = MaxT(list(zip(ours, theirs)), skewed=skewed)
+    test.extend(10_000)
+    return float((test.p <= 0.05).mean())
+
+
+def print_unequal(pairs: int) -> None:
+    """Both rules; a tenth of the pairs for plans. The last column is the chance that no failing run was seen."""
+    columns = ("runs that fail", "runs of each", "times", "times-skewed", "no failing run among them")
+    head(f"Equal means, unequal laws, {pairs} pairs: any difference", *columns)
+    generator = np.random.default_rng(0)
+    for share in (0.05, 0.1, 0.15, 0.3):
+        for n_runs in SIZES:
+            pair = unequal_laws(share, n_runs, n_runs, pairs, generator)
+            line(
+                f"{share:.0%}", n_runs, *(found(*pair, kind) for kind in (False, True)), (1 - share) ** n_runs
+            )
+    columns = ("runs that may fail", "other runs", "times", "times-skewed")
+    head("The same at unequal numbers, 15% fail", *columns)
+    for n_fail, n_other in ((20, 100), (100, 20)):
+        pair = unequal_laws(0.15, n_fail, n_other, pairs, generator)
+        line(n_fail, n_other, *(found(*pair, kind) for kind in (False, True)))
+    count = max(10, pairs // 2)
+    head(
+        f"The same in plans of two entries, {count} plans", "runs that fail", "looks", "times", "times-skewed"
+    )
+    for share in (0.05, 0.15):
+        drawn = unequal_laws(share, 100, 100, count, generator)
+        for looks in ((20, 40, 60, 80, 100), (40, 60, 80, 100)):
+            plans = (DecisionPlan(("a", "b"), looks, rule=rule) for rule in ("times", "times-skewed"))
+            line(
+                f"{share:.0%}",
+                ", ".join(map(str, looks)),
+                *(play(plan, drawn).any_difference for plan in plans),
+            )
+
+
+def print_skewed(pairs: int) -> None:
+    """What the correction for skewness costs: error between equals, and power."""
+    head(f"Both rules, {pairs} pairs: told apart", "pair", "runs", "times", "times-skewed")
+    generator = np.random.default_rng(11)
+    slow = SmoothedRuns(slower(ENTRIES[W64], 1.1))
+    for name, *models in (
+        ("width 64, equals", MODELS[W64], MODELS[W64]),
+        ("width 16, equals", MODELS[W16], MODELS[W16]),
+        ("10 qubits, equals", MODELS[Q10], MODELS[Q10]),
+        ("width 64, 10% slower", MODELS[W64], slow),
+        ("10 against 8 qubits", MODELS[Q10], MODELS[Q8]),
+        ("width 32 against 10 qubits", MODELS[W32], MODELS[Q10]),
+    ):
+        for n_runs in SIZES:
+            pair = [draw_times(model, n_runs, pairs, GRID, generator) for model in models]
+            line(name, n_runs, *(found(*pair, kind) for kind in (False, True)))
+
+
+def print_replication(pairs: int) -> None:
+    """How much of the published board comes out again with 100 fresh runs per entry, by either rule."""
+    count, generator = max(10, pairs // 10), np.random.default_rng(12)
+    entries = list(ENTRIES.values())
+    now, tiers = times_board(entries, GRID), _tiers(entries)
+    decided = np.argwhere(np.triu(now.adjusted <= 0.05))
+    again, all_again, order, tiering = 0, 0, 0, 0
+    for _ in range(count):
+        fresh = [
+            LearningCurves(np.clip(_mixed(entry, 100, generator), 0, 1), entry.steps_per_epoch, entry.name)
+            for entry in entries
+        ]
+        board = times_board(fresh, GRID)
+        same = [board.directions[i][j] is now.directions[i][j] for i, j in decided]
+        again, all_again = again + np.mean(same), all_again + all(same)
+        order += board.order == now.order
+        tiering += _tiers(fresh) == tiers
+    n_pairs = len(entries) * (len(entries) - 1) // 2
+    columns = ("of the published board", f"comes out again, of {count} replications")
+    head(f"{len(entries)} entries, 100 fresh runs each (published runs mixed with near neighbors)", *columns)
+    line(f"a decision by `times` ({len(decided)} of {n_pairs} pairs)", float(again / count))
+    line("all of these decisions at once", all_again / count)
+    line("the order by mean", order / count)
+    line(f"the {len(tiers)} tiers of the paper's rule", tiering / count)
 
 
 def print_decisions(pairs: int) -> None:
@@ -287,6 +363,8 @@ def print_coverage(pairs: int) -> None:
 
 PARTS: dict[str, Callable[[int], None]] = {
     "unequal": print_unequal,
+    "skewed": print_skewed,
+    "replication": print_replication,
     "equality": print_equality,
     "power": print_power,
     "decisions": print_decisions,

@@ -26,7 +26,7 @@ _PERMUTATION = "qrlsuite.statistics.permutation"
 
 @hookimpl
 def register_significance_tests(register: Callable[[SignificanceTestSpec], None]) -> None:
-    """Register the paper's rule, the bootstrap of the difference, and two permutation tests."""
+    """Register the paper's rule, the bootstrap of the difference, and three permutation tests."""
     register(
         SignificanceTestSpec(
             name=DEFAULT,
@@ -60,6 +60,13 @@ def register_significance_tests(register: Callable[[SignificanceTestSpec], None]
             name="times",
             summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
             factory=f"{_PERMUTATION}:TimesRule",
+        )
+    )
+    register(
+        SignificanceTestSpec(
+            name="times-skewed",
+            summary="the same with a t corrected for skewness: errs less where some runs of one entry fail",
+            factory=f"{_PERMUTATION}:SkewedTimesRule",
         )
     )
 

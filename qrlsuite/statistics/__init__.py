@@ -47,7 +47,7 @@ from qrlsuite.statistics.estimator import (
 from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, final_scores, last_epochs
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.pair import TimesPair, times_pair
-from qrlsuite.statistics.permutation import MaxT, PermutationRule, TimesRule
+from qrlsuite.statistics.permutation import MaxT, PermutationRule, SkewedTimesRule, TimesRule
 from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.sequential import (
@@ -97,6 +97,7 @@ __all__ = [
     "Resampling",
     "ScoreBoard",
     "SignificanceRule",
+    "SkewedTimesRule",
     "SmoothedRuns",
     "Spending",
     "TimesBoard",

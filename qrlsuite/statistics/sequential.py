@@ -34,6 +34,8 @@ from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for
 from qrlsuite.statistics.standings import direction, log_ratios
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
 
+RULES = ("times", "times-skewed")
+"""What may judge the pairs of a plan."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a decision needs p = 1 / 200,001 or so; at levels below that there is none."""
 _POINTS = 1001  # of the numerical integration
@@ -158,6 +160,8 @@ class DecisionPlan:
         Of the relabelings.
     reason:
         Why the first look comes before 20 runs.
+    rule:
+        `times`, or `times-skewed`: with a t that is corrected for skewness.
 
     Raises
     ------
@@ -174,6 +178,7 @@ class DecisionPlan:
     pairs: tuple[tuple[str, str], ...] | None = None
     seed: int = 0
     reason: str = ""
+    rule: str = "times"
 
     def __post_init__(self) -> None:
         if len(self.entries) < 2:
@@ -191,6 +196,8 @@ class DecisionPlan:
                 "occurred yet would decide; begin later, or give a reason"
             )
         check_probability(self.alpha, "alpha")
+        if self.rule not in RULES:
+            raise OptionError(f"rule = '{self.rule}': expected {' or '.join(RULES)}")
         if self.spending not in tuple(Spending):
             known = " or ".join(f"'{each}'" for each in Spending)
             raise OptionError(f"spending = '{self.spending}': expected {known}")
@@ -406,7 +413,7 @@ def next_look(
     for study, index in todo:
         pair = studies[study][index]
         data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
-    test = MaxT(data, plan.blocks[: look + 1], plan.seed)
+    test = MaxT(data, plan.blocks[: look + 1], plan.seed, skewed=plan.rule == "times-skewed")
     test.extend(min(relabelings_for(plan.level(look, len(plan.family))), MOST_RELABELINGS))
     p, p_each = test.p, test.p_each
     result = [list(pairs) for pairs in studies]

@@ -86,7 +86,7 @@ class PlanFile(_PlanTable):
     epochs: Annotated[
         int, Field(ge=1, description="of every seed: the horizon at which entries are compared")
     ]
-    rule: Literal["times"]
+    rule: Literal["times", "times-skewed"]
     epsilons: Annotated[
         list[float] | None,
         Field(min_length=1, description="thresholds 1 - epsilon on a score with maximum 1"),
@@ -366,6 +366,7 @@ class DecisionStudy:
                 file.margin,
                 pairs=pairs or None,
                 reason=file.reason,
+                rule=file.rule,
             )
             self.grid = grid(file.epsilons or file.thresholds or [], [0.5])  # rule `times` needs no delta
         except OptionError as error:

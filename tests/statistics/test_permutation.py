@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import rules
 from qrlsuite.statistics import (
     Evidence,
     Grid,
@@ -29,6 +30,7 @@ from qrlsuite.statistics.permutation import (
     _CellRatios,
     relabelings,
     relabelings_for,
+    skewed_t,
     smallest,
     welch_t,
 )
@@ -261,3 +263,61 @@ def test_a_grid_of_one_cell() -> None:
     grid = Grid.relative([0.1], [0.5])
     pair = [Evidence(each, grid, 30) for each in (entry(0), entry(1))]
     assert PermutationRule()(*pair).tolist() == TimesRule()(*pair).tolist() == [[1]]
+
+
+def test_the_correction_for_skewness_by_hand() -> None:
+    """First: mean 0, variance 0, third 0. Second: 0, 0, 3 have mean 1, variance of the mean 1, third cumulant 2 / 9."""
+    first, second = np.array([[0], [0], [0]]), np.array([[0], [0], [3]])
+    # mean cube of the deviations -1, -1, 2 is 2; over n^2 = 9, and variance 3 / 3 = 1; t = 1
+    skewness = 2 / 9
+    expected = 1 + skewness * 3 / 6 + skewness**2 / 27
+    assert skewed_t(first, second) == pytest.approx([expected])
+    assert skewed_t(second, first) == pytest.approx([-expected])
+
+
+def test_the_corrected_t_is_counted_over_all_relabelings() -> None:
+    generator = np.random.default_rng(0)
+    for sizes in ((4, 4), (3, 5)):
+        first, second = (generator.integers(0, 9, (size, 2)) ** 2 for size in sizes)
+        test = MaxT([(first, second)], skewed=True)
+        test.extend(50_000)
+        pooled = np.concatenate([first, second])
+        maxima = []
+        for chosen in combinations(range(8), sizes[0]):
+            mask = np.isin(np.arange(8), chosen)
+            maxima.append(np.abs(skewed_t(pooled[mask], pooled[~mask])).max())
+        exact = [np.mean(np.array(maxima) >= abs(t) * (1 - 1e-9)) for t in skewed_t(first, second)]
+        assert test.p_each[0] == pytest.approx(exact, abs=0.01)
+
+
+def test_the_corrected_t_survives_what_does_not_vary_and_has_a_swapped_pair_s_p() -> None:
+    same, other = np.full((20, 1), 2000), np.full((20, 1), 4000)
+    assert skewed_t(same, same).tolist() == [0]
+    assert skewed_t(same, other).tolist() == [np.inf]
+    generator = np.random.default_rng(1)
+    pair = generator.integers(0, 50, (25, 3)) * 2000, generator.integers(5, 60, (25, 3)) * 2000
+    tests = [MaxT([each], skewed=True) for each in (pair, pair[::-1], (same, other))]
+    for test in tests:
+        test.extend(10_000)
+    assert tests[0].p == tests[1].p
+    assert tests[2].p[0] < 1e-3
+
+
+def test_the_skewed_rule_errs_less_where_runs_of_one_entry_fail() -> None:
+    """15 percent of one entry's runs fail, all of the other's are later, at equal means: 300 pairs of 20 runs."""
+    generator = np.random.default_rng(2)
+    ours = generator.integers(20, 41, (300, 20, 1))
+    ours[generator.random((300, 20)) < 0.15] = 100
+    theirs = generator.integers(20, 41, (300, 20, 1)) * 1000 + 70 * 150
+    plain, skewed = (MaxT(list(zip(ours * 1000, theirs)), skewed=kind) for kind in (False, True))
+    rates = []
+    for test in (plain, skewed):
+        test.extend(10_000)
+        rates.append(float((test.p <= 0.05).mean()))
+    assert rates[0] > 0.07 > rates[1]
+
+
+def test_the_skewed_rule_is_registered_and_judges() -> None:
+    rule = rules.load("times-skewed")
+    assert rule.name == "times-skewed"
+    assert (np.asarray(rule(*(Evidence(each, SURFACE, 30) for each in (entry(0), entry(1))))) > 0).all()

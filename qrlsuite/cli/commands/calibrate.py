@@ -38,7 +38,7 @@ def calibrate(
     ] = None,
     rule: Annotated[
         list[str] | None,
-        typer.Option("--rule", metavar="NAME", help="The rules; by default the four built-in ones."),
+        typer.Option("--rule", metavar="NAME", help="The rules; by default four built-in ones."),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="The task, if the folder holds several.")] = None,
     draws: Annotated[
