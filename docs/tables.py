@@ -62,13 +62,13 @@ def verdicts(outcome: DecisionOutcome, questions: int | None) -> Rows:
         yield f"**{question}**", "", "", "", ""
         for pair in pairs:
             seeds = str(pair.n_runs) if pair.n_runs else ""
-            yield versus(pair), pair.verdict, seeds, *difference_text(pair)
+            yield versus(pair), pair.verdict, seeds, *difference_text(pair, outcome.study.grid)
 
 
 def entries(outcome: DecisionOutcome, questions: int | None) -> Rows:
     """Mean times and costs of the entries that a look has reached."""
     assert isinstance(outcome.study, PublishedDecision)
-    yield "entry", "seeds", "M (95%)", "core-hours", "circuits per seed"
+    yield "entry", "seeds", "steps below threshold (95%)", "core-hours", "circuits per seed"
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
             low, high = map(steps_text, entry["mean_time_interval"])

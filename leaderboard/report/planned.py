@@ -99,8 +99,8 @@ def view(outcome: DecisionOutcome) -> PlanView:
             pair=clean(versus(pair)),
             verdict=clean(pair.verdict),
             seeds=pair.n_runs,
-            difference=difference_text(pair)[0].replace("-", "−"),
-            interval=difference_text(pair)[1].replace("-", "−"),
+            difference=difference_text(pair, study.grid)[0].replace("-", "−"),
+            interval=difference_text(pair, study.grid)[1].replace("-", "−"),
             needs=needs_text(study, facts["needs"]).replace("<=", "≤"),
         )
         for index, (pair, facts) in enumerate(zip(outcome.pairs, plain["pairs"]))

@@ -271,6 +271,10 @@ class PairDecision:
         Whether the difference is significantly smaller than the margin, either way.
     margin:
         As in the plan.
+    leading:
+        Number of the threshold with the largest |t| at the last look, which gave the pair its p.
+    leading_difference, leading_interval:
+        As `difference`, at this threshold alone; the interval is at the level that p was compared with last.
     """
 
     first: str
@@ -283,6 +287,9 @@ class PairDecision:
     interval: tuple[float, float] = (-1.0, math.inf)
     within_margin: bool = False
     margin: float = 0.10
+    leading: int = 0
+    leading_difference: float = math.nan
+    leading_interval: tuple[float, float] = (-1.0, math.inf)
 
     @property
     def differs(self) -> bool:
@@ -423,33 +430,59 @@ def next_look(
         rows.setdefault(study, {})[index] = row
     for study, of_study in rows.items():
         _reject(plan, look, result[study], of_study, test.t, p_each)
+        for index, row in of_study.items():
+            result[study][index] = _led(result[study][index], data[row], test.t[row])
         _close(plan, look, result[study])
     return result
 
 
 def _looked(
-    plan: DecisionPlan, look: int, pair: PairDecision, data: tuple[IntArray, IntArray], p: float
+    plan: DecisionPlan,
+    look: int,
+    pair: PairDecision,
+    data: tuple[IntArray, IntArray],
+    p: float,
 ) -> PairDecision:
     """Return a pair with its p, difference, interval and test of equality at a look."""
-    ratios, errors, freedoms = log_ratios(data)
-    ratio, error, freedom = float(ratios[1, 0]), float(errors[1, 0]), float(freedoms[1, 0])
-    interval = (-1.0, math.inf)
+    level = plan.level(look, len(plan.family))
+    difference, interval = _repeated(data, level)
+    equal_level = plan.equal_level(look)
     within = False
-    if math.isfinite(ratio):
-        reach = error * float(student_quantile(1 - plan.level(look, len(plan.family)) / 2, freedom))
-        interval = (math.expm1(ratio - reach), math.expm1(ratio + reach))
-        level = plan.equal_level(look)
-        if level is not None:
-            reach = error * float(student_quantile(1 - level, freedom))
-            within = abs(ratio) + reach < math.log1p(plan.margin)
+    if math.isfinite(difference) and equal_level is not None:
+        ratio, error, freedom = _log_ratio(data)
+        reach = error * float(student_quantile(1 - equal_level, freedom))
+        within = abs(ratio) + reach < math.log1p(plan.margin)
     return replace(
         pair,
         n_runs=plan.looks[look],
         p=(*pair.p, p),
-        difference=math.expm1(ratio),
+        difference=difference,
         interval=interval,
         within_margin=within,
     )
+
+
+def _led(pair: PairDecision, data: tuple[IntArray, IntArray], t: FloatArray) -> PairDecision:
+    """Return a pair with the threshold that gave it its p, and what the difference is there."""
+    leading = int(np.abs(t).argmax())
+    first, second = (each[:, [leading]] for each in data)
+    difference, interval = _repeated((first, second), pair.levels[-1])
+    return replace(pair, leading=leading, leading_difference=difference, leading_interval=interval)
+
+
+def _log_ratio(data: Sequence[IntArray]) -> tuple[float, float, float]:
+    """Return log(mean of the second / mean of the first), its standard error and degrees of freedom."""
+    ratio, error, freedom = (float(matrix[1, 0]) for matrix in log_ratios(data))
+    return ratio, error, freedom
+
+
+def _repeated(data: Sequence[IntArray], level: float) -> tuple[float, tuple[float, float]]:
+    """Return the second's mean over the first's, minus 1, and its interval at level 1 - `level`."""
+    ratio, error, freedom = _log_ratio(data)
+    if not math.isfinite(ratio):
+        return math.expm1(ratio), (-1.0, math.inf)
+    reach = error * float(student_quantile(1 - level / 2, freedom))
+    return math.expm1(ratio), (math.expm1(ratio - reach), math.expm1(ratio + reach))
 
 
 def _reject(

@@ -21,8 +21,9 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
 from qrlsuite.results.text import counted, hours_range, hours_text, steps_text
+from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
-from qrlsuite.statistics.sequential import Decision, PairDecision
+from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
 from qrlsuite.studies import decisions
 from qrlsuite.studies.decisions import DecisionStudy
@@ -101,7 +102,7 @@ class DecisionOutcome(Shown):
             "looks_taken": study.taken,
             "reason": study.file.reason or None,
             "pairs": [
-                {"question": asked or None, **_pair_as_dict(decision, pair)}
+                {"question": asked or None, **_pair_as_dict(study, decision, pair)}
                 for asked, pairs in by_question(study, decision.pairs)
                 for pair in pairs
             ],
@@ -140,14 +141,14 @@ class DecisionOutcome(Shown):
             yield _table(study, pairs)
         if any(pair.p for pair in decision.pairs):
             yield Text(
-                "B against A: how much longer B is below the thresholds, with a repeated confidence interval that "
-                f"holds at every look ({100 * (1 - study.file.alpha):g} percent for all pairs together). An early stop "
-                "overstates the difference."
+                "B against A: how many more steps B needs, on average over the thresholds (+52% = B is slower), with "
+                f"a repeated confidence interval that holds at every look ({100 * (1 - study.file.alpha):g} percent "
+                "for all pairs together). Each threshold is tested separately: where this interval contains 0, the "
+                "threshold that decided follows with its own. An early stop overstates the difference."
             )
             yield _entries_table(facts["entries"])
             yield Text(
-                "M (95%): environment steps that a run of the entry spends below threshold, mean over seeds and the "
-                "task's thresholds, at its last look"
+                "steps below threshold: of a run of the entry, mean over seeds and thresholds, at its last look"
             )
         if study.begun_at:
             yield Text(f"first seed begun {study.begun_at}")
@@ -311,11 +312,25 @@ def percent(value: float) -> str:
     return f"{100 * value:+.0f}%" if abs(value) < 100 else ("+inf" if value > 0 else "-100%")
 
 
-def difference_text(pair: PairDecision) -> tuple[str, str]:
-    """Return a pair's difference and its interval as text; empty where there is none."""
+def difference_text(pair: PairDecision, grid: Grid) -> tuple[str, str]:
+    """Return a pair's difference and its interval as text; empty where there is none.
+
+    Where a pair was found to differ and the interval of the mean contains 0, the threshold that decided follows with
+    the difference there and its own interval.
+    """
     if not _finite(pair):
         return "", ""
-    return percent(pair.difference), f"{percent(pair.interval[0])} to {percent(pair.interval[1])}"
+    low, high = pair.interval
+    return percent(pair.difference), f"{percent(low)} to {percent(high)}" + _leading_text(pair, grid)
+
+
+def _leading_text(pair: PairDecision, grid: Grid) -> str:
+    low, high = pair.interval
+    one_sided = pair.decided in (Decided.FIRST, Decided.SECOND)
+    if not (one_sided and low <= 0 <= high and math.isfinite(pair.leading_difference)):
+        return ""
+    ends = " to ".join(map(percent, pair.leading_interval))
+    return f"; at {grid.thresholds[pair.leading]:g}: {percent(pair.leading_difference)}, {ends}"
 
 
 def needs_text(study: DecisionStudy, needs: Mapping[str, Any] | None) -> str:
@@ -339,7 +354,11 @@ def _finite(pair: PairDecision) -> bool:
     return bool(pair.p) and all(math.isfinite(end) for end in (pair.difference, *pair.interval))
 
 
-def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pair_as_dict(study: DecisionStudy, decision: Decision, pair: PairDecision) -> dict[str, Any]:
     plan = decision.plan
     needs = None
     if pair.decided is None:
@@ -361,6 +380,9 @@ def _pair_as_dict(decision: Decision, pair: PairDecision) -> dict[str, Any]:
         "levels": list(pair.levels),
         "difference": pair.difference if finite else None,
         "interval": list(pair.interval) if finite else None,
+        "leading_threshold": study.grid.thresholds[pair.leading] if finite else None,
+        "leading_difference": _number(pair.leading_difference) if finite else None,
+        "leading_interval": [_number(end) for end in pair.leading_interval] if finite else None,
         "needs": needs,
     }
 
@@ -374,7 +396,7 @@ def _table(study: DecisionStudy, pairs: Sequence[tuple[PairDecision, Mapping[str
             versus(pair),
             pair.verdict,
             str(pair.n_runs),
-            *difference_text(pair),
+            *difference_text(pair, study.grid),
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(study, facts["needs"]),
         )
@@ -384,7 +406,7 @@ def _table(study: DecisionStudy, pairs: Sequence[tuple[PairDecision, Mapping[str
 
 def _entries_table(entries: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in ("entry", "seeds", "M (95%)", "core-hours"):
+    for column in ("entry", "seeds", "steps below threshold (95%)", "core-hours"):
         table.add_column(column, overflow="fold")
     for facts in entries:
         time = ""
