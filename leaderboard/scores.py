@@ -1,0 +1,195 @@
+"""A task's entries by how well they do: by their final scores, or by the area under their learning curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.results.text import steps_text
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    LearningCurves,
+    ScoreBoard,
+    areas,
+    compare_scores,
+    final_scores,
+    last_epochs,
+    rank_ranges,
+)
+
+OF_RUNS = {"score": final_scores, "area": areas}
+"""What may rank entries: a number of each run, more is better."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreRanking:
+    """The result of `rank_by_score`.
+
+    Attributes
+    ----------
+    task, horizon, by, alpha:
+        The task, the environment steps at which all are cut, `score` or `area`, and the error for all pairs together.
+    entries:
+        The ranked ones, in the order of `results`.
+    results:
+        All statistics.
+    n_last:
+        Epochs that a final score is the mean of.
+    unranked:
+        Labels of the entries with fewer than 20 seeds.
+    """
+
+    task: str
+    horizon: int
+    by: str
+    alpha: float
+    entries: tuple[EntryCurves, ...]
+    results: ScoreBoard
+    n_last: int
+    unranked: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """What is ranked."""
+        what = "final score" if self.by == "score" else "area under the learning curve"
+        return f"{self.task}, {steps_text(self.horizon)} steps, by {what}"
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Indices of the entries by mean, most first."""
+        return self.results.order
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the heads of the table that `cells` fills."""
+        level = f"{100 * (1 - self.alpha):g}%"
+        return (
+            "rank",
+            "entry",
+            "seeds",
+            f"mean ({level})",
+            f"IQM ({level})",
+            "below the first",
+            "P(more than next)",
+        )
+
+    def cells(self, place: int) -> tuple[str, ...]:
+        """Return the row at a place of the order as text."""
+        index, results = self.order[place], self.results
+        first, after = self.order[0], self.order[place + 1 : place + 2]
+        best, worst = self.ranks[index]
+        low, high = results.difference_interval[first, index]
+        return (
+            str(best) if best == worst else f"{best}-{worst}",
+            self.entries[index].label,
+            str(len(self.entries[index].seeds)),
+            _interval(results.mean[index], *results.mean_interval[index]),
+            _interval(results.interquartile_mean[index], *results.interquartile_interval[index]),
+            _interval(results.difference[first, index], low, high) if place else "-",
+            f"{results.improvement[index, after[0]]:.2f}" if after else "-",
+        )
+
+    @property
+    def ranks(self) -> list[tuple[int, int]]:
+        """Best and worst rank of each entry that the significant pairs leave."""
+        return [(best, worst) for best, worst in rank_ranges(self.results.better == 1).tolist()]
+
+    def notes(self) -> list[str]:
+        """Explain the columns."""
+        size, better = len(self.entries), self.results.better
+        what = (
+            f"final score: mean over the last tenth of the epochs ({self.n_last}): one validation alone is noisy"
+            if self.by == "score"
+            else "area: mean score over all epochs"
+        )
+        lines = [
+            what,
+            f"rank: what the significant pairs leave ({int((better == 1).sum())} of {size * (size - 1) // 2}: "
+            f"permutation test, Holm, error {self.alpha:g} for all pairs together)",
+            "IQM: mean of the middle half of the seeds; intervals: bootstrap of the seeds, of each entry by itself",
+            "P: probability that a seed scores more than one of the next entry, ties one half",
+        ]
+        return [
+            *lines,
+            *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
+        order, results = list(self.order), self.results
+        square = np.ix_(order, order)
+        return {
+            "task": self.task,
+            "horizon": self.horizon,
+            "by": self.by,
+            "last_epochs": self.n_last if self.by == "score" else None,
+            "alpha": self.alpha,
+            "entries": [
+                {
+                    "entry": self.entries[index].name,
+                    "label": self.entries[index].label,
+                    "seeds": len(self.entries[index].seeds),
+                    "ranks": list(self.ranks[index]),
+                    "mean": float(results.mean[index]),
+                    "mean_interval": results.mean_interval[index].tolist(),
+                    "interquartile_mean": float(results.interquartile_mean[index]),
+                    "interquartile_interval": results.interquartile_interval[index].tolist(),
+                }
+                for index in order
+            ],
+            "improvement": results.improvement[square].tolist(),
+            "difference": results.difference[square].tolist(),
+            "adjusted_p": [
+                [None if math.isnan(p) else float(p) for p in row] for row in results.adjusted[square]
+            ],
+            "better": results.better[square].tolist(),
+            "unranked": list(self.unranked),
+        }
+
+
+def rank_by_score(
+    entries: Sequence[EntryCurves], horizon: int, by: str = "score", alpha: float = 0.05
+) -> ScoreRanking:
+    """Rank the entries of one task at one horizon by their scores, more is better.
+
+    Parameters
+    ----------
+    entries:
+        All of one task, all reaching the horizon.
+    horizon:
+        Environment steps at which all are cut.
+    by:
+        `score`, the mean over the last tenth of the epochs, or `area`, the mean over all.
+    alpha:
+        In (0, 1): probability of any false difference among entries of equal laws.
+
+    Raises
+    ------
+    OptionError
+        If `by` is neither, no entry has 20 seeds, or the horizon is not a whole number of epochs.
+    """
+    if by not in OF_RUNS:
+        raise OptionError(f"--by {by}: expected {' or '.join(OF_RUNS)}")
+    ranked = tuple(entry for entry in entries if len(entry.seeds) >= MIN_RUNS)
+    if not ranked:
+        raise OptionError(f"--by {by}: no entry has {MIN_RUNS} seeds")
+    curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label).cut(horizon) for each in ranked]
+    return ScoreRanking(
+        task=ranked[0].task,
+        horizon=horizon,
+        by=by,
+        alpha=alpha,
+        entries=ranked,
+        results=compare_scores({str(k): OF_RUNS[by](each) for k, each in enumerate(curves)}, alpha),
+        n_last=last_epochs(curves[0].values.shape[1]),
+        unranked=tuple(entry.label for entry in entries if len(entry.seeds) < MIN_RUNS),
+    )
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    return f"{value:.4g} ({low:.4g} to {high:.4g})"
