@@ -288,12 +288,13 @@ def on_board(
         reached = entry.reaching(end // entry.steps_per_epoch)
         if reached is not None and len(reached.seeds) >= MIN_RUNS:
             ranked.append(reached)
-    folders = [entry.folder for entry in ranked]
-    if len(ranked) < 3 or first.folder not in folders or second.folder not in folders:
+    names = [(entry.folder, entry.name) for entry in ranked]
+    pair = (first.folder, first.name), (second.folder, second.name)
+    if len(ranked) < 3 or not set(pair) <= set(names):
         return None
     curves = [LearningCurves(each.curves, each.steps_per_epoch, str(k)) for k, each in enumerate(ranked)]
     board = times_board(curves, grid, alpha, end)
-    i, j = folders.index(first.folder), folders.index(second.folder)
+    i, j = map(names.index, pair)
     return OnBoard(len(ranked), float(board.adjusted[i, j]), board.directions[i][j])
 
 
