@@ -169,7 +169,9 @@ def reduced(name: str, folder: Path) -> str:
     def written(match: re.Match[str]) -> str:
         content = task.load(match[1]).file.model_dump(mode="json", exclude_none=True)
         for key, value in REDUCED.items():
-            (table,) = (part for part in (content["protocol"], content["environment"]["options"]) if key in part)
+            (table,) = (
+                part for part in (content["protocol"], content["environment"]["options"]) if key in part
+            )
             table[key] = value
         (folder / f"{match[1]}.toml").write_text(tomli_w.dumps(content))
         return f'"{folder / match[1]}.toml"'
