@@ -20,6 +20,7 @@ from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import MIN_RUNS, AcrossTasks, across_tasks, horizon_shares, rliable_arrays
@@ -90,6 +91,12 @@ class AcrossBoard:
             "needs less than",
             "needs more than",
         )
+
+    def sheet(self, explain: bool = False) -> Sheet:
+        """Return the comparison as a table; `explain` adds all its notes."""
+        rows = [self.cells(place) for place in range(len(self.order))]
+        words = ("entry", "needs less than", "needs more than")
+        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, "across", explain)
 
     def cells(self, place: int) -> tuple[str, ...]:
         """Return the row at a place of the order as text."""

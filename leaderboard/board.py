@@ -6,8 +6,9 @@ a provisional section of their own length.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
-from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.leaderboard.rules import DEFAULT, TIMES
+from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
@@ -139,16 +141,18 @@ class Section:
     pairs: Board
     """The verdicts of all pairs, cell by cell."""
     times: TimeRanking
-    """The same entries by mean time below threshold."""
+    """The same entries by steps below threshold, which ranks them."""
     rule: str = DEFAULT
     """Name of the significance rule that the tiers rest on."""
     promise: str = ""
     """What that rule controls."""
+    by_tiers: bool = False
+    """Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it."""
 
 
 @dataclass(frozen=True, repr=False)
 class Leaderboard(Shown):
-    """All sections, and what was refused and why. It shows itself as two tables per section."""
+    """All sections, and what was refused and why. It shows itself as a table per task."""
 
     sections: tuple[Section, ...]
     refused: tuple[str, ...]
@@ -172,15 +176,19 @@ class Leaderboard(Shown):
         """Return the board as plain values, for JSON."""
         return as_dict(self)
 
+    def sheets(self, explain: bool = False, pairs: bool = False) -> list[Sheet]:
+        """Return a table per task; `explain` adds what its columns and marks mean, `pairs` the matrix of pairs."""
+        return tables.sheets(self.sections, explain, pairs)
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for section in self.sections:
-            yield tables.section_table(section, options.max_width)
-            yield tables.times_table(section, options.max_width)
+        yield from self.sheets()
         for line in self.refused:
             yield Text(f"left out: {line}")
 
     def _repr_html_(self) -> str:
-        return tables.board_html(self)
+        parts = [sheet.html() for sheet in self.sheets()]
+        parts += [f"<p>left out: {escape(line)}</p>" for line in self.refused]
+        return "\n".join(parts) or "<p>no entries</p>"
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -277,6 +285,7 @@ def build(
     rule: SignificanceRule | None = None,
     horizon: int | None = None,
     alpha: float = ALPHA,
+    shown: Callable[[EntryCurves], bool] | None = None,
 ) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
@@ -290,12 +299,14 @@ def build(
     refused:
         Lines about what could not be read, passed on.
     rule:
-        What counts as significant, see `qrlsuite.leaderboard.rules.load`; None means each task's own, the paper's
-        where it names none.
+        By which tiers are judged, see `qrlsuite.leaderboard.rules.load`; None means each task's own, the paper's
+        where it names none. Tables show tiers where a rule other than `times` is given or named.
     horizon:
         Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
     alpha:
-        Error probability of the ranking by mean time, see `qrlsuite.leaderboard.times.rank_by_time`.
+        Error probability of the whole board, see `qrlsuite.leaderboard.times.rank_by_time`.
+    shown:
+        Which entries have a row. All are compared: what is shown changes no verdict. None means all.
 
     Raises
     ------
@@ -311,9 +322,13 @@ def build(
     for task in sorted({entry.task for entry in ranked}):
         good = [entry for entry in ranked if entry.task == task]
         for steps, provisional, group in _by_horizon(good, horizon):
+            if shown is not None and not any(map(shown, group)):
+                continue
             try:
                 chosen = rule or rule_of(group)
-                sections.append(_section(task, steps, provisional, group, chosen, alpha))
+                named = rule is not None or ranking_of(group).rule is not None
+                section = _section(task, steps, provisional, group, chosen, alpha, shown)
+                sections.append(replace(section, by_tiers=named and chosen.name != TIMES))
             except PluginError:
                 raise
             except QrlSuiteError as error:
@@ -388,6 +403,7 @@ def _section(
     entries: Sequence[EntryCurves],
     rule: SignificanceRule,
     alpha: float,
+    shown: Callable[[EntryCurves], bool] | None,
 ) -> Section:
     ranking = ranking_of(entries)
     if getattr(rule, "paired", False):
@@ -401,6 +417,8 @@ def _section(
     capped = {place.name for place in places.not_reached}
     for place in places.entries:
         entry = by_name[place.name]
+        if shown is not None and not shown(entry):
+            continue
         values = entry.curves[:, : horizon // entry.steps_per_epoch]
         rows.append(
             Row(
@@ -426,7 +444,7 @@ def _section(
         cell=cell_text(ranking),
         rows=tuple(rows),
         pairs=board,
-        times=rank_by_time(entries, ranking.grid, horizon, alpha),
+        times=rank_by_time(entries, ranking.grid, horizon, alpha, shown),
         rule=rule.name,
         promise=rule.promise,
     )

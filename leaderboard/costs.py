@@ -21,9 +21,10 @@ from rich.text import Text
 
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed, nearest
-from qrlsuite.leaderboard import collect, tables
+from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_one_definition, ranking_of
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
@@ -193,7 +194,7 @@ class CostSection:
     def title(self) -> str:
         """What is compared."""
         within = f", within {self.unit.text(self.budget)}" if self.compared is not None else ""
-        return f"{self.task} by {self.unit.name}{within}, S_hat at {self.cell}"
+        return f"{self.task} by {self.unit.name}{within}, sample complexity at {self.cell}"
 
     @property
     def level(self) -> str:
@@ -202,8 +203,16 @@ class CostSection:
 
     def columns(self) -> tuple[str, ...]:
         """Return the heads of the table that `cells` fills."""
-        names = ("rank", "entry", "seeds", "shots", "per step", "S_hat (5%-95%)", f"M ({self.level})")
-        return (*names, "at cap", "needs less than", "needs more than")
+        below = f"{self.unit.name} below threshold ({self.level})"
+        names = ("rank", "entry", below, "per step", "sample complexity (5%-95%)", "at cap", "shots", "seeds")
+        return (*names, "needs less than", "needs more than")
+
+    def sheet(self, explain: bool = False) -> Sheet:
+        """Return the section as a table; `explain` adds all its notes."""
+        rows = [self.cells(row) for row in self.rows]
+        words = ("entry", "needs less than", "needs more than")
+        label = f"{self.task}-{self.unit.name}"
+        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, label, explain)
 
     def cells(self, row: CostRow) -> tuple[str, ...]:
         """Return a row as text."""
@@ -212,12 +221,12 @@ class CostSection:
         return (
             self.rank_text(row),
             row.entry.label,
-            f"{len(row.entry.seeds)}",
-            f"{shots:,}" if shots else "exact" if row.entry.has_circuit else "-",
+            "-" if mean is None else self._mean_text(mean),
             ("~" * self.marked(row)) + self.unit.step_text(row.price.per_step) if self.priced(row) else "-",
             ("~" * self.marked(row)) + self._complexity_text(row) if self.priced(row) else "-",
-            "-" if mean is None else self._mean_text(mean),
             "-" if mean is None else f"{mean.at_cap.mean():.0%}",
+            f"{shots:,}" if shots else "exact" if row.entry.has_circuit else "-",
+            f"{len(row.entry.seeds)}",
             ", ".join(self.against(row, Direction.FEWER)) or "-",
             ", ".join(self.against(row, Direction.MORE)) or "-",
         )
@@ -272,27 +281,26 @@ class CostSection:
 
     def notes(self) -> list[str]:
         """Explain the columns, and the marks that occur."""
-        lines = [self.unit.meaning]
-        lines.append(
-            "per step: what the entry's seeds took in all, divided by all their environment steps; S_hat and M: of one "
-            "run; S_hat: over all its epochs"
-        )
+        lines = []
         if self.compared is not None:
             lines.append(
-                f"M: what a run spends below threshold, mean over seeds and the task's thresholds, within "
-                f"{self.unit.text(self.budget)} {self.unit.name}, which is what the cheapest spent in all; a run that "
-                "does not get there within it counts with all of it (at cap)"
+                f"rank: by significant outperformance, within {self.unit.text(self.budget)} {self.unit.name}, which is "
+                f"what the cheapest spent in all; error {self.alpha:g} for all pairs together"
             )
-            lines.append(
-                f"rank: what the decided pairs leave (rule 'times', Holm over all pairs, error {self.alpha:g})"
-            )
-            if not self.exact:
-                lines.append(f"curves are read at {CELLS} equal parts of the budget")
         by_problem: dict[str, list[str]] = {}
         for row in self.rows:
             if row.price.problem:
                 by_problem.setdefault(row.price.problem, []).append(row.entry.label)
         lines += [f"not ranked: {', '.join(labels)}: {problem}" for problem, labels in by_problem.items()]
+        lines += [
+            self.unit.meaning,
+            "per step: what the entry's seeds took in all, divided by all their environment steps; the others: of one "
+            "run; sample complexity: over all its epochs",
+            "below threshold: mean over seeds and thresholds; a run that does not get there counts with all of the "
+            "budget (at cap)",
+        ]
+        if self.compared is not None and not self.exact:
+            lines.append(f"curves are read at {CELLS} equal parts of the budget")
         if any(self.marked(row) for row in self.rows):
             lines.append("~ : not to be compared with the others")
         shots = {
@@ -307,7 +315,7 @@ class CostSection:
             for row in uneven
         ]
         if any(row.complexity.unsettled for row in self.rows if self.priced(row)):
-            lines.append(">= : still below delta at the last epoch; S_hat is at least this")
+            lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
         if any(row.index is not None and len(row.entry.seeds) < MIN_RUNS for row in self.rows):
             lines.append(TOO_FEW)
         return lines
@@ -355,7 +363,7 @@ class CostBoard(Shown):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for section in self.sections:
-            yield tables.cost_table(section)
+            yield section.sheet()
         for line in self.refused:
             yield Text(f"left out: {line}")
 

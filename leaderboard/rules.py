@@ -19,6 +19,10 @@ from qrlsuite.statistics.significance import check_signs
 
 DEFAULT = "intervals"
 """The paper's rule."""
+PAPER = "paper"
+"""Another name for it."""
+TIMES = "times"
+"""The rule by which boards rank, with Holm's correction over all pairs of a board."""
 
 _HERE = "qrlsuite.statistics.significance"
 _PERMUTATION = "qrlsuite.statistics.permutation"
@@ -30,7 +34,7 @@ def register_significance_tests(register: Callable[[SignificanceTestSpec], None]
     register(
         SignificanceTestSpec(
             name=DEFAULT,
-            summary="the paper's: 5th to 95th percentile intervals do not overlap; per cell (default)",
+            summary="the paper's (`--rule paper`): 5th to 95th percentile intervals do not overlap; per cell",
             factory=f"{_HERE}:IntervalRule",
         )
     )
@@ -57,7 +61,7 @@ def register_significance_tests(register: Callable[[SignificanceTestSpec], None]
     )
     register(
         SignificanceTestSpec(
-            name="times",
+            name=TIMES,
             summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
             factory=f"{_PERMUTATION}:TimesRule",
         )
@@ -72,7 +76,7 @@ def register_significance_tests(register: Callable[[SignificanceTestSpec], None]
 
 
 def load(name: str = DEFAULT) -> SignificanceRule:
-    """Return a registered rule, ready to judge.
+    """Return a registered rule, ready to judge; `paper` is the paper's.
 
     Raises
     ------
@@ -82,6 +86,7 @@ def load(name: str = DEFAULT) -> SignificanceRule:
         If a plugin's factory raises, or what it returns lacks what a rule must have; the message names the
         distribution. The rule's later answers are checked in the same way.
     """
+    name = DEFAULT if name == PAPER else name
     registered = registry.load().get("significance_tests", name)
     spec = cast(SignificanceTestSpec, registered.spec)
     origin = f"significance test '{name}' of distribution '{registered.distribution}'"

@@ -1,71 +1,222 @@
-"""Boards and comparisons as text: tables for a terminal and a notebook, Markdown, CSV."""
+"""Boards as sheets, and comparisons as tables for a terminal and a notebook."""
 
 from __future__ import annotations
 
-import csv
-import io
-import re
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.engine.terminal import printable
 from qrlsuite.leaderboard.absent import absent
-from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import Comparison
+from qrlsuite.leaderboard.sheet import Column, Sheet
+from qrlsuite.leaderboard.times import p_text, percent
+from qrlsuite.results.text import counted, hours_text, steps_text
+from qrlsuite.statistics import Comparison, Direction
+from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
-    from qrlsuite.leaderboard.across import AcrossBoard
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
-    from qrlsuite.leaderboard.costs import CostBoard, CostSection
     from qrlsuite.leaderboard.curves import EntryCurves
     from qrlsuite.leaderboard.pair import PairVerdict
 
-COLUMNS = (
-    "tier",
-    "rests on",
-    "entry",
-    "parameters",
-    "settings",
-    "seeds",
-    "S_hat (5%-95%)",
-    "score",
-    "cells +/-",
-    "outperforms",
-    "outperformed by",
-    "hours",
-)
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
 """What a spreadsheet shows of the win that a tier rests on."""
-NUMERIC = {"rests on", "parameters", "seeds", "score", "cells +/-", "hours"}
-WIDE = 165
-"""Characters per line in which the whole table can be read."""
-LEFT_OUT = ((105, ("outperforms", "outperformed by")), (0, ("parameters", "settings", "cells +/-", "hours")))
-"""What a narrower one leaves out: the first where it has so many columns, else the second too."""
+MARKS = {
+    "†": "settings chosen after seeing runs on protocol seeds, which may flatter",
+    "*": "fewer than the protocol's {protocol} seeds",
+    "!": "fewer than 50 seeds against another number: errors are likelier",
+    ">=": "lower bound",
+}
 
 
-def cells(section: Section, row: Row) -> tuple[str, ...]:
-    """Return an entry's cells, one per column of `COLUMNS`."""
-    entry = row.entry
+def sheets(sections: Sequence[Section], explain: bool = False, pairs: bool = False) -> list[Sheet]:
+    """Return a table per task, at the horizon that most of its entries reach; the others have a line below it.
+
+    With `pairs` the matrix of all pairs follows each.
+    """
+    made = []
+    for task in dict.fromkeys(section.task for section in sections):
+        of_task = [section for section in sections if section.task == task]
+        main = main_section(of_task)
+        made.append(replace(sheet(main, explain), lines=tuple(_elsewhere(main, of_task))))
+        made += [pairs_sheet(main)] * pairs
+    return made
+
+
+def main_section(sections: Sequence[Section]) -> Section:
+    """Return the section of a task that is shown: not provisional if there is one, with most entries, the longest."""
+    return max(sections, key=lambda each: (not each.provisional, len(each.rows), each.horizon))
+
+
+def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
+    """Write a line for every entry of other horizons, and what to type to see them in a table."""
+    told, lines = {row.entry.name for row in main.rows}, []
+    for section in sorted(sections, key=lambda each: -each.horizon):
+        for row in section.times.rows:
+            if row.entry.name in told:
+                continue
+            told.add(row.entry.name)
+            low, high = row.mean.interval
+            lines.append(
+                f"shorter: {row.entry.label}, {counted(len(row.entry.seeds), 'seed')}, {steps_text(section.horizon)} "
+                f"steps, {_mean(row.mean.mean, low, high)} of them below threshold"
+            )
+    others = [each for each in sections if each is not main]
+    lines += [
+        f"--horizon {each.horizon} ranks all at their first {steps_text(each.horizon)} steps"
+        for each in others
+        if lines and each.horizon < main.horizon
+    ]
+    longer = [each for each in others if each.horizon > main.horizon]
+    lines += [
+        f"{counted(len(e.rows), 'entry')} at {steps_text(e.horizon)} steps: --horizon {e.horizon}"
+        for e in longer
+    ]
+    return lines
+
+
+def sheet(section: Section, explain: bool = False) -> Sheet:
+    """Return a section as a table: ranks, or tiers where it shows these."""
+    columns = _tier_columns(section) if section.by_tiers else _rank_columns(section)
+    notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
+    promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
+    remarks = (*notes, *_marks(section), *promise, *facts(section))
+    return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
+
+
+def title(section: Section) -> str:
+    """Return the heading of a section."""
+    algorithms = {row.entry.algorithm for row in section.rows}
+    only = f", {algorithms.pop()}" if len(algorithms) == 1 else ""
+    note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
+    by = f", tiers by rule '{section.rule}'" if section.by_tiers else ""
+    return f"{section.task}{only}, {steps_text(section.horizon)} steps{note}{by}"
+
+
+def names(entries: Sequence[EntryCurves]) -> list[str]:
+    """Return what entries are called in a table: without the algorithm where all have the same."""
+    alike = len({entry.algorithm for entry in entries}) == 1
+    return [
+        (entry.label.removeprefix(f"{entry.algorithm} ") if alike else entry.label)
+        + " †" * entry.on_protocol_seeds
+        for entry in entries
+    ]
+
+
+def _mean(mean: float, low: float, high: float) -> str:
+    point, least, most = (steps_text(steps, digits=3) for steps in (mean, low, high))
+    return f"{point} ({least} to {most})"
+
+
+def _rank_columns(section: Section) -> list[Column]:
+    times = section.times
+    rows = [_row_of(section, row.entry) for row in times.rows]
+    longest = max((row.mean.interval[1] for row in times.rows), default=1) or 1
+    differences = ["-" if row.difference is None else percent(row.difference[0]) for row in times.rows]
+    return [
+        Column(
+            "rank",
+            tuple(row.rank_text for row in times.rows),
+            meaning="1 + the number of entries that outperform this one, to the last that the decided pairs leave. "
+            "A outperforms B if it needs significantly fewer steps at a threshold, and significantly more at none "
+            "(permutation tests, Holm's correction over all pairs of the board, filtered out or not)",
+        ),
+        Column("entry", tuple(names([row.entry for row in times.rows])), words=True),
+        Column(
+            f"steps below threshold ({times.level})",
+            tuple(_mean(row.mean.mean, *row.mean.interval) for row in times.rows),
+            bars=tuple(
+                (row.mean.interval[0] / longest, row.mean.interval[1] / longest) for row in times.rows
+            ),
+            meaning="environment steps that a run spends below a threshold, mean over seeds and the task's thresholds, "
+            "with its interval; a run that never reaches one counts with the horizon. The bar is solid to the "
+            "interval's lower end and shaded to its upper end",
+        ),
+        Column(
+            "vs. first",
+            tuple(differences),
+            meaning="steps below threshold, against the first entry of the table",
+        ),
+        *_facts_columns(section, rows),
+    ]
+
+
+def _tier_columns(section: Section) -> list[Column]:
+    rows = section.rows
+    return [
+        Column(
+            "tier",
+            tuple(map(tier_text, rows)),
+            meaning="1 + the length of the longest chain of entries above, each of which outperforms the next",
+        ),
+        Column("entry", tuple(names([row.entry for row in rows])), words=True),
+        Column(
+            "sample complexity (5%-95%)",
+            tuple(row.reference.text for row in rows),
+            bars=tuple(
+                (row.reference.low / section.horizon, row.reference.high / section.horizon) for row in rows
+            ),
+            meaning=_COMPLEXITY.format(cell=section.cell),
+        ),
+        Column(
+            "rests on",
+            tuple("-" if row.rests_on is None else row.rests_on.text for row in rows),
+            meaning="cells of the narrowest win in the chain of wins above an entry, of the cells in which not both "
+            "are at the cap",
+        ),
+        Column(
+            "cells +/-",
+            tuple(f"{row.wins}/{row.losses}" for row in rows),
+            meaning="grid cells with significantly fewer samples, and with more, over all other entries",
+        ),
+        *_facts_columns(section, rows)[1:],
+    ]
+
+
+_COMPLEXITY = "steps until a share delta of the seeds score 1 - epsilon or more, here at {cell}"
+
+
+def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
+    """Return the columns that both kinds of table end with."""
+    few = {id(row.entry) for row in section.times.rows if row.few}
+    entries = [row.entry for row in rows]
+    return [
+        Column(
+            "sample complexity",
+            tuple(">= " * row.reference.unsettled + steps_text(row.reference.steps) for row in rows),
+            meaning=_COMPLEXITY.format(cell=section.cell),
+        ),
+        Column(
+            "final score",
+            tuple(f"{row.median_score:.3f}" for row in rows),
+            meaning="median over seeds after the last epoch",
+        ),
+        Column(
+            "seeds",
+            tuple(
+                f"{len(row.entry.seeds)}{'*' * row.provisional}{'!' * (id(row.entry) in few)}" for row in rows
+            ),
+        ),
+        Column("core-hours", tuple(hours_text(entry.hours) for entry in entries), meaning="of training"),
+        Column(
+            "parameters",
+            tuple(map(_parameters, entries)),
+            meaning="trained numbers of an agent; q: of a quantum circuit; fixed: those that stay as they were drawn",
+        ),
+        Column("settings", tuple(entry.settings for entry in entries), words=True),
+    ]
+
+
+def _parameters(entry: EntryCurves) -> str:
     classical, quantum = entry.parameters
-    return (
-        tier_text(row),
-        row.rests_on.text if row.rests_on is not None else "-",
-        entry.label,
-        (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text,
-        entry.settings,
-        f"{len(entry.seeds)}" + "*" * row.provisional,
-        row.reference.text,
-        f"{row.median_score:.3f}",
-        f"{row.wins}/{row.losses}",
-        _names(row.outperforms, [r for r in section.rows if r.depth > row.depth], "all lower tiers"),
-        _names(row.outperformed_by, [r for r in section.rows if 0 < r.depth < row.depth], "all higher tiers"),
-        f"{entry.hours:.2f}",
-    )
+    return (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text
+
+
+def _row_of(section: Section, entry: EntryCurves) -> Row:
+    return next(row for row in section.rows if row.entry is entry)
 
 
 def tier_text(row: Row) -> str:
@@ -75,30 +226,59 @@ def tier_text(row: Row) -> str:
     return "not reached" if row.not_reached else "undecided"
 
 
-def _names(names: Sequence[str], others: Sequence[Row], everyone: str) -> str:
-    """List a few names; many that are all the entries on one side of the board are called so."""
-    if len(names) > 1 and sorted(names) == sorted(row.entry.label for row in others):
-        return everyone
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") or "-"
+def _rank_notes(section: Section) -> list[str]:
+    times = section.times
+    pairs = (
+        f"{times.n_decided} of {counted(times.n_pairs, 'pair')} of {times.n_ranked} entries decided, error "
+        f"{times.board.alpha:g} for all together"
+        if times.n_pairs
+        else "no pair to test"
+    )
+    lines = [
+        f"rank: by significant outperformance: {pairs}",
+        f"steps below threshold: mean over seeds and thresholds; sample complexity at {section.cell}",
+    ]
+    if any(row.ranks is None for row in times.rows):
+        lines.append(TOO_FEW)
+    return lines
 
 
-def notes(section: Section) -> list[str]:
-    """Explain the marks that occur in a section."""
-    lines = sorted({row.reason for row in section.rows if row.reason})
-    if any(row.rests_on for row in section.rows):
-        lines.append(
-            "rests on: cells of the narrowest win in the chain of wins above an entry, of the cells in which not "
-            "both are at the cap"
-        )
-    if any(row.provisional for row in section.rows):
-        protocol_seeds = section.rows[0].entry.task_file.protocol.seeds
-        lines.append(f"* provisional: the protocol asks for {protocol_seeds} seeds")
-    if any(row.reference.unsettled for row in section.rows):
-        lines.append(">= : still below delta at the last epoch; the sample complexity is at least this")
-    if any(row.entry.parameters[1] for row in section.rows):
-        lines.append("q: quantum parameters")
-    if any(row.entry.fixed for row in section.rows):
-        lines.append("fixed: parameters that stay as they were drawn, beside the trained ones")
+def _tier_notes(section: Section) -> list[str]:
+    return [
+        "tier: 1 + the longest chain of entries above, each outperforming the next; sample complexity at "
+        f"{section.cell}",
+        *sorted({row.reason for row in section.rows if row.reason}),
+    ]
+
+
+def _marks(section: Section) -> list[str]:
+    """Explain the marks that occur, in one line, and the pairs that need a word."""
+    times, rows = section.times, section.rows
+    occurring = {
+        "†": any(row.entry.on_protocol_seeds for row in rows),
+        "*": any(row.provisional for row in rows),
+        "!": any(row.few for row in times.rows),
+        ">=": any(row.reference.unsettled for row in rows),
+    }
+    protocol = rows[0].entry.task_file.protocol.seeds
+    marks = [f"{mark} {MARKS[mark].format(protocol=protocol)}" for mark, there in occurring.items() if there]
+    special = [] if section.by_tiers else times.trade_offs() + times.against_the_order()
+    first = changed_thresholds([row.entry for row in section.rows])
+    return [*_diverged(section), *first, *["; ".join(marks)] * bool(marks), *unequal_tuning(section), *special]
+
+
+def _diverged(section: Section) -> list[str]:
+    found = [row.entry for row in section.rows if row.entry.diverged]
+    told = ", ".join(f"{entry.label} ({len(entry.diverged)} of {len(entry.seeds)} seeds)" for entry in found)
+    line = (
+        f"diverged (numbers of the agents are no longer finite), ranked with the scores that they had: {told}"
+    )
+    return [line] * bool(found)
+
+
+def facts(section: Section) -> list[str]:
+    """Say what else to know of a section's entries."""
+    lines = []
     alone = [row.entry.label for row in section.rows if row.entry.first_network_alone]
     if alone:
         lines.append(
@@ -120,21 +300,6 @@ def notes(section: Section) -> list[str]:
             "settings found by tuning: "
             + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
         )
-    diverged = [row.entry for row in section.rows if row.entry.diverged]
-    if diverged:
-        lines.append(
-            "diverged (numbers of the agents are no longer finite), ranked with the scores that they had: "
-            + ", ".join(
-                f"{entry.label} ({len(entry.diverged)} of {len(entry.seeds)} seeds)" for entry in diverged
-            )
-        )
-    lines += changed_thresholds([row.entry for row in section.rows])
-    lines += unequal_tuning(section)
-    seen = [row.entry.label for row in section.rows if row.entry.on_protocol_seeds]
-    if seen:
-        lines.append(
-            f"settings chosen after seeing runs on protocol seeds, which may flatter: {', '.join(seen)}"
-        )
     mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
     if mixed:
         lines.append(
@@ -147,10 +312,7 @@ def notes(section: Section) -> list[str]:
             "trained on several kinds of device, see `qrlsuite show ENTRY`: "
             + ", ".join(f"{entry.label} ({', '.join(entry.devices)})" for entry in devices)
         )
-    lines.append(
-        "cells +/-: grid cells with significantly fewer samples, and with more, over all other entries"
-    )
-    return [*lines, "score: median over seeds after the last epoch; hours: core-hours"]
+    return lines
 
 
 def changed_thresholds(entries: Sequence[EntryCurves]) -> list[str]:
@@ -181,39 +343,82 @@ def _tuning_text(tuning: Mapping[str, Any]) -> str:
     return ", ".join(known) or "budget not known"
 
 
-def title(section: Section) -> str:
-    """Return the heading of a section."""
-    note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
-    return f"{section.task}, {steps_text(section.horizon)} steps{note}, S_hat at {section.cell}"
+SIGNS = {Direction.FEWER: "+", Direction.MORE: "-", Direction.TRADE_OFF: "+/-"}
+"""A decided pair, from the row's side."""
 
 
-def _left_out(width: int) -> list[str]:
-    """Return the columns for which a table of some width has no room."""
-    left_out: list[str] = []
-    for enough, names in LEFT_OUT if width < WIDE else ():
-        left_out += names
-        if width >= enough:
-            break
-    return left_out
+def pairs_sheet(section: Section) -> Sheet:
+    """Return the matrix of all pairs: who outperforms whom, by the board's ranks or by the cells of its tiers."""
+    if section.by_tiers:
+        rows = [row.entry for row in section.rows]
+        order = [section.pairs.names.index(entry.name) for entry in rows]
+        texts = [[_cells_text(section, i, j) for j in order] for i in order]
+        notes = ["+n: the row's entry needs significantly fewer samples in n cells; -n: more; . in none"]
+    else:
+        rows, order = [row.entry for row in section.times.rows], list(section.times.order)
+        texts = [[_decision_text(section, i, j) for j in order] for i in order]
+        notes = [
+            "+ the row's entry outperforms the column's; - the reverse; +/- a trade-off; a number: adjusted p of a "
+            "pair that is not told apart"
+        ]
+    if any("?" in line for line in texts):
+        notes.append(f"? {TOO_FEW}")
+    places = [str(place + 1) for place in range(len(order))]
+    columns = [
+        Column("", tuple(places)),
+        Column("entry", tuple(names(rows)), words=True),
+        *(Column(head, tuple(line[place] for line in texts)) for place, head in enumerate(places)),
+    ]
+    return Sheet(f"{title(section)}: pairs", tuple(columns), tuple(notes), label=f"{section.task}-pairs")
 
 
-def section_table(section: Section, width: int = WIDE) -> Table:
-    """Return a section as a table for a terminal of some width, without the columns for which there is no room."""
-    remarks, left_out = notes(section), _left_out(width)
-    shown = [name for name in COLUMNS if name not in left_out]
-    if left_out:
-        remarks.append(f"a terminal of {WIDE} columns, or --format markdown, shows {', '.join(left_out)} too")
-    result = table(
-        shown,
-        title=title(section),
-        caption="\n".join(remarks),
-        left=[name for name in shown if name not in NUMERIC],
-        fixed=[name for name in shown if name in NUMERIC or name.startswith("S_hat")],
-    )
-    for row in section.rows:
-        texts = dict(zip(COLUMNS, cells(section, row)))
-        result.add_row(*(Text(texts[name]) for name in shown))
-    return result
+def _decision_text(section: Section, i: int, j: int) -> str:
+    board = section.times.board
+    direction = board.directions[i][j]
+    if i == j:
+        return ""
+    if direction is Direction.UNDECIDED:
+        return "?"
+    return SIGNS.get(direction, p_text(board.adjusted[i, j]).removeprefix("0"))
+
+
+def _cells_text(section: Section, i: int, j: int) -> str:
+    board = section.pairs
+    if i == j:
+        return ""
+    if not board.decided[i, j]:
+        return "?"
+    wins, losses = int(board.better_cells[i, j]), int(board.better_cells[j, i])
+    return f"{f'+{wins}' * bool(wins)}{f'-{losses}' * bool(losses)}" or "."
+
+
+def flat(board: Leaderboard) -> list[dict[str, object]]:
+    """Return one row of values per entry and section, for a spreadsheet."""
+    rows: list[dict[str, object]] = []
+    for made, section in zip(board.sections, board.as_dict()["sections"]):
+        for of, row in zip(made.rows, section["rows"]):
+            low, high = row.pop("interval")
+            count = row.pop("parameters")
+            tuning = row.pop("tuning") or {}
+            tuned, on_protocol_seeds = bool(tuning), bool(tuning.get("on_protocol_seeds"))
+            support = row.pop("rests_on") or {}
+            flat = {
+                **{name: section[name] for name in ("task", "horizon", "cell")},
+                **row,
+                "parameters_classical": count["classical"],
+                "parameters_quantum": count["quantum"],
+                "parameters_fixed": count["fixed"],
+                "networks": count["networks"],
+                **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
+                "interval_low": low,
+                "interval_high": high,
+                "tuned": tuned,
+                "tuned_on_protocol_seeds": on_protocol_seeds,
+                "rule": section["rule"],
+                **made.times.flat(of.entry),
+            }
+            rows.append(flat)
+    return rows
 
 
 def table(
@@ -250,189 +455,6 @@ def table(
         justify: Literal["left", "right"] = "left" if name in left else "right"
         result.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
     return result
-
-
-NARROW = 105
-"""Characters per line in which the whole table by mean time can be read."""
-LEFT_OUT_OF_TIMES = ("seeds", "at cap", "at half")
-"""What a narrower one leaves out."""
-NAMES = ("entry", "needs less than", "needs more than")
-"""Columns of names, which may be broken into several lines."""
-
-
-def times_title(section: Section) -> str:
-    """Return the heading of a section by mean time below threshold."""
-    return f"{section.task}, {steps_text(section.horizon)} steps, by mean time below threshold"
-
-
-def times_table(section: Section, width: int = WIDE) -> Table:
-    """Return a section by mean time below threshold as a table for a terminal of some width."""
-    times = section.times
-    remarks, columns = times.notes(), times.columns()
-    left_out = LEFT_OUT_OF_TIMES if width < NARROW else ()
-    if left_out:
-        remarks.append(
-            f"a terminal of {NARROW} columns, or --format markdown, shows {', '.join(left_out)} too"
-        )
-    kept = [place for place, name in enumerate(columns) if name not in left_out]
-    shown = [columns[place] for place in kept]
-    result = table(
-        shown,
-        title=times_title(section),
-        caption="\n".join(remarks),
-        left=[name for name in shown if name not in LEFT_OUT_OF_TIMES],
-        fixed=[name for name in shown if name not in NAMES],
-    )
-    for row in times.rows:
-        texts = times.cells(row)
-        result.add_row(*(Text(texts[place]) for place in kept))
-    return result
-
-
-def across_table(board: AcrossBoard) -> Table:
-    """Return a comparison over several tasks as a table."""
-    columns = board.columns()
-    fixed = [name for name in columns if name not in NAMES]
-    result = table(columns, title=board.title, caption="\n".join(board.notes()), left=columns, fixed=fixed)
-    for place in range(len(board.order)):
-        result.add_row(*map(Text, board.cells(place)))
-    return result
-
-
-def cost_table(section: CostSection) -> Table:
-    """Return a section by cost as a table."""
-    columns = section.columns()
-    result = table(
-        columns,
-        title=section.title,
-        caption="\n".join(section.notes()),
-        left=NAMES,
-        fixed=[name for name in columns if name not in NAMES],
-    )
-    for row in section.rows:
-        result.add_row(*map(Text, section.cells(row)))
-    return result
-
-
-def cost_markdown(board: CostBoard) -> str:
-    """Return a board by cost as Markdown."""
-    lines = []
-    for section in board.sections:
-        rows = [section.cells(row) for row in section.rows]
-        lines += _markdown_table(section.title, section.columns(), rows, section.notes())
-    return "\n".join(lines)
-
-
-def markdown(board: Leaderboard) -> str:
-    """Return a board as Markdown: for each section two tables, each with heading and notes."""
-    lines = []
-    for section in board.sections:
-        times = section.times
-        rows = [cells(section, row) for row in section.rows]
-        lines += _markdown_table(title(section), COLUMNS, rows, notes(section))
-        by_time = [times.cells(row) for row in times.rows]
-        lines += _markdown_table(times_title(section), times.columns(), by_time, times.notes())
-    return "\n".join(lines)
-
-
-def across_markdown(board: AcrossBoard) -> str:
-    """Return a comparison over several tasks as Markdown."""
-    rows = [board.cells(place) for place in range(len(board.order))]
-    return "\n".join(_markdown_table(board.title, board.columns(), rows, board.notes()))
-
-
-def _markdown_table(
-    heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]], remarks: Sequence[str]
-) -> list[str]:
-    lines = [f"### {_plain(heading)}", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
-    lines += [f"| {' | '.join(map(_plain, row))} |" for row in rows]
-    return [*lines, "", *(f"{_plain(line, '')}  " for line in remarks), ""]
-
-
-def _plain(text: str, further: str = "`|") -> str:
-    """Return Markdown that shows a text as it is: labels and options are strangers' words.
-
-    An underscore within a word stands for itself, as in `batch_size`.
-
-    Parameters
-    ----------
-    further:
-        Characters to escape beside the usual ones; a remark of ours may have code in it.
-    """
-    special = rf"[\\*\[\]{further}]|(?<!\w)_|_(?!\w)"
-    escaped = re.sub(special, lambda found: f"\\{found[0]}", printable(text))
-    return escaped.replace("&", "&amp;").replace("<", "&lt;")
-
-
-def csv_text(board: Leaderboard) -> str:
-    """Write one line per entry and section; lists are separated by semicolons."""
-    rows: list[dict[str, object]] = []
-    for made, section in zip(board.sections, board.as_dict()["sections"]):
-        for of, row in zip(made.rows, section["rows"]):
-            low, high = row.pop("interval")
-            count = row.pop("parameters")
-            tuning = row.pop("tuning") or {}
-            tuned, on_protocol_seeds = bool(tuning), bool(tuning.get("on_protocol_seeds"))
-            support = row.pop("rests_on") or {}
-            flat = {
-                **{name: section[name] for name in ("task", "horizon", "cell")},
-                **row,
-                "parameters_classical": count["classical"],
-                "parameters_quantum": count["quantum"],
-                "parameters_fixed": count["fixed"],
-                "networks": count["networks"],
-                **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
-                "interval_low": low,
-                "interval_high": high,
-                "tuned": tuned,
-                "tuned_on_protocol_seeds": on_protocol_seeds,
-                "rule": section["rule"],
-                **made.times.flat(of.entry),
-            }
-            rows.append(flat)
-    return csv_rows(rows)
-
-
-def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
-    """Write rows of equal columns; lists are separated by semicolons."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        flat = {name: "; ".join(value) if isinstance(value, list) else value for name, value in row.items()}
-        writer.writerow({name: _harmless(value) for name, value in flat.items()})
-    return buffer.getvalue()
-
-
-def _harmless(value: object) -> object:
-    """Keep spreadsheets from reading a name as a formula."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
-
-
-def board_html(board: Leaderboard) -> str:
-    """Return a board as HTML for a notebook: every section with its heading, table and notes."""
-    parts = []
-    for section in board.sections:
-        rows = [cells(section, row) for row in section.rows]
-        parts.append(html_table(COLUMNS, rows, title(section), notes(section)))
-        times = section.times
-        by_time = [times.cells(row) for row in times.rows]
-        parts.append(html_table(times.columns(), by_time, times_title(section), times.notes()))
-    parts += [f"<p>left out: {escape(line)}</p>" for line in board.refused]
-    return "\n".join(parts) or "<p>no entries</p>"
-
-
-def html_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], heading: str = "", remarks: Sequence[str] = ()
-) -> str:
-    """Return a table as HTML; every text is escaped."""
-    head = "".join(f"<th>{escape(name)}</th>" for name in columns)
-    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    return (
-        (f"<p><b>{escape(heading)}</b></p>" if heading else "")
-        + f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-        + "".join(f"<p><small>{escape(line)}</small></p>" for line in remarks)
-    )
 
 
 SYMBOLS = {
@@ -486,4 +508,6 @@ def comparison_html(comparison: Comparison, headline: str) -> str:
     heading, rows, deltas = _levels(comparison)
     signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
     remarks = [heading, legend(comparison)]
-    return html_table(["", *deltas], signs, f"{headline}: {comparison.sentence}", remarks)
+    return Sheet.of(
+        f"{headline}: {comparison.sentence}", ["", *deltas], signs, remarks, explained=True
+    ).html()

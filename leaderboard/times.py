@@ -1,27 +1,25 @@
-"""A section of a board by mean time below threshold: which pairs are decided, and which ranks that leaves.
+"""A section of a board by steps below threshold: who outperforms whom, and which ranks that leaves.
 
-Beside the tiers of the paper's definition. `rank_by_time` computes everything once; tables, files and the page
+`rank_by_time` computes everything once; tables, files and the page
 write what it returns. The statistics are in `qrlsuite.statistics.standings`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from qrlsuite.leaderboard.curves import EntryCurves
-from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
-from qrlsuite.statistics.compare import TOO_FEW
 
 ALPHA = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class TimeRow:
-    r"""One entry, ordered by M: its mean time below threshold over its runs and the grid's thresholds, in steps.
+    """One entry, ordered by M: its mean time below threshold over its runs and the grid's thresholds, in steps.
 
     Attributes
     ----------
@@ -34,11 +32,9 @@ class TimeRow:
     at_cap:
         Share of the times that are the horizon, over runs and thresholds: these runs never got there.
     difference:
-        M over that of the first entry, minus 1, and its interval; None for the first, and below 20 seeds.
+        M over that of the first entry shown, minus 1, and its interval; None for the first, and below 20 seeds.
     few:
         Whether it has fewer than 50 seeds, and another ranked entry another number.
-    joined:
-        `/` where the entry is not told apart from the next, `\` from the one before, `|` from both; else empty.
     """
 
     entry: EntryCurves
@@ -49,13 +45,12 @@ class TimeRow:
     at_cap: float
     difference: tuple[float, float, float] | None
     few: bool
-    joined: str
 
     @property
     def rank_text(self) -> str:
-        """`3`, `3-5` or `undecided`."""
+        """`3`, `3-5`, or `-` below 20 seeds."""
         if self.ranks is None:
-            return "undecided"
+            return "-"
         best, worst = self.ranks
         return str(best) if best == worst else f"{best}-{worst}"
 
@@ -77,7 +72,7 @@ class TimeRanking:
     board:
         All pairs, in the order in which the entries were given.
     rows:
-        In the order of M.
+        The entries that are shown, in the order of M.
     order:
         Index in `board` of each row.
     kind, levels:
@@ -98,40 +93,17 @@ class TimeRanking:
     @property
     def n_pairs(self) -> int:
         """Pairs that were tested, and over which Holm's procedure goes."""
-        ranked = sum(row.ranks is not None for row in self.rows)
-        return ranked * (ranked - 1) // 2
+        return self.n_ranked * (self.n_ranked - 1) // 2
 
     @property
     def n_decided(self) -> int:
-        """Pairs of them that are decided, trade-offs among them."""
-        return sum(decided(self.board.directions[i][j]) for i, j in self._pairs())
+        """Pairs of them that are decided, trade-offs among them, be the entries shown or not."""
+        return sum(decided(each) for row in self.board.directions for each in row) // 2
 
-    def columns(self) -> tuple[str, ...]:
-        """Return the heads of the table that `cells` fills."""
-        return (
-            "rank",
-            "",
-            "entry",
-            "seeds",
-            f"M ({self.level})",
-            "at cap",
-            "at half",
-            f"above the first ({self.level})",
-        )
-
-    def cells(self, row: TimeRow) -> tuple[str, ...]:
-        """Return a row as text."""
-        mean, low, high = (steps_text(steps, digits=3) for steps in (row.mean.mean, *row.mean.interval))
-        return (
-            row.rank_text,
-            row.joined,
-            row.entry.label,
-            f"{len(row.entry.seeds)}{'!' * row.few}",
-            f"{mean} ({low} to {high})",
-            f"{row.at_cap:.0%}",
-            "-" if row.place_at_half is None else str(row.place_at_half),
-            row.difference_text,
-        )
+    @property
+    def n_ranked(self) -> int:
+        """Entries of 20 seeds or more: the family over whose pairs Holm's procedure goes."""
+        return sum(count >= MIN_RUNS for count in self.board.n_runs)
 
     def trade_offs(self) -> list[str]:
         """Name every pair of which each needs fewer steps at some threshold."""
@@ -145,32 +117,11 @@ class TimeRanking:
     def against_the_order(self) -> list[str]:
         """Name every decided pair whose better entry has the larger M."""
         return [
-            f"against the order of M: {self._label(j)} needs significantly fewer steps than {self._label(i)} at "
-            f"{self._thresholds(j, i) or 'a threshold'}, and more at others, not significantly"
+            f"against the order: {self._label(j)} outperforms {self._label(i)}, though it needs more steps on average: "
+            f"it needs significantly fewer at {self._thresholds(j, i) or 'a threshold'}"
             for i, j in self._pairs()
             if self.board.directions[i][j] is Direction.MORE
         ]
-
-    def notes(self) -> list[str]:
-        """Explain the columns, and the marks that occur."""
-        lines = [
-            "M: environment steps that a run spends below threshold, mean over seeds and the task's thresholds; "
-            "a run that never gets there counts with the horizon",
-            f"rank: what the decided pairs leave ({self.n_decided} of {self.n_pairs}: rule 'times', Holm over all "
-            f"pairs, error {self.board.alpha:g}); intervals: of each entry or pair by itself",
-            "at cap: share of the seeds that never get there, mean over thresholds; at half: place by M at half the "
-            "horizon",
-        ]
-        if any(row.joined for row in self.rows):
-            lines.append(
-                "/ | \\ join neighbors that are not told apart, which does not mean that they are equal"
-            )
-        lines += self.trade_offs() + self.against_the_order()
-        if any(row.few for row in self.rows):
-            lines.append("! fewer than 50 seeds against another number: errors are likelier than alpha says")
-        if any(row.ranks is None for row in self.rows):
-            lines.append(TOO_FEW)
-        return lines
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
@@ -201,7 +152,7 @@ class TimeRanking:
         following = self.rows[index + 1] if index + 1 < len(self.rows) else None
         apart = None
         if row.ranks is not None and following is not None and following.ranks is not None:
-            apart = self.board.neighbors_told_apart[index]
+            apart = decided(self.board.directions[self.order[index]][self.order[index + 1]])
         return {
             "entry": row.entry.name,
             "place": row.place,
@@ -263,7 +214,11 @@ class TimeRanking:
 
 
 def rank_by_time(
-    entries: Sequence[EntryCurves], grid: Grid, horizon: int, alpha: float = ALPHA
+    entries: Sequence[EntryCurves],
+    grid: Grid,
+    horizon: int,
+    alpha: float = ALPHA,
+    shown: Callable[[EntryCurves], bool] | None = None,
 ) -> TimeRanking:
     """Rank the entries of a section by mean time below threshold.
 
@@ -277,6 +232,8 @@ def rank_by_time(
         Environment steps at which all are cut.
     alpha:
         In (0, 1): probability of any false decision among entries of equal laws; intervals have level 1 - alpha.
+    shown:
+        Which entries have a row; all are compared, and counted by Holm's procedure. None means all.
 
     Raises
     ------
@@ -286,19 +243,20 @@ def rank_by_time(
     curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
     board = times_board(curves, grid, alpha, horizon)
     ranked = [index for index in board.order if board.n_runs[index] >= MIN_RUNS]
+    order = tuple(index for index in board.order if shown is None or shown(entries[index]))
     at_half = [index for index in board.order_at_half if index in ranked]
     rows = []
-    for place, index in enumerate(board.order):
+    for index in order:
         known = index in ranked
-        difference = None
-        if known and place and not math.isnan(board.difference[index, ranked[0]]):
-            low, high = board.difference_interval[index, ranked[0]]
-            difference = (float(board.difference[index, ranked[0]]), float(low), float(high))
+        first, difference = order[0], None
+        if known and index != first and not math.isnan(board.difference[index, first]):
+            low, high = board.difference_interval[index, first]
+            difference = (float(board.difference[index, first]), float(low), float(high))
         best, worst = board.ranks[index].tolist()
         rows.append(
             TimeRow(
                 entry=entries[index],
-                place=place + 1 if known else None,
+                place=ranked.index(index) + 1 if known else None,
                 place_at_half=at_half.index(index) + 1 if known else None,
                 ranks=(best, worst) if known else None,
                 mean=board.means[index],
@@ -308,19 +266,11 @@ def rank_by_time(
                 and any(
                     board.few[index, other] and board.n_runs[index] < board.n_runs[other] for other in ranked
                 ),
-                joined=_joined(board, ranked, place) if known else "",
             )
         )
     return TimeRanking(
-        board, tuple(rows), board.order, grid.level_name, tuple(f"{float(level):g}" for level in grid.levels)
+        board, tuple(rows), order, grid.level_name, tuple(f"{float(level):g}" for level in grid.levels)
     )
-
-
-def _joined(board: TimesBoard, ranked: Sequence[int], place: int) -> str:
-    apart = board.neighbors_told_apart
-    before = place > 0 and not apart[place - 1]
-    after = place + 1 < len(ranked) and not apart[place]
-    return {(False, True): "/", (True, True): "|", (True, False): "\\"}.get((before, after), "")
 
 
 def decided(direction: Direction) -> bool:

@@ -131,17 +131,20 @@ def board(
         As for `load`. Published entries that answer the question of one study are not ranked beside others of their
         task: name the study.
     rule:
-        What counts as significant: a name of `qrlsuite list significance-tests`; None means each task's own.
+        None ranks by significant outperformance with the error of the whole board held. `paper`, or another name of
+        `qrlsuite list significance-tests`, shows tiers by the cells of the task's grid in the place of ranks. A task
+        may name a rule of its own.
     alpha:
-        Probability of any false decision by mean time below threshold.
+        Probability of any false decision on the board.
     horizon:
         Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
     entries:
-        Rank these only: what `load` accepts, or what it returns.
+        Show these only: what `load` accepts. They keep the ranks that they have among all entries of their task. What
+        `load` returns is compared by itself, without others.
     study:
         Rank the entries of this study only: its name, or a study file's path.
     min_seeds:
-        Leave out entries with fewer seeds.
+        Show no entries with fewer seeds.
 
     Returns
     -------
@@ -164,13 +167,24 @@ def board(
     Examples
     --------
     >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
-    >>> [(row.tier, row.entry.label) for row in found.sections[0].rows]
-    [(1, 'ddqn mlp width=64'), (2, 'ddqn mlp width=16')]
+    >>> [(row.rank_text, row.entry.label) for row in found.sections[0].times.rows]
+    [('1-2', 'ddqn mlp width=64'), ('11', 'ddqn mlp width=16')]
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
-    selected, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
-    return boards.build(selected, left_out, rules.load(rule) if rule else None, horizon, alpha)
+    shown, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
+    keys = {(entry.task_hash, entry.name) for entry in shown}
+    family = shown
+    if (entries or min_seeds > 1) and not any(isinstance(entry, EntryCurves) for entry in entries):
+        family = _family(shown, _selected(folder, task_names, (), study, published, horizon, 1)[0])
+    return boards.build(
+        family,
+        left_out,
+        rules.load(rule) if rule else None,
+        horizon,
+        alpha,
+        lambda entry: (entry.task_hash, entry.name) in keys,
+    )
 
 
 def costs(
@@ -863,6 +877,14 @@ def _selected(
     if entries:
         raise OptionError(f"--study {study} names the entries: leave --entry out")
     return studies.select(study, runs, tasks, published, horizon, min_seeds)
+
+
+def _family(shown: Sequence[EntryCurves], ranked: Sequence[EntryCurves]) -> list[EntryCurves]:
+    """Return what is compared: all ranked entries of the same definitions of tasks, and those shown beside them."""
+    hashes = {entry.task_hash for entry in shown}
+    family = [entry for entry in ranked if entry.task_hash in hashes]
+    keys = {(entry.task_hash, entry.name) for entry in family}
+    return family + [entry for entry in shown if (entry.task_hash, entry.name) not in keys]
 
 
 def _several(names: str | Sequence[str] | None) -> Sequence[str]:

@@ -69,7 +69,7 @@
     const select = element("select", {});
     for (const cell of headers) {
       const name = cell.textContent;
-      const best = ["score", "wins", "seeds"].includes(cell.dataset.key) ? "descending" : "ascending";
+      const best = ["score", "seeds"].includes(cell.dataset.key) ? "descending" : "ascending";
       const control = element("button", { type: "button" }, name);
       control.addEventListener("click", () => {
         const now = cell.getAttribute("aria-sort");
@@ -79,6 +79,7 @@
       cell.replaceChildren(control);
       select.append(element("option", { value: cell.dataset.key, "data-best": best }, name));
     }
+    select.value = table.querySelector("[aria-sort]").dataset.key;
     select.addEventListener("change", () => sort(table, select.value, select.selectedOptions[0].dataset.best));
     const tools = document.querySelector(`[data-sort-for="${table.id}"]`);
     tools.append(element("label", {}, "Sort by", select));

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import tables
@@ -16,26 +18,30 @@ from qrlsuite.leaderboard.report.entries import EntryView
 from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.words import listed
+from qrlsuite.leaderboard.times import TimeRanking, TimeRow
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome
+from qrlsuite.statistics.compare import TOO_FEW
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
 
 
 @dataclass(frozen=True)
 class RowView:
-    """A line of the leaderboard; `low`, `point` and `high` are shares of the horizon in percent."""
+    """A line of the leaderboard; `low`, `point` and `high` are the mean's, in percent of the horizon."""
 
     place: int
     entry: EntryView
     row: Row
-    steps: str
-    interval: str
+    time: TimeRow
+    mean: str
+    mean_interval: str
+    at_cap: str
     low: float
     point: float
     high: float
-    wins: int
-    losses: int
+    steps: str
+    interval: str
     reason: str
 
 
@@ -50,6 +56,8 @@ class SectionView:
     horizon: str
     lead: str
     rows: tuple[RowView, ...]
+    by_tier: tuple[RowView, ...]
+    """The same in the order of the tiers."""
     protocol_seeds: int
     missing: str
     first_alone: str
@@ -67,7 +75,8 @@ class SectionView:
     framed: bool
     deltas: tuple[str, ...]
     data: dict[str, Any]
-    times: timed.TimesView
+    times: TimeRanking
+    decisions: tuple[tuple[timed.Cell, ...], ...]
 
     @property
     def others(self) -> int:
@@ -88,11 +97,13 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     entries:
         The page's entries by the identity of their curves.
     """
+    by_entry = {id(row.entry): row for row in section.rows}
+    by_tier = list(by_entry)
+    section = replace(section, rows=tuple(by_entry[id(time.entry)] for time in section.times.rows))
     judgement = judge(section)
     ranking = ranking_of([row.entry for row in section.rows])
-    rows = tuple(
-        _row(place, row, entries[id(row.entry)], judgement) for place, row in enumerate(section.rows)
-    )
+    rows = tuple(_row(place, row, entries[id(row.entry)], section) for place, row in enumerate(section.rows))
+    order = np.array(section.times.order)
     grid = judgement.grid
     bars = bar_grid(ranking)
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
@@ -106,14 +117,18 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         section=section,
         judgement=judgement,
         horizon=steps_text(section.horizon),
-        lead=_lead(rows),
+        lead=_lead(rows, section.times),
         rows=rows,
+        by_tier=tuple(sorted(rows, key=lambda row: by_tier.index(id(row.row.entry)))),
         protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
         first_alone=", ".join(row.entry.label for row in rows if row.row.entry.first_network_alone),
         tuning=clean("; ".join(tables.unequal_tuning(section))),
         flattered=", ".join(row.entry.label for row in rows if row.row.entry.on_protocol_seeds),
-        ladder=ladder.draw(judgement.beats(), [row.depth for row in section.rows]),
+        ladder=ladder.draw(
+            section.times.board.outperforms[np.ix_(order, order)],
+            [0.0 if time.ranks is None else float(time.ranks[0]) for time in section.times.rows],
+        ),
         matrix=tuple(
             tuple(_matrix_cell(judgement, i, j) for j in range(len(rows))) for i in range(len(rows))
         ),
@@ -132,48 +147,57 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
         data=_data(section, judgement, rows, bars, bar_evidence, ranking),
-        times=timed.view(section.times, entries),
+        times=section.times,
+        decisions=timed.matrix(section.times, [row.entry.label for row in rows]),
     )
 
 
-def _row(place: int, row: Row, entry: EntryView, judgement: Judgement) -> RowView:
-    reference, horizon = row.reference, judgement.horizon
-    beats = judgement.beats()
+def _row(place: int, row: Row, entry: EntryView, section: Section) -> RowView:
+    reference, horizon, time = row.reference, section.horizon, section.times.rows[place]
+    mean, low, high = time.mean.mean, *time.mean.interval
+    kind, levels = section.times.kind, section.times.levels
+    shares = (f"{kind} {level}: {share:.0%}" for level, share in zip(levels, time.mean.at_cap))
     return RowView(
         place=place,
         entry=entry,
         row=row,
+        time=time,
+        mean=steps_text(mean, digits=3),
+        mean_interval=f"{steps_text(low, digits=3)} to {steps_text(high, digits=3)}",
+        at_cap=f"never there: {', '.join(shares)}; {steps_text(round(time.mean.half))} at half the horizon",
+        low=100 * low / horizon,
+        point=100 * mean / horizon,
+        high=100 * high / horizon,
         steps=("≥ " if reference.unsettled else "") + steps_text(reference.steps),
         interval=f"{steps_text(reference.low)} to {steps_text(reference.high)}",
-        low=100 * reference.low / horizon,
-        point=100 * reference.steps / horizon,
-        high=100 * reference.high / horizon,
-        wins=int(beats[place].sum()),
-        losses=int(beats[:, place].sum()),
         reason=row.reason,
     )
 
 
-def _lead(rows: Sequence[RowView]) -> str:
-    """Say in one sentence who is in front."""
-    ranked = [row for row in rows if row.row.tier is not None]
+def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
+    """Say in one sentence who is in front, among all entries that are compared."""
+    ranked = [row for row in rows if row.time.ranks is not None]
     if not ranked:
-        return "No pair is decided: " + rows[0].reason.partition(": ")[2] + "."
-    first = [row for row in ranked if row.row.tier == 1]
-    if len(ranked) == len(first):
-        return f"No entry of {len(ranked)} stands above the others: nobody is ranked before anybody."
+        return f"No entry is ranked: {TOO_FEW.partition(': ')[2]}."
+    best, relation = ranked[0], times.board.outperforms
+    if times.n_ranked == 1:
+        return f"{best.entry.label} is the only ranked entry."
+    if not relation.any():
+        return f"No entry of {times.n_ranked} outperforms another."
+    first = [row for row in ranked if row.time.ranks is not None and row.time.ranks[0] == 1]
+    if not first:
+        return f"{best.entry.label} has rank {best.time.rank_text} of {times.n_ranked} entries."
+    if len(first) > 4:
+        return f"No entry outperforms any of {len(first)}, from {first[0].entry.label} on."
     if len(first) > 1:
-        names = listed([row.entry.label for row in first]) if len(first) <= 4 else f"{len(first)} entries"
-        return f"{names} share the first tier."
-    best = first[0]
-    rest = len(ranked) - 1
-    if best.wins == rest:
-        if rest > 1:
-            return f"{best.entry.label} outperforms all {rest} others."
-        win = next(row.row.rests_on for row in ranked if row is not best)
-        cells = f", in {win.text} cells that are not at the cap for both" if win is not None else ""
-        return f"{best.entry.label} outperforms the other entry{cells}."
-    return f"{best.entry.label} stands in the first tier and outperforms {best.wins} of {rest} others."
+        names = [row.entry.label for row in first]
+        return f"No entry outperforms {', '.join(names[:-1])} or {names[-1]}."
+    wins, rest = int(relation[times.order[first[0].place]].sum()), times.n_ranked - 1
+    if wins == rest:
+        return (
+            f"{first[0].entry.label} outperforms {f'all {rest} others' if rest > 1 else 'the other entry'}."
+        )
+    return f"{first[0].entry.label} has rank 1 and outperforms {wins} of {rest} others."
 
 
 def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str, str]:

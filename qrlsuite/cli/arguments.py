@@ -60,7 +60,7 @@ RuleOption = Annotated[
 AlphaOption = Annotated[
     float,
     typer.Option(
-        "--alpha", metavar="P", help="Probability of any false decision by mean time, between 0 and 1."
+        "--alpha", metavar="P", help="Probability of any false difference on the board, between 0 and 1."
     ),
 ]
 PublishedOption = Annotated[

@@ -1,8 +1,8 @@
-"""All pairs of a board by their mean time below threshold: what is decided, by how much, and which ranks remain.
+"""All pairs of a board by their time below threshold: who outperforms whom, by how much, and which ranks remain.
 
-Beside the tiers of the paper's definition (`qrlsuite.statistics.board`). The order is by mean time M. A pair is
-decided if Holm's procedure over all pairs of the board rejects its max-T permutation test (`MaxT`): for entries of
-equal laws the probability of any false decision on the whole board is alpha at most.
+The verdicts by which boards rank; tiers by the paper's definition are in `qrlsuite.statistics.board`. The order is by
+mean time M. A pair is decided if Holm's procedure over all pairs of the board rejects its max-T permutation test
+(`MaxT`): for entries of equal laws the probability of any false decision on the whole board is alpha at most.
 """
 
 from __future__ import annotations
@@ -94,10 +94,15 @@ class TimesBoard:
         return self._by([mean.half for mean in self.means])
 
     @property
-    def neighbors_told_apart(self) -> tuple[bool, ...]:
-        """For each two that follow each other in `order`: whether the pair is decided."""
-        decided = (Direction.FEWER, Direction.MORE, Direction.TRADE_OFF)
-        return tuple(self.directions[i][j] in decided for i, j in zip(self.order, self.order[1:]))
+    def outperforms(self) -> BoolArray:
+        """Shape (M, M): whether the row's entry outperforms the column's.
+
+        The pair is decided, and it needs significantly fewer steps at a threshold and significantly more at none. The
+        rank of an entry is 1 + the number of entries that outperform it: the first column of `ranks`.
+        """
+        rows = [[each is Direction.FEWER for each in row] for row in self.directions]
+        matrix: BoolArray = np.array(rows, dtype=bool).reshape(len(rows), -1)
+        return matrix
 
     def _by(self, values: Sequence[float]) -> tuple[int, ...]:
         def key(index: int) -> tuple[bool, float, str]:

@@ -20,7 +20,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import across, latex
+from qrlsuite.leaderboard import across
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore
@@ -94,7 +94,7 @@ def test_what_is_left_out_says_why() -> None:
 
 
 def test_latex_of_several_tasks() -> None:
-    text = latex.across_table(across.compare([*both("a & b", 0.2), *both("c_d", 0.6)], TASKS))
+    text = across.compare([*both("a & b", 0.2), *both("c_d", 0.6)], TASKS).sheet().latex()
     assert r"a \& b" in text
     assert r"c\_d" in text
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
+from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, TaskError
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board, latex, report, tables
+from qrlsuite.leaderboard import board, report, sheet, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction
@@ -44,6 +46,11 @@ def times_of(*entries: EntryCurves, alpha: float = 0.05) -> Any:
     return section.times
 
 
+def markdown(*entries: EntryCurves) -> str:
+    (made,) = boards.of(entries).sheets(explain=True)
+    return made.markdown()
+
+
 def test_mean_times_places_and_differences_by_hand() -> None:
     # half of the runs of `quick` score 1 from epoch 10 on and half from 11: M = 10.5 epochs of 2000 steps
     found = times_of(reaching("slow one", (1, 60)), reaching("quick one", (1, 10)), reaching("never"))
@@ -59,19 +66,16 @@ def test_mean_times_places_and_differences_by_hand() -> None:
     low, high = found.rows[1].difference[1:]
     assert low < 121 / 21 - 1 < high
     assert (found.n_pairs, found.n_decided) == (3, 3)
-    assert found.cells(found.rows[1])[4].startswith("121k (")
 
 
-def test_neighbors_that_are_not_told_apart_are_joined() -> None:
+def test_ranks_of_entries_that_are_not_told_apart_are_ranges() -> None:
     first, second = reaching("first", (1, 10)), reaching("second", (1, 10), spread=3)
     found = times_of(first, second, reaching("third", (1, 60)), reaching("fourth", (1, 60), spread=3))
-    assert [row.joined for row in found.rows] == ["/", "\\", "/", "\\"]
     assert [row.rank_text for row in found.rows] == ["1-2", "1-2", "3-4", "3-4"]
+    told = [entry["told_apart_from_next"] for entry in found.as_dict()["entries"]]
+    assert told == [False, True, False, None]
     (row,) = times_of(first).rows
-    assert (row.joined, row.rank_text, row.difference_text) == ("", "1", "-")
-    assert {r.joined for r in times_of(first, reaching("third", (1, 60))).rows} == {""}
-    three = times_of(first, second, reaching("other", (1, 10), spread=4))
-    assert [row.joined for row in three.rows] == ["/", "|", "\\"]
+    assert (row.rank_text, row.difference_text) == ("1", "-")
 
 
 def test_few_and_unequal_numbers_are_marked_and_below_20_nothing_is_decided() -> None:
@@ -80,15 +84,16 @@ def test_few_and_unequal_numbers_are_marked_and_below_20_nothing_is_decided() ->
     assert [(row.entry.label, row.few, row.rank_text) for row in made.rows] == [
         ("many", False, "1"),
         ("few", True, "2"),
-        ("five", False, "undecided"),
+        ("five", False, "-"),
     ]
-    assert made.cells(made.rows[1])[3] == "20!"
     assert made.n_pairs == 1
     assert made.rows[2].difference is None
-    assert any("fewer than 50 seeds" in note for note in made.notes())
+    text = markdown(many, few)
+    assert "| 20*! |" in text
+    assert "! fewer than 50 seeds" in text
     enough = times_of(many, reaching("enough", (1, 60), seeds=50))
     assert not any(row.few for row in enough.rows)
-    assert not any("fewer than 50" in note for note in enough.notes())
+    assert "fewer than 50" not in markdown(many, reaching("enough", (1, 60), seeds=50))
     equal = times_of(few, reaching("as few", (1, 60), seeds=20))
     assert not any(row.few for row in equal.rows)
 
@@ -100,9 +105,9 @@ def test_trade_offs_are_named() -> None:
     assert line == (
         "trade-off: steady needs fewer steps at epsilon 0.1, 0.15, 0.2, 0.25; early at epsilon 0.3, 0.35, 0.4"
     )
-    assert line in made.notes()
+    assert line in markdown(reaching("early", (0.72, 5), (1, 60)), reaching("steady", (1, 30)))
     assert [row.rank_text for row in made.rows] == ["1-2", "1-2"]
-    assert {row.joined for row in made.rows} == {""}, "a trade-off is told apart"
+    assert made.as_dict()["entries"][0]["told_apart_from_next"] is True, "a trade-off is told apart"
 
 
 def test_a_pair_decided_against_the_order_of_the_means_is_named() -> None:
@@ -113,8 +118,8 @@ def test_a_pair_decided_against_the_order_of_the_means_is_named() -> None:
     assert made.board.directions[0][1] is Direction.FEWER
     assert [row.entry.label for row in made.rows] == ["other", "sure"]
     assert made.against_the_order() == [
-        "against the order of M: sure needs significantly fewer steps than other at epsilon 0.1, and more at others, "
-        "not significantly"
+        "against the order: sure outperforms other, though it needs more steps on average: it needs significantly "
+        "fewer at epsilon 0.1"
     ]
     assert [row.rank_text for row in made.rows] == ["2", "1"]
 
@@ -164,7 +169,7 @@ def test_csv_holds_the_same_numbers() -> None:
     (section,) = board.as_dict(made)["sections"]
     found = section["times"]
     names = [row["entry"] for row in found["entries"]]
-    written = list(csv.DictReader(io.StringIO(tables.csv_text(made))))
+    written = list(csv.DictReader(io.StringIO(sheet.csv_rows(tables.flat(made)))))
     assert len(written) == 5
     for row in written:
         place = names.index(row["entry"])
@@ -176,16 +181,130 @@ def test_csv_holds_the_same_numbers() -> None:
         assert {n: float(p) for n, p in given.items()} == pytest.approx(stated, rel=1e-5)
 
 
-def test_markdown_shows_both_tables_and_escapes_the_bracket() -> None:
-    text = tables.markdown(boards.of([reaching(name, (1, 10)) for name in ("a b", "c d", "e f")]))
-    assert "by mean time below threshold" in text
+def columns(made: board.Leaderboard, width: int, **asked: bool) -> list[str]:
+    """What a terminal of some width shows, line by line."""
+    text = io.StringIO()
+    console = Console(file=text, width=width, color_system=None, highlight=False)
+    for each in made.sheets(**asked):
+        console.print(each)
+    return text.getvalue().splitlines()
+
+
+@pytest.mark.parametrize(("width", "last"), [(80, "complexity"), (100, "hours"), (140, "settings")])
+def test_a_row_is_a_line_and_a_narrow_terminal_shows_the_first_columns(width: int, last: str) -> None:
+    made = api.board("beam6g", published=True, runs="none")
+    lines = columns(made, width)
+    assert max(map(len, lines)) <= width
+    rule = next(place for place, line in enumerate(lines) if line.startswith("──"))
+    heads = " ".join(lines[1:rule]).split()
+    assert last in heads
+    rows = lines[rule + 1 : rule + 12]
+    assert rows[0].split()[:4] == ["1-3", "mlp", "width=128", "40.5k"], "the algorithm is in the title"
+    assert all(row.split()[0].partition("-")[0].isdigit() for row in rows)
+    assert all("█" in row for row in rows)
+    assert "46 of 55 pairs of 11 entries" in lines[rule + 12]
+    notes = " ".join(lines[rule + 12 :])
+    assert notes.count("--explain") == 1
+    assert "parameters:" not in " ".join(columns(made, 80, explain=True)), (
+        "the notes of columns that are shown"
+    )
+    assert "parameters:" in " ".join(columns(made, 140, explain=True))
+
+
+def test_bars_need_no_unicode() -> None:
+    (made,) = boards.of(boards.graded(2)).sheets()
+    buffer = io.TextIOWrapper(io.BytesIO(), "ascii")
+    Console(file=buffer, width=100).print(made)
+    buffer.flush()
+    assert "=" in buffer.buffer.getvalue().decode("ascii")  # type: ignore[attr-defined]
+
+
+def test_entries_of_other_lengths_have_a_line_below_the_table() -> None:
+    made = boards.of([*boards.graded(3), boards.entry("short one", 20, 40), boards.entry("shorter", 20, 20)])
+    assert [section.horizon for section in made.sections] == [200_000, 80_000, 40_000]
+    (found,) = made.sheets()
+    assert len(found.rows) == 3
+    assert [line.partition(" steps, ")[0] for line in found.lines[:2]] == [
+        "shorter: short one, 20 seeds, 80k",
+        "shorter: shorter, 20 seeds, 40k",
+    ]
+    assert found.lines[2:] == (
+        "--horizon 80000 ranks all at their first 80k steps",
+        "--horizon 40000 ranks all at their first 40k steps",
+    )
+
+
+def test_filters_change_no_rank() -> None:
+    asked = {"published": True, "runs": "none"}
+    ((full,), (few,), (many,)) = (
+        api.board("beam6g", **asked, **more).sections  # type: ignore[arg-type]
+        for more in ({}, {"entries": ["mlp width=64", "vqc-native qubits=8"]}, {"min_seeds": 100})
+    )
+    ranks = {row.entry.label: row.ranks for row in full.times.rows}
+    for section, size in ((few, 2), (many, 9)):
+        assert len(section.times.rows) == len(section.rows) == size
+        assert all(ranks[row.entry.label] == row.ranks for row in section.times.rows)
+        assert (section.times.n_ranked, section.times.n_pairs, section.times.n_decided) == (11, 55, 46)
+        tiers = {row.entry.label: row.tier for row in full.rows}
+        assert all(tiers[row.entry.label] == row.tier for row in section.rows)
+    i, j = few.times.order
+    assert few.times.rows[1].difference[0] == few.times.board.difference[j, i], (
+        "against the first that is shown"
+    )
+    alone = api.board("beam6g", **asked, entries=[row.entry for row in few.rows])  # type: ignore[arg-type]
+    assert alone.sections[0].times.n_ranked == 2
+
+
+def test_the_matrix_of_pairs() -> None:
+    entries = [
+        reaching("early", (0.72, 5), (1, 60)),
+        reaching("steady", (1, 30)),
+        reaching("slow one", (1, 80)),
+    ]
+    _, found = boards.of([*entries, reaching("few", (1, 3), seeds=5)]).sheets(pairs=True)
+    assert [row[2:] for row in found.rows] == [
+        ("", "+/-", "+", "?"),
+        ("+/-", "", "+", "?"),
+        ("-", "-", "", "?"),
+        ("?", "?", "?", ""),
+    ]
+
+
+def test_the_paper_s_rule_gives_the_published_tiers() -> None:
+    """As the paper defines them; README of version 0.1.1 printed the same."""
+    made = api.board("beam6g", rule="paper", published=True, runs="none")
+    found, pairs = made.sheets(pairs=True)
+    assert [column.head for column in found.columns[:5]] == [
+        "tier",
+        "entry",
+        "sample complexity (5%-95%)",
+        "rests on",
+        "cells +/-",
+    ]
+    assert [(row[0], row[1].removesuffix(" †"), row[3], row[4]) for row in found.rows] == [
+        ("1", "mlp width=64", "-", "335/19"),
+        ("1", "mlp width=128", "-", "361/3"),
+        ("2", "mlp width=256", "1 of 47", "361/7"),
+        ("2", "mlp width=32", "39 of 48", "162/127"),
+        ("3", "vqc-native qubits=12", "3 of 48", "141/91"),
+        ("3", "vqc-native qubits=14", "1 of 47", "89/121"),
+        ("4", "vqc-native qubits=10", "1 of 47", "100/141"),
+        ("5", "mlp width=16 lr=0.002", "1 of 47", "75/189"),
+        ("6", "vqc-native qubits=8", "1 of 46", "42/239"),
+        ("7", "vqc-native qubits=6", "1 of 46", "10/328"),
+        ("8", "mlp width=16", "1 of 46", "0/411"),
+    ]
+    assert pairs.rows[1][4] == "+1", "width 128 against width 256"
+
+
+def test_markdown_escapes_what_markdown_reads() -> None:
+    text = markdown(*(reaching(name, (1, 10)) for name in ("a|b", "c\\d", "<e>")))
     lines = [line for line in text.splitlines() if line.startswith("| 1-3 |")]
-    assert [line.split(" | ")[1] for line in lines] == ["/", "\\|", "\\\\"]
-    columns = {len(re.findall(r"(?<!\\)\|", line)) for line in text.splitlines() if line.startswith("| 1-3")}
-    assert columns == {9}
+    assert [line.split(" | ")[1] for line in lines] == ["&lt;e>", "a\\|b", "c\\\\d"]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {11}
 
 
-def test_the_page_shows_brackets_matrix_and_trade_offs(opened: Callable[..., Any]) -> None:
+def test_the_page_shows_ranks_matrix_and_trade_offs(opened: Callable[..., Any]) -> None:
     entries = [
         reaching("early", (0.72, 5), (1, 60)),
         reaching("steady", (1, 30)),
@@ -194,39 +313,38 @@ def test_the_page_shows_brackets_matrix_and_trade_offs(opened: Callable[..., Any
     ]
     for width in (1400, 390):
         tab = opened(boards.of(entries), width)
-        assert tab.locator(".timed tbody tr").count() == 4
-        assert tab.locator(".timed .rank.start").count() == tab.locator(".timed .rank.end").count() == 1
+        assert tab.locator(".ranks .rank").all_inner_texts() == ["1–2", "1–2", "3–4", "3–4"]
+        assert tab.locator(".lead").inner_text() == "No entry outperforms steady or early."
         assert tab.locator(".p-values tbody td").count() == 16
         assert tab.locator(".p-values td.both").count() == 2
         assert tab.locator(".special").count() == 1
         assert "Trade-off: steady needs fewer steps at epsilon 0.1" in tab.locator(".special").inner_text()
         assert tab.evaluate("document.documentElement.scrollWidth") == width
-        bottom, top = (tab.locator(f".timed .rank.{end}").bounding_box() for end in ("start", "end"))
-        assert bottom["x"] == top["x"]
 
 
 @pytest.mark.parametrize("text", [*boards.HOSTILE, "a_b & 50% #1 $x^2$ ~ \\input{x} [1] --x `y' {", "a\nb"])
 def test_latex_prints_every_name_as_it_is(text: str) -> None:
-    shown = latex.escaped(text)
+    shown = sheet.escaped(text)
     assert "\n" not in shown
     spelled = r"\\text[a-z]+\{\}|\\symbol\{\d+\}|\{\[\}|\{\]\}|-\{\}-|\\[&%$#_{}]"
     assert not set(re.sub(spelled, "", shown)) & set("\\&%$#_{}~^<>|\"`'[]"), shown
     assert "--" not in shown
-    written = latex.tables(boards.of([replace(boards.entry("x", 20), label=text), boards.entry("plain")]))
+    (made,) = boards.of([replace(boards.entry("x", 20), label=text), boards.entry("plain")]).sheets()
+    written = made.latex()
     rows = [line for line in written.splitlines() if line.endswith(r"\\")]
-    assert [len(re.findall(r"(?<!\\)&", row)) for row in rows] == [8, 8, 8]
+    assert [len(re.findall(r"(?<!\\)&", row)) for row in rows] == [9, 9, 9]
     assert written.count("{") - written.count(r"\{") == written.count("}") - written.count(r"\}")
 
 
 def test_latex_is_a_booktabs_table_per_section() -> None:
-    assert doctest.testmod(latex).failed == 0
+    assert doctest.testmod(sheet).failed == 0
     made = boards.of([*boards.graded(3, seeds=20), boards.entry("many", 100)])
-    text = latex.tables(made)
+    (text,) = (each.latex() for each in made.sheets())
     for part in (r"\toprule", r"\midrule", r"\bottomrule", r"\caption{", r"\label{tab:beam6g-200000}"):
         assert text.count(part) == 1
-    assert r"20$^\dagger$" in text
-    assert r"$\dagger$: fewer than 50 seeds" in text
-    assert r"$\alpha = 0.05$" in text
+    assert "& 20*! &" in text
+    assert "! fewer than 50 seeds" in text
+    assert "error 0.05 for all together" in text
 
 
 RULED = TINY.replace("[ranking]", '[ranking]\nrule = "times"')

@@ -65,7 +65,7 @@ def test_a_board_by_hand() -> None:
     assert board.p[0, 1] == pytest.approx(1e-4, abs=1e-4)
     assert np.isnan(board.p.diagonal()).all()
     assert board.signs[1, 0].tolist() == [1, 1]
-    assert board.neighbors_told_apart == (True, False)
+    assert board.outperforms.tolist() == [[False] * 3, [True, False, True], [False] * 3]
     assert board.order_at_half == board.order
     assert not board.few.any()
 

@@ -20,7 +20,6 @@ from qrlsuite.cli.arguments import (
     HorizonOption,
     MinSeedsOption,
     PublishedOption,
-    RuleOption,
     RunsOption,
     TaskOption,
     names_of,
@@ -30,10 +29,11 @@ from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import across as several
 from qrlsuite.leaderboard import board as boards
-from qrlsuite.leaderboard import latex, report, rules, tables
 from qrlsuite.leaderboard import plans as decision_plans
+from qrlsuite.leaderboard import report, tables
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
+from qrlsuite.leaderboard.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
 
@@ -84,7 +84,15 @@ def leaderboard(
             "--out", metavar="FILE", help="For html; default: leaderboard.html in the results folder."
         ),
     ] = None,
-    rule: RuleOption = None,
+    rule: Annotated[
+        str | None,
+        typer.Option(
+            "--rule",
+            metavar="NAME",
+            help="Tiers by cells of the grid in the place of ranks: paper, or a name of `qrlsuite list "
+            "significance-tests`.",
+        ),
+    ] = None,
     alpha: AlphaOption = ALPHA,
     by: Annotated[
         By,
@@ -92,21 +100,28 @@ def leaderboard(
             "--by", help="What learning is measured in; other than steps: by mean cost below threshold."
         ),
     ] = By.steps,
+    pairs: Annotated[bool, typer.Option("--pairs", help="Print the matrix of all pairs, too.")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Say below the table what its columns and marks mean.")
+    ] = False,
     across: AcrossOption = None,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
 ) -> None:
     """Rank the entries of each task by significant outperformance.
 
-    A tier is 1 + the length of the longest chain of entries above, each of which outperforms the next. Entries are
-    compared at equal numbers of seeds; below 20 the verdict is undecided. S_hat is the sample complexity: the
-    environment steps at which fewer than a fraction delta of the runs score 1 - epsilon or more, with its 5th to
-    95th percentile. With --published, your own copy of a published entry is shown too if it has fewer epochs.
+    A outperforms B if it needs significantly fewer environment steps at a threshold of the task and significantly
+    more at none: permutation tests, with Holm's correction over all pairs of the board, so that --alpha is the
+    probability of any false difference. An entry's rank is 1 + the number of entries that outperform it; a range says
+    which ranks the decided pairs leave. The order is by steps below threshold. Entries with fewer than 20 seeds are
+    not ranked. --entry and --min-seeds choose what is shown, and change no rank.
 
-    A second table ranks the same entries by mean time below threshold, with the differences in percent and the
-    ranks that are possible after all decided pairs, with one error probability for all pairs (--alpha). --across
-    compares entries that were trained on several tasks with the same options. The page also shows the plans of
-    `qrlsuite decide` in the results folder.
+    --rule paper ranks by the paper's definition instead: tiers of significant outperformance in the cells of the
+    task's grid, by intervals of the sample complexity.
+
+    With --published, your own copy of a published entry is shown too if it has fewer epochs. --across compares
+    entries that were trained on several tasks with the same options. The page also shows the plans of `qrlsuite
+    decide` in the results folder.
 
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all. Entries whose record does not hold it, or not so that it can be compared, have no rank.
@@ -121,10 +136,27 @@ def leaderboard(
     if by is not By.steps and (across is not None or rule is not None):
         other = "--across" if across is not None else f"--rule {rule}"
         raise OptionError(f"--by {by.value}: leave {other} out, which counts in environment steps")
+    if pairs and (across is not None or by is not By.steps):
+        raise OptionError(
+            "--pairs: only the board by steps has the matrix of pairs; --format json has the others'"
+        )
     if across is not None and study is not None:
         raise OptionError(f"--study {study}: leave --across out, or name the entries with --entry")
     if across is not None:
-        _across(across, task, entry or [], horizon, min_seeds, format_, output, rule, alpha, published, runs)
+        _across(
+            across,
+            task,
+            entry or [],
+            horizon,
+            min_seeds,
+            format_,
+            output,
+            rule,
+            alpha,
+            explain,
+            published,
+            runs,
+        )
         return
     costs = None
     if by is not By.steps:
@@ -140,7 +172,7 @@ def leaderboard(
             min_seeds=min_seeds,
         )
         if format_ is not Format.html:
-            _by_cost(costs, format_, task, runs)
+            _by_cost(costs, format_, task, runs, explain)
             return
     board = api.board(
         task,
@@ -164,20 +196,22 @@ def leaderboard(
         return
     if not board.sections:
         raise _empty(runs, task)
+    if format_ is Format.csv:
+        typer.echo(csv_rows(tables.flat(board)), nl=False)
+        return
+    _write(board.sheets(explain, pairs), format_)
+
+
+def _write(sheets: Sequence[Sheet], format_: Format) -> None:
+    """Write tables to the terminal, or as text."""
     if format_ is Format.markdown:
-        typer.echo(tables.markdown(board))
-    elif format_ is Format.csv:
-        typer.echo(tables.csv_text(board), nl=False)
+        typer.echo("\n".join(sheet.markdown() for sheet in sheets))
     elif format_ is Format.latex:
-        typer.echo(latex.tables(board), nl=False)
+        typer.echo("\n".join(sheet.latex() for sheet in sheets), nl=False)
     else:
-        console = table_console(tables.WIDE)
-        for section in board.sections:
-            console.print(tables.section_table(section, console.width))
-            console.print(tables.times_table(section, console.width))
-    for name, promise in board.rules.items() if format_ in (Format.table, Format.markdown) else ():
-        if name != rules.DEFAULT:
-            typer.echo(f"rule '{name}': {promise}")
+        console = table_console(WIDE)
+        for sheet in sheets:
+            console.print(sheet)
 
 
 def _tasks_of(board: Leaderboard, task: str | None, study: str | None) -> list[str]:
@@ -194,7 +228,7 @@ def _empty(runs: Path, task: str | None) -> UnknownNameError:
     )
 
 
-def _by_cost(board: CostBoard, format_: Format, task: str | None, runs: Path) -> None:
+def _by_cost(board: CostBoard, format_: Format, task: str | None, runs: Path, explain: bool) -> None:
     """Write a board by cost."""
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
@@ -203,16 +237,10 @@ def _by_cost(board: CostBoard, format_: Format, task: str | None, runs: Path) ->
         typer.echo(f"left out: {line}", err=True)
     if not board.sections:
         raise _empty(runs, task)
-    if format_ is Format.markdown:
-        typer.echo(tables.cost_markdown(board))
-    elif format_ is Format.csv:
-        typer.echo(tables.csv_rows(board.flat()), nl=False)
-    elif format_ is Format.latex:
-        typer.echo(latex.cost_tables(board), nl=False)
-    else:
-        console = table_console(tables.WIDE)
-        for section in board.sections:
-            console.print(tables.cost_table(section))
+    if format_ is Format.csv:
+        typer.echo(csv_rows(board.flat()), nl=False)
+        return
+    _write([section.sheet(explain) for section in board.sections], format_)
 
 
 def _page(
@@ -247,6 +275,7 @@ def _across(
     output: Path | None,
     rule: str | None,
     alpha: float,
+    explain: bool,
     published: bool,
     runs: Path,
 ) -> None:
@@ -265,11 +294,7 @@ def _across(
     if format_ is Format.html:
         single = boards.build(selected, board.refused, horizon=horizon, alpha=alpha)
         _page(single, output, runs, across, published, board)
-    elif format_ is Format.table:
-        table_console(tables.WIDE).print(tables.across_table(board))
-    elif format_ is Format.markdown:
-        typer.echo(tables.across_markdown(board))
-    elif format_ is Format.latex:
-        typer.echo(latex.across_table(board), nl=False)
+    elif format_ is Format.csv:
+        typer.echo(csv_rows(board.flat()), nl=False)
     else:
-        typer.echo(tables.csv_rows(board.flat()), nl=False)
+        _write([board.sheet(explain)], format_)
