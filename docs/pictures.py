@@ -82,7 +82,7 @@ PICTURES: dict[str, Picture] = {
     "quantum-or-not-entries.png": Plot(f"decide plot {PLAN} --entries", PLAN_FILES),
     "quantum-or-not-pairs.png": Plot(f"decide plot {PLAN}", PLAN_FILES),
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
-    "report-times.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1290, "By mean time below threshold"),
+    "report-pairs.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1000, "Who outperforms whom"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"

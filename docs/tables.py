@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from qrlsuite import api
-from qrlsuite.leaderboard import plans, tables
+from qrlsuite.leaderboard import plans
 from qrlsuite.leaderboard.plans import PublishedDecision
+from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.studies.decided import DecisionOutcome, by_question, difference_text, versus
 from qrlsuite.training.trainer import count_parameters
@@ -84,37 +86,32 @@ def entries(outcome: DecisionOutcome, questions: int | None) -> Rows:
             )
 
 
+def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
+    """Some columns of a sheet, in this order."""
+    yield heads
+    columns = {column.head: column.cells for column in sheet.columns}
+    yield from zip(*(columns[head] for head in heads))
+
+
+def board(task: str) -> Rows:
+    """The board as `qrlsuite leaderboard` prints it."""
+    [sheet] = api.board(task, published=True, runs="none").sheets()
+    heads = [column.head for column in sheet.columns if column.head not in ("core-hours", "settings")]
+    return _chosen(sheet, heads)
+
+
 def tiers(task: str) -> Rows:
-    """A board by significant outperformance; (†): settings chosen after seeing runs on protocol seeds."""
-    section = api.board(task, published=True, runs="none").sections[-1]
-    shown = ("tier", "rests on", "entry", "parameters", "seeds", "S_hat (5%-95%)", "score")
-    yield shown
-    for row in section.rows:
-        cells = dict(zip(tables.COLUMNS, tables.cells(section, row)))
-        cells["entry"] += " (†)" * row.entry.on_protocol_seeds
-        yield [cells[name] for name in shown]
-
-
-def times(task: str) -> Rows:
-    """A board by mean time below threshold, with the tiers beside it."""
-    section = api.board(task, published=True, runs="none").sections[-1]
-    depths = {row.entry.label: tables.tier_text(row) for row in section.rows}
-    shown = ("rank", "", "entry", "M (95%)", "above the first (95%)")
-    yield *shown, "tier"
-    for row in section.times.rows:
-        cells = dict(zip(section.times.columns(), section.times.cells(row)))
-        yield *(cells[name] for name in shown), depths[row.entry.label]
+    """The same by the paper's definition."""
+    [sheet] = api.board(task, rule="paper", published=True, runs="none").sheets()
+    first = ("tier", "rests on", "entry", "parameters", "seeds")
+    return _chosen(sheet, (*first, "sample complexity (5%-95%)", "final score"))
 
 
 def executions(task: str) -> Rows:
     """The entries that execute circuits, by what these cost."""
     [section] = api.costs(task, by="executions", published=True, runs="none").sections
-    shown = ("rank", "entry", "per step", "S_hat (5%-95%)", "M (95%)")
-    yield shown
-    for row in section.rows:
-        if not row.price.problem:
-            cells = dict(zip(section.columns(), section.cells(row)))
-            yield [cells[name] for name in shown]
+    kept = replace(section, rows=tuple(row for row in section.rows if not row.price.problem))
+    return _chosen(kept.sheet(), kept.columns()[:5])
 
 
 OF_PLANS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
@@ -122,7 +119,7 @@ OF_PLANS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
     "verdicts": verdicts,
     "entries": entries,
 }
-OF_BOARDS: dict[str, Callable[[str], Rows]] = {"tiers": tiers, "times": times, "executions": executions}
+OF_BOARDS: dict[str, Callable[[str], Rows]] = {"board": board, "tiers": tiers, "executions": executions}
 
 
 def _padded(cell: str) -> str:

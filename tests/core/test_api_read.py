@@ -116,9 +116,11 @@ def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None
     board = api.board("beam6g", entries=[small, large], **WHERE)
     comparison = api.compare(large, small)
     for shown in (board._repr_html_(), printed(board), repr(board), str(board)):
-        assert "ddqn mlp width=64" in shown
-        assert "60k (56k to 66k)" in shown
-        assert "score: median over seeds" in shown
+        assert "beam6g, ddqn, 200k steps" in shown
+        assert "42.5k (40.6k to 44.5k)" in shown
+        assert "1 of 1 pair of 2 entries decided" in shown, (
+            "entries that were read are compared by themselves"
+        )
     for shown in (comparison._repr_html_(), printed(comparison), repr(comparison), str(comparison)):
         said = " ".join(unescape(shown).split())
         assert comparison.verdict in said
@@ -127,9 +129,9 @@ def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None
     assert "387" in printed(small)
     assert repr(small).startswith("task        beam6g\nentry       ddqn mlp width=16 (ddqn-mlp-")
     heads = [
-        next(line for line in printed(board, width).splitlines() if "tier" in line) for width in (80, 200)
+        next(line for line in printed(board, width).splitlines() if "rank" in line) for width in (80, 200)
     ]
-    assert ["outperforms" in head for head in heads] == [False, True], "80 columns have no room for it"
+    assert ["settings" in head for head in heads] == [False, True], "80 columns have no room for it"
 
 
 def test_html_holds_nothing_but_text(large: EntryCurves) -> None:

@@ -95,7 +95,7 @@ def test_versions_that_mix_are_pointed_out(train: Callable[..., Path], tmp_path:
     record = json.loads(run.read_text())
     record["provenance"][0]["versions"]["torch"] = "2.0"
     run.write_text(json.dumps(record))
-    said = CliRunner().invoke(build(), ["leaderboard", "--runs", str(tmp_path / "runs")]).output
+    said = CliRunner().invoke(build(), ["leaderboard", "--explain", "--runs", str(tmp_path / "runs")]).output
     assert "made with several versions, see `qrlsuite show ENTRY`: ddqn mlp width=16 (torch)" in " ".join(
         said.split()
     )
