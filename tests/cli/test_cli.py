@@ -44,7 +44,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
     assert {row["label"] for row in section["rows"]} == {"ddqn mlp width=16", "ddqn mlp width=8"}
     assert all(row["tier"] is None and row["seeds"] == 4 for row in section["rows"])
     markdown = qrlsuite("leaderboard", "--runs", runs, "--format", "markdown").stdout
-    assert "| undecided | - | ddqn mlp width=8 |" in markdown
+    assert "| - | mlp width=8 |" in markdown
 
     compared = qrlsuite("compare", "mlp width=16", "mlp width=8", "--runs", runs)
     assert "undecided: fewer than 20 seeds" in compared.stdout

@@ -234,16 +234,18 @@ def test_it_is_ranked_and_stays_ranked_when_it_is_uninstalled(installed: Install
     before = board()
     assert set(before) == {"ddqn waves features=24", "ddqn mlp width=64"}
     assert {row["tier"] for row in before.values()} <= {1, 2}  # decided: 20 seeds each
-    assert "not installed" not in installed.qrlsuite("leaderboard", "--runs", "ranked").stdout
+    assert "not installed" not in installed.qrlsuite("leaderboard", "--explain", "--runs", "ranked").stdout
 
     installed.pip("uninstall", "--yes", "--quiet", "acme-qrl")
     assert installed.listed() == {}
     assert board() == before
-    table = " ".join(installed.qrlsuite("leaderboard", "--runs", "ranked").stdout.split())
+    table = " ".join(installed.qrlsuite("leaderboard", "--explain", "--runs", "ranked").stdout.split())
     assert (
         "not installed here: environment 'channel-hop', model 'waves'; ranked from the stored curves" in table
     )
-    circuits = installed.qrlsuite("leaderboard", "--runs", "circuits", "--format", "markdown").stdout
+    circuits = installed.qrlsuite(
+        "leaderboard", "--runs", "circuits", "--format", "markdown", "--explain"
+    ).stdout
     assert "ansatz 'rzz-ring'" in circuits
     assert "waves" in installed.qrlsuite("runs", "--runs", "ranked").stdout
     compared = installed.qrlsuite("compare", "waves", "mlp", "--runs", "ranked").stdout
