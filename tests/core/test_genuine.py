@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import board, collect, tables
+from qrlsuite.leaderboard import board, collect
 from qrlsuite.results.store import EntryStore, json_line
 
 
@@ -192,7 +192,8 @@ def test_no_word_of_a_stranger_controls_the_terminal(store: EntryStore, values: 
 def test_markdown_shows_labels_as_they_are() -> None:
     from tests.leaderboard.boards import entry
 
-    shown = tables.markdown(board.build([entry("mlp [a](http://x) *b* `c` _d_ e_f & <i>"), entry("mlp")]))
+    (sheet,) = board.build([entry("mlp [a](http://x) *b* `c` _d_ e_f & <i>"), entry("mlp")]).sheets()
+    shown = sheet.markdown()
     assert r"mlp \[a\](http://x) \*b\* \`c\` \_d\_ e_f &amp; &lt;i>" in shown
 
 
