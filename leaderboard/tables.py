@@ -83,7 +83,8 @@ def sheet(section: Section, explain: bool = False) -> Sheet:
     columns = _tier_columns(section) if section.by_tiers else _rank_columns(section)
     notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
     promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
-    remarks = (*notes, *_marks(section), *promise, *facts(section))
+    warnings = [*_diverged(section), *changed_thresholds([row.entry for row in section.rows])]
+    remarks = (notes[0], *warnings, *notes[1:], *_marks(section), *promise, *facts(section))
     return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
 
 
@@ -263,8 +264,7 @@ def _marks(section: Section) -> list[str]:
     protocol = rows[0].entry.task_file.protocol.seeds
     marks = [f"{mark} {MARKS[mark].format(protocol=protocol)}" for mark, there in occurring.items() if there]
     special = [] if section.by_tiers else times.trade_offs() + times.against_the_order()
-    first = changed_thresholds([row.entry for row in section.rows])
-    return [*_diverged(section), *first, *["; ".join(marks)] * bool(marks), *unequal_tuning(section), *special]
+    return ["; ".join(marks)] * bool(marks) + unequal_tuning(section) + special
 
 
 def _diverged(section: Section) -> list[str]:

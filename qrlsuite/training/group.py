@@ -132,7 +132,7 @@ class GroupFiles:
         for seed in self.seeds:
             folder = self.store.seed(seed)
             old = folder.record() or {}
-            begun = {"code": self.code.record()} if epoch == 0 else {}
+            begun: dict[str, Any] = {"code": self.code.record()} if epoch == 0 else {}
             kept = {name: old[name] for name in ("code", "probe") if name in old}
             record = {
                 **self._seed_record(seed),
