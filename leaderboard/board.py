@@ -264,7 +264,8 @@ class EntryComparison(Shown, Comparison):
 
     def _repr_html_(self) -> str:
         pair = self.pair
-        shown = tables.html_table(pair.columns(), pair.rows(), self.verdict, [*pair.notes, *self.further])
+        notes = [*pair.notes, *self.further]
+        shown = Sheet.of(self.verdict, pair.columns(), pair.rows(), notes, explained=True).html()
         return shown + (tables.comparison_html(self, self.headline) if self.show_cells else "")
 
 

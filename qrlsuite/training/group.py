@@ -133,7 +133,7 @@ class GroupFiles:
             folder = self.store.seed(seed)
             old = folder.record() or {}
             begun: dict[str, Any] = {"code": self.code.record()} if epoch == 0 else {}
-            kept = {name: old[name] for name in ("code", "probe") if name in old}
+            kept: dict[str, Any] = {name: old[name] for name in ("code", "probe") if name in old}
             record = {
                 **self._seed_record(seed),
                 **kept,
