@@ -95,7 +95,8 @@ def test_a_probe_is_said_stored_and_made_once(acme: Acme) -> None:
 
     assert "probing" not in acme.run("good", "4")
     assert acme.probes()[3] is None
-    shown = qrlsuite("leaderboard", "--runs", str(acme.folder / "runs"), env=acme.environment).stdout
+    words = ("leaderboard", "--explain", "--runs", str(acme.folder / "runs"))
+    shown = qrlsuite(*words, env=acme.environment).stdout
     assert "not probed" not in shown
 
 
@@ -134,7 +135,7 @@ def test_entries_of_earlier_versions_are_marked_until_they_are_trained_further(a
         record = json.loads(path.read_text())
         del record["probe"]
         path.write_text(json.dumps(record))
-    words = ("leaderboard", "--runs", str(acme.folder / "runs"))
+    words = ("leaderboard", "--explain", "--runs", str(acme.folder / "runs"))
     assert "not probed: ddqn good" in " ".join(qrlsuite(*words, env=acme.environment).stdout.split())
 
     assert "probed: seed 1 is the same alone" in acme.run("good", "3", "--epochs", "4")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qrlsuite import api
-from qrlsuite.leaderboard import board, pair, tables
+from qrlsuite.leaderboard import board, pair
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
@@ -147,5 +147,6 @@ def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
     changed, same = replace(first, first_thresholds=(0.9, 0.8)), replace(second, first_thresholds=kept[::-1])
     said = "thresholds changed after the first seed: first"
     assert said in board.compare_entries(changed, same).remarks
-    assert said in tables.markdown(boards.of([changed, same]))
-    assert "thresholds changed" not in tables.markdown(boards.of([first, same]))
+    (named,), (unchanged,) = (boards.of([one, same]).sheets(explain=True) for one in (changed, first))
+    assert said in named.markdown()
+    assert "thresholds changed" not in unchanged.markdown()
