@@ -474,7 +474,8 @@ def _readable(
             continue
         try:
             run = store.seed(seed).read()
-            require_scores(run.curve, task_file, store.seed(seed).path)
+            if len(run.scores):
+                require_scores(run.curve, task_file, store.seed(seed).path)
         except StoreError as error:
             refused.append(f"seed {seed}: {printable(error)}")
             continue

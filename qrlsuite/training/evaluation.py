@@ -170,7 +170,9 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     StoreError
         If a run has no parameters, they are not those of the entry's model, or its code has changed since.
     """
-    codes.require_installed(store, seeds, identity.of(entry))
+    codes.require_installed(
+        store, seeds, identity.of(store.entry())
+    )  # not of another backend that they act on
     stored = [parameters(store.seed(seed)) for seed in seeds]
     trainer = Trainer(entry, seeds, device)
     state: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())

@@ -29,7 +29,7 @@ from qrlsuite.training.trainer import Epoch, Report, Trainer
 CHECKPOINT_SECONDS = 60.0
 
 
-class Probe(Protocol):
+class GroupProbe(Protocol):
     """Shows, while a group is trained, that its middle seed does not depend on the others: `qrlsuite.engine.probe`."""
 
     def begin(self, trainer: Trainer) -> bool:
@@ -292,7 +292,7 @@ class GroupRun:
         report: Report = lambda progress: None,
         others: Sequence[tuple[store.EntryStore, Sequence[int]]] = (),
         held: Callable[[], bool] = lambda: True,
-        probe: Probe | None = None,
+        probe: GroupProbe | None = None,
     ) -> None:
         self.epochs, self.held, self.probe = epochs, held, probe
         parts = [(entry, entry_store, seeds), *((other.entry(), other, own) for other, own in others)]
@@ -380,7 +380,7 @@ class GroupRun:
         for files in self.files:
             files.begin(self.trainer.epoch, parameters, origin)
 
-    def _judge(self, guard: Interruptible, probe: Probe) -> None:
+    def _judge(self, guard: Interruptible, probe: GroupProbe) -> None:
         """Make the probe, and note what it found; an interruption ends it, and the same command makes it again.
 
         Raises

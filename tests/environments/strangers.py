@@ -98,11 +98,13 @@ class Endless(Walk):
 
 
 class Broken(Walk):
-    """Raises once, in the step after the 24th of one of its instances: whichever creates the file `marker`."""
+    """Raises once, in the step after the 24th of one of its instances: whichever creates the file `marker`.seen."""
 
     def __init__(self, marker: str) -> None:
         super().__init__()
-        self.marker = marker
+        self.marker = (
+            f"{marker}.seen"  # not the option itself: files that options name are part of an entry's code
+        )
         self.taken = 0
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

@@ -48,6 +48,7 @@ WHERE_OFFERED = {
     ("engines", "dask"): ["answers", "once"],
     ("significance_tests", "intervals"): ["against"],
     ("significance_tests", "times"): ["against"],
+    ("significance_tests", "times-skewed"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},
     **{("models", name): ["memory"] for name in ("fourier", "mlp", "vqc-native", "vqc-pennylane")},
     **{("algorithms", item.name): ["memory"] for item in EVERYTHING if item.kind == "algorithms"},

@@ -157,7 +157,7 @@ class _Name:
 
 
 @dataclass(eq=False)
-class _Table:
+class _Items:
     """Stands for a dictionary: its pairs, in order. Keys are not hashed, for a hash descends into them."""
 
     pairs: list[tuple[Any, Any]] = field(default_factory=list)
@@ -168,7 +168,7 @@ class _Table:
 
 
 @dataclass(eq=False)
-class _Call(_Table):
+class _Call(_Items):
     """Stands for what a call would return, with the state and the pairs that it was given then."""
 
     name: str = ""
@@ -298,11 +298,11 @@ class _Reader:
         self.stack[-1].extend(values)
 
     def _empty_dict(self, argument: Any) -> None:
-        self.stack.append(_Table())
+        self.stack.append(_Items())
 
     def _dict(self, argument: Any) -> None:
         values = self._taken()
-        self.stack.append(_Table())
+        self.stack.append(_Items())
         self._update(values)
 
     def _setitem(self, argument: Any) -> None:
@@ -313,7 +313,7 @@ class _Reader:
         self._update(self._taken())
 
     def _update(self, values: Sequence[Any]) -> None:
-        if not isinstance(self.stack[-1], _Table) or len(values) % 2:
+        if not isinstance(self.stack[-1], _Items) or len(values) % 2:
             raise ValueError("pairs are added to what is no dictionary")
         self.stack[-1].pairs += zip(values[::2], values[1::2])
 
@@ -437,7 +437,7 @@ def _extract(content: Any) -> dict[str, Any]:
     _Refused
         If it is not the content of a released result file.
     """
-    if not isinstance(content, _Table):
+    if not isinstance(content, _Items):
         raise _Refused("it does not hold a dictionary: not a released result file")
     parts = content.texts()
     if "val_returns" not in parts:
@@ -451,7 +451,7 @@ def _extract(content: Any) -> dict[str, Any]:
     if not np.isfinite(returns).all():
         raise _Refused("val_returns has values that are not finite")
     model = parts.get("model")
-    tensors = model.texts() if isinstance(model, _Table) else {}
+    tensors = model.texts() if isinstance(model, _Items) else {}
     shapes = {name: _tensor_shape(value) for name, value in tensors.items()}
     return {
         "returns": returns[1:].tolist(),
@@ -465,7 +465,7 @@ def _arguments(value: Any) -> dict[str, Any]:
     """Return the arguments that are numbers, short text, truth values or None."""
     if _is_call(value, "argparse.Namespace"):
         value = value.state
-    given = value.texts() if isinstance(value, _Table) else {}
+    given = value.texts() if isinstance(value, _Items) else {}
     numbers = {name: _number(argument) for name, argument in given.items()}
     return {name: argument for name, argument in numbers.items() if _short(argument)}
 
