@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
@@ -119,6 +120,16 @@ class ScoreRanking:
             *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
         ]
 
+    def sheet(self, explain: bool = False, shown: Collection[str] | None = None) -> Sheet:
+        """Return the table; `shown` names the entries that have a row, None all. What is shown changes no rank."""
+        places = [
+            place
+            for place, index in enumerate(self.order)
+            if shown is None or self.entries[index].name in shown
+        ]
+        rows = [self.cells(place) for place in places]
+        return Sheet.of(self.title, self.columns(), rows, self.notes(), ("entry",), explained=explain)
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
         order, results = list(self.order), self.results
@@ -192,4 +203,4 @@ def rank_by_score(
 
 
 def _interval(value: float, low: float, high: float) -> str:
-    return f"{value:.4g} ({low:.4g} to {high:.4g})"
+    return f"{value:.3f} ({low:.3f} to {high:.3f})"

@@ -6,7 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.leaderboard.scores import rank_by_score
@@ -21,8 +23,8 @@ def test_score_and_area_may_order_differently() -> None:
     score, area = (rank_by_score(both(), 200_000, by) for by in ("score", "area"))
     assert [row[:3] for row in map(score.cells, (0, 1))] == [("1", "slow", "30"), ("2", "fast", "30")]
     assert [row[:2] for row in map(area.cells, (0, 1))] == [("1", "fast"), ("2", "slow")]
-    assert score.cells(0)[3:] == ("0.9 (0.9 to 0.9)", "0.9 (0.9 to 0.9)", "-", "1.00")
-    assert score.cells(1)[5:] == ("0.2 (0.2 to 0.2)", "-")
+    assert score.cells(0)[3:] == ("0.900 (0.900 to 0.900)", "0.900 (0.900 to 0.900)", "-", "1.00")
+    assert score.cells(1)[5:] == ("0.200 (0.200 to 0.200)", "-")
     # .1 for 10 + 2 epochs, then .7 for 88; .1 for 62, then .9 for 38
     assert area.results.mean == pytest.approx([0.1 * 0.12 + 0.7 * 0.88, 0.1 * 0.62 + 0.9 * 0.38])
     assert score.n_last == 10
@@ -49,3 +51,16 @@ def test_bad_input_is_one_error() -> None:
         rank_by_score(both()[2:], 200_000)
     with pytest.raises(OptionError, match="not a whole number of epochs"):
         rank_by_score(both(), 2_001)
+
+
+def test_the_board_ranks_by_score_and_what_is_shown_changes_no_rank() -> None:
+    words = ["leaderboard", "--published", "--runs", "none", "--task", "beam6g", "--by", "score"]
+    (whole,) = json.loads(CliRunner().invoke(build(), [*words, "--format", "json"]).stdout)
+    assert len(whole["entries"]) == 11
+    assert whole["entries"][-1]["label"] == "ddqn mlp width=16"
+    low, high = whole["entries"][-1]["ranks"]
+    shown = CliRunner().invoke(build(), [*words, "--entry", "mlp width=16", "--format", "markdown"]).stdout
+    (row,) = [line for line in shown.splitlines() if "mlp width=16" in line]
+    assert row.startswith(f"| {low}-{high} |")
+    refused = CliRunner().invoke(build(), [*words, "--format", "html"]).exception
+    assert "--by score: no html; choose --format table" in str(refused)

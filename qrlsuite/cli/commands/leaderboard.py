@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -33,6 +34,7 @@ from qrlsuite.leaderboard import plans as decision_plans
 from qrlsuite.leaderboard import report, tables
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
+from qrlsuite.leaderboard.scores import rank_by_score
 from qrlsuite.leaderboard.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
@@ -56,6 +58,8 @@ class By(StrEnum):
     executions = "executions"
     shots = "shots"
     core_hours = "core-hours"
+    score = "score"
+    area = "area"
 
 
 app = typer.Typer(cls=SeveralTasksGroup, invoke_without_command=True)
@@ -97,7 +101,9 @@ def leaderboard(
     by: Annotated[
         By,
         typer.Option(
-            "--by", help="What learning is measured in; other than steps: by mean cost below threshold."
+            "--by",
+            help="What entries are ranked by: environment steps, executions, shots or core-hours below threshold, the "
+            "final score, or the area under the learning curve.",
         ),
     ] = By.steps,
     pairs: Annotated[bool, typer.Option("--pairs", help="Print the matrix of all pairs, too.")] = False,
@@ -125,6 +131,7 @@ def leaderboard(
 
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all. Entries whose record does not hold it, or not so that it can be compared, have no rank.
+    --by score ranks by the mean score of the last tenth of the epochs, and --by area by that of all epochs.
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
@@ -157,6 +164,12 @@ def leaderboard(
             published,
             runs,
         )
+        return
+    if by in (By.score, By.area):
+        chosen = functools.partial(
+            api.board, task, runs=runs, published=published, horizon=horizon, study=study, alpha=alpha
+        )
+        _by_score(chosen, by, entry or [], min_seeds, alpha, format_, explain)
         return
     costs = None
     if by is not By.steps:
@@ -241,6 +254,38 @@ def _by_cost(board: CostBoard, format_: Format, task: str | None, runs: Path, ex
         typer.echo(csv_rows(board.flat()), nl=False)
         return
     _write([section.sheet(explain) for section in board.sections], format_)
+
+
+def _by_score(
+    chosen: Callable[..., Leaderboard],
+    by: By,
+    names: Sequence[str],
+    min_seeds: int,
+    alpha: float,
+    format_: Format,
+    explain: bool,
+) -> None:
+    """Write the entries of each task by final score or by area; `names` and `min_seeds` choose what is shown."""
+    if format_ in (Format.html, Format.csv):
+        raise OptionError(
+            f"--by {by.value}: no {format_.value}; choose --format table, markdown, latex or json"
+        )
+    board, shown = chosen(), None
+    if names or min_seeds > 1:
+        filtered = chosen(entries=names, min_seeds=min_seeds)
+        shown = {row.entry.name for section in filtered.sections for row in section.rows}
+    for line in board.refused:
+        typer.echo(f"left out: {line}", err=True)
+    tasks = dict.fromkeys(section.task for section in board.sections)
+    mains = [tables.main_section([each for each in board.sections if each.task == task]) for task in tasks]
+    rankings = [
+        rank_by_score([row.entry for row in section.rows], section.horizon, by.value, alpha)
+        for section in mains
+    ]
+    if format_ is Format.json:
+        typer.echo(json.dumps([ranking.as_dict() for ranking in rankings]))
+    else:
+        _write([ranking.sheet(explain, shown) for ranking in rankings], format_)
 
 
 def _page(
