@@ -1,4 +1,4 @@
-# `make quickstart` trains a small classical and a small quantum model and compares them; `make test` checks the suite.
+# `make quickstart` trains two networks and a circuit and compares them; `make test` checks the suite.
 PYTHON ?= python3
 VENV ?= .venv
 RUNS ?= runs

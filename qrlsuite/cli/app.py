@@ -41,7 +41,7 @@ _ROOM = "qrlsuite.cli.commands"
 BUILT_IN = {
     command.name: command
     for command in (
-        LazyCommand("demo", "Train two small models and compare them: 5 minutes.", f"{_ROOM}.demo:demo"),
+        LazyCommand("demo", "Train three models and compare them: 2 minutes.", f"{_ROOM}.demo:demo"),
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
         LazyCommand("runs", "List the results folder, and what is running in it.", f"{_ROOM}.runs:app"),
         LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),

@@ -16,7 +16,6 @@ import yaml
 from qrlsuite.cli.commands import demo
 from qrlsuite.leaderboard.changed import PLACES
 from tests.commands import qrlsuite
-from tests.core.test_docs import parse
 
 ROOT = Path(__file__).parents[2]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -224,29 +223,27 @@ def test_the_judge_takes_data_alone(name: str, differs: str, tmp_path: Path) -> 
     assert {path.name for path in clone.iterdir()} == {*before, "report.txt"}
 
 
-@pytest.mark.parametrize("fails", [False, True])
-def test_the_demo_is_four_commands(
-    fails: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_demo_ends_with_a_sentence_for_each_pair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """They exist with their options; where no epoch of both models was finished, the picture has what there is."""
-    lines: list[list[str]] = []
-
-    def application() -> object:
-        def run(words: list[str], **_: object) -> None:
-            lines.append(words)
-            if fails and words[0] == "plot" and "--entry" in words:
-                raise demo.QrlSuiteError("no such entry")
-
-        return run
-
-    monkeypatch.setattr(demo, "build", application)
-    demo.demo(minutes=2, runs=Path("elsewhere"))
-    assert [words[0] for words in lines] == ["run", "run", *["plot"] * (1 + fails), "leaderboard"]
-    assert not any(parse(words) for words in lines)
-    assert all(words[-2:] == ["--runs", "elsewhere"] for words in lines)
-    said = capsys.readouterr().err
-    assert ("no such entry\nshowing what there is; to train on, type" in said) == fails
-    assert "demo --runs elsewhere\n" in said or not fails
+    """At an epoch and at few seeds it is the same demo, and its sentences say that this is too short."""
+    monkeypatch.setattr(demo, "EPOCHS", 1)
+    monkeypatch.setattr(demo, "SEEDS", 2)
+    demo.demo(runs=tmp_path / "runs")
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if line.startswith("$ ")]
+    assert [re.findall(r"qrlsuite (\w+)", line)[-1] for line in lines] == ["run"] * 3 + [
+        "leaderboard",
+        "plot",
+    ]
+    assert "times as fast). Their values differ by" in said.err
+    assert (tmp_path / "runs" / "beam6g-curves.png").exists()
+    verdicts = [line for line in said.out.splitlines() if line.startswith("- ")]
+    assert len(verdicts) == 3
+    assert all("neither reached any of the 7 thresholds within 2k steps" in line for line in verdicts), (
+        verdicts
+    )
+    assert "Your 2 seeds, 2000 steps each" in said.out
 
 
 def test_make_starts_the_demo() -> None:
