@@ -387,6 +387,7 @@ class RunDisplay:
                 f"no seed reached a threshold: the lowest is {summary['lowest_threshold']:.4g}, the best score seen "
                 f"{summary['best_score']:.4g}. Entries that reach none cannot be told apart: train longer "
                 "(--epochs), or lower the thresholds ([ranking] in the task file) before the next entry is trained",
+                markup=False,
                 soft_wrap=True,
             )
         if summary["diverged"]:
