@@ -288,13 +288,13 @@ def on_board(
         reached = entry.reaching(end // entry.steps_per_epoch)
         if reached is not None and len(reached.seeds) >= MIN_RUNS:
             ranked.append(reached)
-    names = [(entry.folder, entry.name) for entry in ranked]
-    pair = (first.folder, first.name), (second.folder, second.name)
-    if len(ranked) < 3 or not set(pair) <= set(names):
+    places = [(entry.folder, entry.codes) for entry in ranked]  # a board calls one of two copies another name
+    pair = (first.folder, first.codes), (second.folder, second.codes)
+    if len(ranked) < 3 or not set(pair) <= set(places):
         return None
     curves = [LearningCurves(each.curves, each.steps_per_epoch, str(k)) for k, each in enumerate(ranked)]
     board = times_board(curves, grid, alpha, end)
-    i, j = map(names.index, pair)
+    i, j = map(places.index, pair)
     return OnBoard(len(ranked), float(board.adjusted[i, j]), board.directions[i][j])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -469,10 +470,11 @@ SYMBOLS = {
 
 def pair_table(pair: PairVerdict) -> Table:
     """Return two entries threshold by threshold as a table."""
-    columns = pair.columns()
-    result = table(
-        columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=(columns[0], *columns[3:])
-    )
+    heading, *labels, size, p, verdict = pair.columns()
+    heads = ("\n".join(textwrap.wrap(label, 9, break_long_words=False)) for label in labels)
+    columns = (heading, *heads, size, p, verdict)
+    result = table(columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=columns[:-1])
+    result.show_edge = False  # so that its numbers fit into 80 characters
     for row in pair.rows():
         result.add_row(*map(Text, row))
     return result

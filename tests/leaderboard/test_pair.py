@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import doctest
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from qrlsuite import api
-from qrlsuite.leaderboard import board, pair
+from qrlsuite.leaderboard import board, pair, tables
 from qrlsuite.leaderboard.curves import EntryCurves
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
@@ -121,8 +123,20 @@ def test_the_board_of_more_entries_is_stricter() -> None:
     assert among.text.startswith(
         "on the board of 8 entries, which is stricter (28 pairs): not told apart, adjusted p = "
     )
+    renamed = replace(first, name="first-published", label="first (published)")
+    assert pair.on_board(first, second, [renamed, second, *others], grid, 0.05) == among
     assert pair.on_board(first, second, [first, second], grid, 0.05) is None
     assert pair.on_board(first, few, [first, few, *others], grid, 0.05) is None
+
+
+def test_numbers_in_a_label_are_never_cut_by_a_narrow_terminal() -> None:
+    compared = board.compare_entries(entry("mlp width=16", spread(18)), entry("mlp width=64", spread(38)))
+    console = Console(width=80, file=io.StringIO())
+    console.print(tables.pair_table(compared.pair))
+    shown = console.file.getvalue()
+    assert "width=16   width=64" in shown
+    for cells in compared.pair.rows():
+        assert all(cell in shown for cell in cells), cells
 
 
 @pytest.mark.parametrize(
