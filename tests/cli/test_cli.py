@@ -302,6 +302,14 @@ def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     assert qrlsuite("show", "register_models").stdout == manual
 
 
+def test_show_says_how_a_published_entry_was_made() -> None:
+    name = ("show", "cartpole/reinforce mlp", "--published")
+    shown = json.loads(qrlsuite(*name, "--json").stdout)
+    assert (shown["seeds"], shown["parameters"]["classical"]) == (100, 114)
+    assert shown["provenance"][0]["versions"]["qrlsuite"] == "0.1.0"
+    assert json.loads(qrlsuite(*name, "--identity", "--json").stdout)["seeds"] == {"0:100": ["not recorded"]}
+
+
 def test_version_and_help() -> None:
     assert qrlsuite("--version").stdout.startswith("qrlsuite ")
     for command in ("run", "leaderboard", "compare", "plot", "list", "show"):

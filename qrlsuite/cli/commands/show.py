@@ -19,6 +19,7 @@ from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.catalog import describe, hooks
 from qrlsuite.leaderboard import collect, pictures, rules
+from qrlsuite.leaderboard import published as published_entries
 from qrlsuite.options import parse_setting
 from qrlsuite.results import codes, lookup
 from qrlsuite.results.seeds import format_seeds
@@ -83,7 +84,7 @@ def show(
     if not kinds and kind is None:
         folder = _entry_folder(runs, target, published)
         if folder is not None:
-            content = _code_of_entry(EntryStore(folder)) if code else outline(EntryStore(folder))
+            content = _code_of_entry(EntryStore(folder)) if code else _outline(EntryStore(folder))
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not kinds:
@@ -165,6 +166,21 @@ def _entry_folder(runs: Path, name: str, published: bool) -> Path | None:
         return None
 
 
+def _outline(store: EntryStore) -> dict[str, Any]:
+    """Return an entry's options and how it was made; a published one has no folders of seeds, but says it itself."""
+    content = outline(store)
+    if not published_entries.is_published(store.path):
+        return content
+    made = published_entries.read(store.path)
+    said = made.record["published"]
+    return {
+        **content,
+        "seeds": len(made.seeds),
+        "provenance": said["provenance"],
+        "parameters": said["parameters"],
+    }
+
+
 def _code_of_entry(store: EntryStore) -> dict[str, Any]:
     """Return the steps from an entry's code to its identity, and with which identities its seeds were trained."""
     entry = store.entry()
@@ -175,10 +191,19 @@ def _code_of_entry(store: EntryStore) -> dict[str, Any]:
         "parts": {f"{part['role']} {part['name']}": dict(part) for part in now.parts},
         "text": now.text,
         "digest": now.digest,
-        "seeds": {
-            format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]
-            for group in codes.of_seeds(store)
-        },
+        "seeds": _codes_of_seeds(store),
+    }
+
+
+def _codes_of_seeds(store: EntryStore) -> dict[str, list[str]]:
+    """Return the digests of the code of an entry's seeds, or of its record where it is published."""
+    if published_entries.is_published(store.path):
+        made = published_entries.read(store.path)
+        code = codes.read(made.record, store.path / "entry.json")
+        return {format_seeds(made.seeds): ["not recorded" if code is None else code.digest]}
+    return {
+        format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]
+        for group in codes.of_seeds(store)
     }
 
 
