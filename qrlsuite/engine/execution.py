@@ -157,8 +157,8 @@ class Plan:
 
     @property
     def left(self) -> int:
-        """Epochs to train, summed over the seeds."""
-        return sum(len(group.seeds) * (self.epochs - group.epoch) for group in self.groups)
+        """Epochs to train, summed over the seeds; none for those that an interrupted longer run has already."""
+        return sum(len(group.seeds) * max(0, self.epochs - group.epoch) for group in self.groups)
 
     @property
     def together(self) -> int | None:

@@ -38,6 +38,11 @@ def test_a_narrow_terminal_shows_fewer_columns_and_says_which(columns: int, left
     assert [name for name in heads if name in told] == list(heads[len(heads) - left_out :])
 
 
+def test_seeds_of_a_longer_run_take_no_time_in_a_shorter_one(entry: Entry, tmp_path: Path) -> None:
+    groups = [SeedGroup((0, 1), 8), SeedGroup((2,), 3)]
+    assert Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 5, groups=groups).left == 2
+
+
 def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, monkeypatch) -> None:
     path: Path = train("runs", [0, 1, 2])
     train("runs", [3, 4])
