@@ -123,8 +123,7 @@ def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenO
     runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
     for run in runs_by_seed.values():  # all of them, before anything is written
         require_scores(run.curve, entry.task.file, source.seed(run.seed).path)
-    codes.require_mergeable(store, source, exported is not None)
-    store = EntryStore.create(runs, entry)
+    store = EntryStore.create(runs, entry, _place_for(store, source, exported is not None, runs, entry))
     claim = acquire(store, seeds)
     try:
         return (
@@ -134,6 +133,24 @@ def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenO
         )
     finally:
         claim.release()
+
+
+def _place_for(store: EntryStore, source: EntryStore, exported: bool, runs: Path, entry: Entry) -> str:
+    """Return the mark of the folder that seeds go to: none beside seeds of the same code, else the one that they have.
+
+    Raises
+    ------
+    ChangedCodeError
+        If seeds of another code are there.
+    """
+    try:
+        codes.require_mergeable(store, source, exported)
+    except codes.ChangedCodeError:
+        if not source.mark:
+            raise
+        codes.require_mergeable(EntryStore.find(runs, entry, source.mark), source, exported)
+        return source.mark
+    return ""
 
 
 def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:

@@ -533,33 +533,39 @@ class EntryStore:
         return found[0] if found is not None and found.end() == len(self.path.name) else ""
 
     @classmethod
-    def find(cls, runs: Path, entry: Entry) -> EntryStore:
+    def find(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:
         """Return the entry's folder below a results folder, whether it is there or not.
+
+        Parameters
+        ----------
+        mark:
+            That of seeds of another code, which stand beside the entry's own.
 
         Raises
         ------
         StoreError
             If a folder of another format version or another entry is in its place, or a link.
         """
-        store = cls(runs / entry.task.name / entry.name)
+        store = cls(runs / entry.task.name / f"{entry.name}{mark}")
         genuine.require_no_link(store.path.parent, store.path)
         if (store.path / "entry.json").exists() and store.record().get("hash") != entry.hash:
             raise StoreError(f"{store.path} belongs to another entry; choose another folder with --runs DIR")
         return store
 
     @classmethod
-    def create(cls, runs: Path, entry: Entry) -> EntryStore:
+    def create(cls, runs: Path, entry: Entry, mark: str = "") -> EntryStore:
         """Return the entry's folder below a results folder, made if it is not there.
 
         Where the entry's settings are known to come from tuning, its record says so from now on; of two records
         of tuning the one that took more steps stands; one that does not know its steps gives way to one that does.
+        `mark` is as for `find`.
 
         Raises
         ------
         StoreError
             If a folder of another format version or another entry is in its place, or it cannot be made.
         """
-        store = cls.find(runs, entry)
+        store = cls.find(runs, entry, mark)
         path = store.path / "entry.json"
         if not path.exists():
             write_json(path, entry.record())

@@ -310,6 +310,22 @@ def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(au
     assert list(author.board().values()) == [2]
 
 
+def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(author: Author) -> None:
+    assert author.run(model="line").returncode == 0
+    author.edit("own_helper", "rand(", "randn(")
+    assert author.run("--fresh", model="line").returncode == 0
+    before, author.runs = author.runs, author.folder / "more"
+    held = sorted(path.relative_to(before) for path in before.glob("*/*/seed-*/run.json"))
+    assert len(held) == 4
+    for _ in range(2):  # again, there is nothing new
+        done = author.command("import", str(before))
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert (
+            sorted(path.relative_to(author.runs) for path in author.runs.glob("*/*/seed-*/run.json")) == held
+        )
+    assert list(author.board().values()) == [2, 2]
+
+
 STUDY = """
 format_version = 1
 name = "lines"

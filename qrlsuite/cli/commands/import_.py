@@ -49,7 +49,8 @@ def import_entries(
             continue
         new = f"imported seeds {format_seeds(taken.new)}" if taken.new else "nothing new"
         known = f", {counted(len(taken.known), 'seed')} here already" if taken.known else ""
-        typer.echo(f"{taken.entry.label} on {taken.entry.task.name}: {new}{known}")
+        label = f"{taken.entry.label} {taken.store.mark}".rstrip()
+        typer.echo(f"{label} on {taken.entry.task.name}: {new}{known}")
         for note in taken.notes:
             typer.echo(f"  note: {note}", err=True)
     if json_output:
