@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import keyword
+import math
 import re
 import shutil
 import sys
@@ -16,11 +17,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError
 
 TEMPLATES = Path(__file__).parent / "templates"
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 LONGEST = 40
+WAY = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95)
+"""Where a new task's thresholds lie on the way from the random to the best known score."""
 
 
 class ScaffoldError(QrlSuiteError):
@@ -40,11 +43,15 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class _Words:
-    """What is said about a kind: a summary, what to type after installing, and the files besides registration."""
+    """What is said about a kind: a summary, what to type after installing, and the files besides registration.
+
+    A kind with a task has a range, too: the scores of random actions and of the best policy known.
+    """
 
     summary: str
     commands: tuple[str, ...]
     files: dict[str, str]
+    range: tuple[float, float] | None = None
 
 
 _WORDS = {
@@ -65,6 +72,7 @@ _WORDS = {
         "walk along a line to a place",
         ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --seeds 20"),
         {"environment.py": "the environment: edit this", "task.toml": "a task with it: protocol and ranking"},
+        range=(0.65, 1.0),
     ),
     Kind.algorithm: _Words(
         "policy gradient with a mean baseline",
@@ -78,6 +86,7 @@ _WORDS = {
         "balance a pole for 200 steps",
         ("qrlsuite show task {thing}", "qrlsuite run --task {thing} --model mlp --quick"),
         {"task.toml": "environment, protocol and ranking: edit this"},
+        range=(0.11, 1.0),
     ),
     Kind.tracker: _Words(
         "every epoch as a line of a CSV file",
@@ -112,7 +121,7 @@ class Package:
     files: dict[str, str]
 
 
-def package(name: str, kind: Kind) -> Package:
+def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) -> Package:
     """Render a plugin package.
 
     Parameters
@@ -121,9 +130,14 @@ def package(name: str, kind: Kind) -> Package:
         Of the distribution, `acme-ring`: lower-case words and digits with single hyphens between them.
     kind:
         What it adds.
+    scores:
+        For a kind with a task: the scores of random actions and of the best policy known, between which its
+        thresholds are spread. Numbers outside [0, 1] are returns. Default: those of the template's environment.
 
     Raises
     ------
+    OptionError
+        If the kind has no task, or the scores are no range.
     ScaffoldError
         If a package cannot have the name, or something is installed or registered under it.
     """
@@ -153,6 +167,7 @@ def package(name: str, kind: Kind) -> Package:
         "contents": list(contents.items()),
         "files": any(file.endswith(".toml") for file in template_words.files),
         "versions": compatible_versions(),
+        **_ranking(kind, scores),
     }
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
@@ -170,6 +185,34 @@ def package(name: str, kind: Kind) -> Package:
         files[path] = render(f"{kind}/{template}.jinja")
     files[f"{source}/py.typed"] = ""
     return Package(name, module, thing, commands, files)
+
+
+def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object]:
+    """Return what a task's template says of the range of scores and of the thresholds in it."""
+    usual = _WORDS[kind].range
+    if usual is None:
+        if scores is not None:
+            raise OptionError(f"--range: a new {kind} has no task; it goes with --kind task or environment")
+        return {}
+    worst, best = scores or usual
+    span = best - worst
+    if not 0 < span < math.inf:
+        raise OptionError(
+            f"--range {worst:g} {best:g}: give two numbers, the score of random actions and then the best known "
+            "one, which is larger"
+        )
+    digits = 2 - math.floor(math.log10(span))
+    relative = worst >= 0 and best <= 1
+    levels = [worst + part * span for part in WAY]
+    cells = [round(1 - level if relative else level, digits) for level in levels]
+    return {
+        "relative": relative,
+        "random": worst,
+        "best": best,
+        "way": ", ".join(f"{part:.0%}" for part in WAY),
+        "cells": sorted(cells),
+        "reference": cells[WAY.index(0.9)],
+    }
 
 
 def _names(name: str, kind: Kind) -> tuple[str, str]:

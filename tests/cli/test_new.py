@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from qrlsuite import __version__, scaffold
 from qrlsuite.cli import main
-from qrlsuite.errors import QrlSuiteError
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.experiment.task import parse
 from qrlsuite.scaffold import Kind
 from tests import commands
 from tests.commands import Command, start
@@ -145,6 +148,80 @@ def test_json_names_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert content["folder"] == str(tmp_path / "qrlsuite-csv")
     assert "src/qrlsuite_csv/__init__.py" in content["files"]
     assert "--track csv=epochs.csv" in content["next"][-1]
+
+
+RANDOM = """
+import sys
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.training.evaluation import references
+*_, random = references(resolve(sys.argv[1], "mlp"), episodes=500)
+print(random.scores.mean())
+"""
+
+
+@pytest.mark.parametrize(("kind", "stated"), [(Kind.task, 0.11), (Kind.environment, 0.65)])
+def test_a_new_tasks_thresholds_begin_above_random_actions(packages: Path, kind: Kind, stated: float) -> None:
+    env = installed(packages / "site")
+    measured = float(run(sys.executable, "-c", RANDOM, f"acme-{kind}", env=env))
+    text = (packages / f"acme-{kind}" / f"src/acme_{kind}/task.toml").read_text()
+    assert f"Random actions have the score {stated}, the best policy known has 1.0." in text
+    assert measured == pytest.approx(stated, abs=0.03)
+    ranking = tomllib.loads(text)["ranking"]
+    lowest, highest = 1 - max(ranking["epsilons"]), 1 - min(ranking["epsilons"])
+    assert lowest == pytest.approx(stated + 0.3 * (1 - stated), abs=0.001)
+    assert measured + 0.05 < lowest < highest < 1
+    assert commands.qrlsuite("check", f"task:acme-{kind}", env=env).returncode == 0
+
+
+@pytest.mark.parametrize("kind", [Kind.task, Kind.environment])
+@pytest.mark.parametrize(
+    ("scores", "unit", "expected", "reference"),
+    [
+        (("0.2", "0.7"), "epsilon", [0.325, 0.35, 0.4, 0.45, 0.55, 0.65], 0.35),
+        (("-500", "-80"), "threshold", [-374, -290, -206, -164, -122, -101], -122),
+        (("10000", "10010"), "threshold", [10003, 10005, 10007, 10008, 10009, 10009.5], 10009),
+    ],
+)
+def test_a_range_sets_the_thresholds(
+    kind: Kind,
+    scores: tuple[str, str],
+    unit: str,
+    expected: list[float],
+    reference: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Relative scores within 0 and 1, otherwise returns, which need no maximum."""
+    words = ["new", "plugin", "acme-x", "--kind", str(kind), "--out", str(tmp_path), "--range", *scores]
+    code, _, err = qrlsuite(capsys, *words)
+    assert code == 0, err
+    file = tmp_path / "acme-x" / "src" / "acme_x" / "task.toml"
+    text = file.read_text()
+    ranking = tomllib.loads(text)["ranking"]
+    assert ranking[f"{unit}s"] == pytest.approx(expected)
+    assert ranking["reference"] == {unit: pytest.approx(reference), "delta": 0.75}
+    assert ("max_return = 200" in text) == (unit == "epsilon" and kind is Kind.task)
+    beam6g = '[environment]\nname = "beam6g"\n\n'  # acme-x is not installed
+    assert parse(re.sub(r"\[environment\](.|\n)*(?=\[protocol\])", beam6g, text), str(file)).name == "acme-x"
+
+
+@pytest.mark.parametrize(
+    ("kind", "scores", "message"),
+    [
+        (Kind.task, (1.0, 0.2), "--range 1 0.2: give two numbers"),
+        (Kind.task, (0.2, 0.2), "--range 0.2 0.2: give two numbers"),
+        (Kind.environment, (float("nan"), 1.0), "--range nan 1: give two numbers"),
+        (Kind.environment, (0.0, float("inf")), "--range 0 inf: give two numbers"),
+        (
+            Kind.ansatz,
+            (0.2, 1.0),
+            "--range: a new ansatz has no task; it goes with --kind task or environment",
+        ),
+    ],
+)
+def test_what_is_no_range_is_refused(kind: Kind, scores: tuple[float, float], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        scaffold.package("acme-x", kind, scores)
 
 
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,6 +35,15 @@ def plugin(
         typer.Argument(metavar="NAME", help="The package's name, also that of what it registers: acme-ring."),
     ],
     kind: Annotated[Kind, typer.Option("--kind", help="What it adds.")],
+    scores: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--range",
+            metavar="RANDOM BEST",
+            help="For a task: the score of random actions and the best known one, between which its thresholds are "
+            "spread. Numbers outside 0..1 are returns. Default: those of the template's environment.",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write it into.")] = Path(),
     json_output: JsonOption = False,
 ) -> None:
@@ -45,7 +54,7 @@ def plugin(
 
     Example: qrlsuite new plugin acme-ring --kind ansatz
     """
-    files = scaffold.package(name, kind)
+    files = scaffold.package(name, kind, scores)
     folder = scaffold.write(files, out)
     if json_output:
         content = {"folder": str(folder), "files": sorted(files.files), "next": list(files.commands)}
