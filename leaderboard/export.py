@@ -89,6 +89,10 @@ def _refuse_smaller(folder: Path, entry: EntryCurves, force: bool) -> None:
     except StoreError as error:
         raise QrlSuiteError(f"{error}; --force replaces it") from None
     if len(before.seeds) > len(entry.seeds) or before.curves.shape[1] > entry.curves.shape[1]:
+        if before.record["name"] == entry.folder.name.partition("@")[0] != entry.folder.name:
+            raise QrlSuiteError(
+                f"{entry.folder} holds seeds of another code than those exported to {folder}: --out another folder"
+            )
         raise QrlSuiteError(
             f"{folder} has {len(before.seeds)} seeds of {before.curves.shape[1]} epochs, "
             f"and '{entry.label}' {len(entry.seeds)} of {entry.curves.shape[1]}; --force replaces it"

@@ -224,7 +224,7 @@ def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[Gro
     alive = living(store)
     statuses = [_running(store, claim) for claim in alive]
     seen = {seed for claim in alive for seed in claim.seeds}
-    done = _finished(store)
+    done, damaged = _finished(store)
     gone: list[GroupStatus] = []
     for task in waiting(store, []):
         rest = tuple(seed for seed in task["seeds"] if seed not in seen | done)
@@ -238,7 +238,7 @@ def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[Gro
                 left_out = tuple(seed for seed in rest if seed not in waits)
                 gone.append(GroupStatus(left_out, "stopped", f"{job} has left the queue", progress))
             seen |= set(rest)
-    left = set(store.seeds()) - seen - done
+    left = set(store.seeds()) - seen - done - damaged
     for path in sorted(store.groups.glob("*/progress.json")):
         progress = read_progress(path)
         if progress.get("error") and left:
@@ -254,16 +254,18 @@ def _running(store: EntryStore, claim: Claim) -> GroupStatus:
     return GroupStatus(claim.seeds, "running", f"{claim.host}, process {claim.pid}", read_progress(path))
 
 
-def _finished(store: EntryStore) -> set[int]:
-    done = set()
+def _finished(store: EntryStore) -> tuple[set[int], set[int]]:
+    """Return the seeds that have finished, and those whose records cannot be read, which no run goes on with."""
+    done, damaged = set(), set()
     for seed in store.seeds():
         try:
             record = store.seed(seed).record() or {}
         except StoreError:
+            damaged.add(seed)
             continue
         if record.get("status") == "finished":
             done.add(seed)
-    return done
+    return done, damaged
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import board, collect
 from qrlsuite.results.store import EntryStore, json_line
+from qrlsuite.results.survey import groups
 
 
 @pytest.fixture
@@ -200,3 +201,10 @@ def test_markdown_shows_labels_as_they_are() -> None:
 def test_an_entrys_hash_is_that_of_its_identity(store: EntryStore) -> None:
     record = store.record()
     assert digest(record["identity"]) == record["hash"]
+
+
+def test_a_damaged_seed_is_not_said_to_go_on(store: EntryStore) -> None:
+    store.seed(1).path.joinpath("run.json").write_text("{")
+    assert not [group for group in groups(store) if group.state == "stopped"]
+    store.seed(0).write_record({**(store.seed(0).record() or {}), "status": "running"})
+    assert [group.seeds for group in groups(store) if group.state == "stopped"] == [(0,)]
