@@ -654,8 +654,8 @@ def tune(
     epochs:
         Of each trial; None takes the task's protocol.
     objective:
-        What is minimized: M, the mean number of steps below the task's thresholds (`time`), S_hat at the task's
-        reference `cell`, or its mean over the ranking grid (`area`).
+        What is minimized: steps below threshold (`time`), sample complexity at the task's reference `cell`, or its
+        mean over the ranking grid (`area`).
     minutes:
         Begin no trial that would not end within this time. Every call gets it anew.
     out:

@@ -144,10 +144,10 @@ def places(signs: NDArray[np.int64], kind: str, levels: Sequence[str]) -> str:
 
 
 def difference(board: TimeRanking, first: str, second: str) -> str:
-    """Write how much longer the first entry's M is, and where fewer or more steps are significant."""
+    """Write how many more steps below threshold the first entry has, and where fewer or more steps are significant."""
     labels = [row.entry.label for row in board.rows]
     i, j = (board.order[labels.index(label)] for label in (first, second))
-    text = f"M {percent(board.board.difference[i, j])}"
+    text = f"steps below threshold {percent(board.board.difference[i, j])}"
     told_apart = board.board.directions[i][j] is not Direction.NOT_TOLD_APART
     return text + places(board.board.signs[i, j], board.kind, board.levels) * told_apart
 
@@ -489,14 +489,14 @@ def thousands(values: Iterable[float]) -> str:
 
 
 def mean_times(placements: Placements, model: str) -> NDArray[np.float64]:
-    """Return a model's M on every placement, by number of antennas: shape (20,), environment steps."""
+    """Return a model's steps below threshold on every placement, by number of antennas: shape (20,)."""
     entries = [entry for count in ANTENNAS for entry in placements[model, count]]
     grid = ranking_of(entries[:1]).grid
     return np.array([times_below(entry.curves, grid, entry.steps_per_epoch).mean() for entry in entries])
 
 
 def slopes(placements: Placements) -> list[str]:
-    """How M rises with the number of antennas: placements are permuted among the numbers, Holm over the models."""
+    """How steps below threshold rise with antennas: placements are permuted among the numbers, Holm over the models."""
     antennas = np.repeat(ANTENNAS, 5) - np.mean(ANTENNAS)
     order = np.random.default_rng(0).random((10_000, len(antennas))).argsort(1)
     rises, p = [], []
@@ -506,8 +506,9 @@ def slopes(placements: Placements) -> list[str]:
         p.append((1 + (times[order] @ antennas >= times @ antennas).sum()) / (1 + len(order)))
     largest = max(holm(p))
     evidence = (
-        f"by the slopes of lines, M of widths 16, 32, 64 and of 10 qubits rises by {thousands(rises)} steps per "
-        f"antenna; placements permuted among the numbers of antennas, largest p {largest:.4f}"
+        f"by the slopes of lines, steps below threshold of widths 16, 32, 64 and of 10 qubits rise by "
+        f"{thousands(rises)} steps per antenna; placements permuted among the numbers of "
+        f"antennas, largest p {largest:.4f}"
     )
     return ["holds" if largest <= 0.05 else "not told apart", "20 of each", evidence, ".05 for 4 models"]
 
@@ -536,8 +537,9 @@ def against_networks() -> list[str]:
     total, wins, losses = 3 * len(ANTENNAS), verdicts[Verdict.WIN], verdicts[Verdict.LOSS]
     told = wins + losses + verdicts[Verdict.TIE]
     evidence = (
-        f"M of 10 qubits against widths 16, 32 and 64, across the five placements: {'; '.join(texts)}. By the paper's "
-        f"rule fewer samples in {wins} and more in {losses} of the {told} cells in which not both are at the cap"
+        f"steps below threshold of 10 qubits against widths 16, 32 and 64, across the five placements: "
+        f"{'; '.join(texts)}. By the paper's rule fewer samples in {wins} and more in {losses} of the {told} "
+        "cells in which not both are at the cap"
     )
     text = f"holds for {total - behind} of {total} pairs" if behind else "holds"
     if behind and 2 * (wins + losses) < told:
@@ -546,7 +548,7 @@ def against_networks() -> list[str]:
 
 
 def complexities(placements: Placements, count: int) -> dict[tuple[float, float], NDArray[np.int64]]:
-    """Return S_hat by epsilon and delta: of each model on the placements of a number of antennas, shape (4, 5)."""
+    """Return sample complexity by epsilon and delta: of each model on the placements of a count, shape (4, 5)."""
     entries = [placements[model, count] for model in MODELS]
     grid = ranking_of(entries[0]).grid
     found = np.array(
@@ -566,8 +568,9 @@ def two_antennas(placements: Placements) -> list[str]:
     assert there[0] < min(there[2:]), "not even in that cell"
     behind = [cell for cell, found in means.items() if found[0] < found[3]]
     evidence = (
-        f"mean S_hat of the placements there: {thousands(there)} for widths 16, 32, 64 and 10 qubits (counted as 200k "
-        f"where it is at the cap); 10 qubits are behind width 16 in {len(behind)} of {len(means)} cells, though"
+        f"mean sample complexity of the placements there: {thousands(there)} for widths 16, 32, 64 and 10 qubits "
+        f"(counted as 200k where it is at the cap); 10 qubits are behind width 16 in "
+        f"{len(behind)} of {len(means)} cells, though"
     )
     verdict = "holds" if behind == [(0.1, 0.75)] else "holds there, but not only there"
     return [f"{verdict}, without a test", "20 of each", evidence, "-"]
@@ -580,14 +583,14 @@ def five_antennas(placements: Placements) -> list[str]:
         counts = (complexities(placements, 5)[cell] < 200_000).sum(1)
         texts.append(f"at epsilon {cell[0]} in {', '.join(map(str, counts[:3]))} and {counts[3]}")
     evidence = (
-        f"placements in which S_hat at delta 0.5 is below the cap, of five, for widths 16, 32, 64 and 10 qubits: "
-        f"{'; '.join(texts)}. The paper does not say for which cell, and its placements are others"
+        f"placements in which sample complexity at delta 0.5 is below the cap, of five, for widths 16, 32, 64 and 10 "
+        f"qubits: {'; '.join(texts)}. The paper does not say for which cell, and its placements are others"
     )
     return ["not told, without a test", "20 of each", evidence, "-"]
 
 
 def harder(placements: Placements) -> list[str]:
-    """How much M rises with antennas, and how much with the degree of the paths, at equal thresholds."""
+    """How steps below threshold rise with antennas, and with the degree of the paths, at equal thresholds."""
     rises = []
     grid = ranking_of(placements[MODELS[0], 3][:1]).grid
     for model in MODELS:
@@ -600,8 +603,9 @@ def harder(placements: Placements) -> list[str]:
         rises.append((many / few - 1, hard / easy - 1))
     antennas, degrees = ([percent(each) for each in column] for column in zip(*rises))
     evidence = (
-        f"M of widths 16, 32, 64 and of 10 qubits, at epsilon 0.3, 0.2 and 0.1: {', '.join(antennas)} from 3 antennas "
-        f"to 4 (means of five placements), {', '.join(degrees)} from degree 3 to 6"
+        f"steps below threshold of widths 16, 32, 64 and of 10 qubits, at epsilon 0.3, 0.2 and 0.1: "
+        f"{', '.join(antennas)} from 3 antennas to 4 (means of five placements), {', '.join(degrees)} "
+        "from degree 3 to 6"
     )
     holds = all(antenna > degree for antenna, degree in rises)
     return [

@@ -49,7 +49,8 @@ def plot(
         str | None,
         typer.Option(
             "--seeds",
-            help="Only these seeds of every entry, 30 or 0:30: S_hat of 30 runs is another quantity than of 100.",
+            help="Only these seeds of every entry, 30 or 0:30: the sample complexity of 30 runs is another quantity "
+            "than that of 100.",
         ),
     ] = None,
     settings: Annotated[

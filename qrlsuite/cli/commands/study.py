@@ -289,7 +289,7 @@ def draw(
 ) -> None:
     """Draw a study's pictures from finished seeds; trains nothing.
 
-    S_hat of few seeds is another quantity than S_hat of many: --seeds 20 draws equal numbers.
+    The sample complexity of few seeds is another quantity than that of many: --seeds 20 draws equal numbers.
 
     Example: qrlsuite study draw degree --published --seeds 20 --format pdf
     """

@@ -129,8 +129,8 @@ def tune(
         Goal,
         typer.Option(
             "--objective",
-            help="M, the mean number of steps below the task's thresholds; S_hat at the task's reference cell; or "
-            "its mean over the ranking grid (area).",
+            help="What to minimize: steps below threshold (time), sample complexity at the task's reference cell "
+            "(cell), or sample complexity averaged over the task's ranking grid (area).",
         ),
     ] = Goal.time,
     budget: Annotated[
