@@ -39,7 +39,9 @@ class CostsOptions:
     ] = None
     horizon: Annotated[
         int | None,
-        Field(ge=1, description="environment steps at which S_hat is capped; by default the task's"),
+        Field(
+            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
+        ),
     ] = None
 
 

@@ -38,7 +38,9 @@ class FewRunsOptions:
     delta: Annotated[float | None, Field(description="by default the reference cell's")] = None
     horizon: Annotated[
         int | None,
-        Field(ge=1, description="environment steps at which S_hat is capped; by default the task's"),
+        Field(
+            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
+        ),
     ] = None
 
 

@@ -35,7 +35,9 @@ class SurfaceOptions:
     ] = None
     horizon: Annotated[
         int | None,
-        Field(ge=1, description="environment steps at which S_hat is capped; by default the task's"),
+        Field(
+            ge=1, description="environment steps at which sample complexity is capped; by default the task's"
+        ),
     ] = None
     elevation: Annotated[float, Field(description="3d: the viewer's height, degrees")] = 22
     azimuth: Annotated[float, Field(description="3d: the viewer's direction, degrees")] = -128
