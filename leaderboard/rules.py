@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 from qrlsuite import registry
-from qrlsuite.errors import OptionError, PluginError
+from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import SignificanceTestSpec, resolve
 from qrlsuite.statistics import Evidence, SignificanceRule
@@ -87,7 +87,12 @@ def load(name: str = DEFAULT) -> SignificanceRule:
         distribution. The rule's later answers are checked in the same way.
     """
     name = DEFAULT if name == PAPER else name
-    registered = registry.load().get("significance_tests", name)
+    known = registry.load()
+    try:
+        registered = known.get("significance_tests", name)
+    except UnknownNameError:
+        choices = [PAPER, *known.names("significance_tests")]
+        raise UnknownNameError(f"unknown significance test '{name}'{nearest(name, choices)}") from None
     spec = cast(SignificanceTestSpec, registered.spec)
     origin = f"significance test '{name}' of distribution '{registered.distribution}'"
     try:

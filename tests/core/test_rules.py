@@ -160,3 +160,8 @@ def test_a_paired_rule_sees_the_seeds_that_entries_share(third_party: Callable[[
     object.__setattr__(few, "seeds", tuple(range(100, 125)))
     with pytest.raises(Exception, match="share no seed"):
         board.compare_entries(many, few, loaded)
+
+
+def test_the_papers_rule_is_named_among_the_choices() -> None:
+    with pytest.raises(UnknownNameError, match="unknown significance test 'papr'; did you mean 'paper'"):
+        rules.load("papr")
