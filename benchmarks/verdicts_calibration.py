@@ -54,7 +54,7 @@ RULES = (DifferenceRule(n_resamples=1000), IntervalRule(), PermutationRule(), Ti
 
 def published() -> dict[str, LearningCurves]:
     """Return the published entries of beam6g by name."""
-    entries = [read(folder).entry_curves() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
+    entries = [read(folder).entry_results() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
     return {each.label: LearningCurves(each.curves, each.steps_per_epoch, each.label) for each in entries}
 
 

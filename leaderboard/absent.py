@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from qrlsuite import registry
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 
 
-def absent(entry: EntryCurves) -> list[str]:
+def absent(entry: EntryResults) -> list[str]:
     """Return what would be needed to train an entry further and nothing registers, in words: `model 'fourier'`."""
     known = registry.load().entries
     used = [

@@ -19,7 +19,7 @@ from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import steps_text
@@ -195,7 +195,7 @@ def collected(
     published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Read the entries of several tasks.
 
     Parameters
@@ -218,7 +218,7 @@ def collected(
     if len(tasks) < 2:
         raise OptionError(f"--across {' '.join(tasks)}: name two tasks or more; `qrlsuite runs` lists them")
     collect.check_tasks(runs, tasks, published)
-    selected, refused = list[EntryCurves](), list[str]()
+    selected, refused = list[EntryResults](), list[str]()
     for task in tasks:
         of_task, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)
         if not of_task:
@@ -231,7 +231,7 @@ def collected(
 
 
 def shares(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     tasks: Sequence[str],
     horizon: int | None = None,
     refused: Sequence[str] = (),
@@ -258,7 +258,7 @@ def shares(
         If no configuration is left; the message says what stood against it.
     """
     lines = list(refused)
-    by_configuration: dict[str, dict[str, EntryCurves]] = {}
+    by_configuration: dict[str, dict[str, EntryResults]] = {}
     horizons, labels = [], dict[str, str]()
     for task in tasks:
         members = [entry for entry in entries if entry.task == task]
@@ -306,7 +306,7 @@ def shares(
 
 
 def compare(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     tasks: Sequence[str],
     horizon: int | None = None,
     alpha: float = ALPHA,
@@ -330,7 +330,7 @@ def compare(
     return AcrossBoard(configurations, across_tasks(configurations.values, alpha), alpha)
 
 
-def configuration(entry: EntryCurves) -> str:
+def configuration(entry: EntryResults) -> str:
     """Return 16 hexadecimal digits for an entry's algorithm and model with all their options, whatever the task."""
     names = ("algorithm", "algorithm_options", "model", "model_options")
     parts = {name: entry.identity.get(name) for name in names}

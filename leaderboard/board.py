@@ -19,7 +19,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
 from qrlsuite.leaderboard.rules import DEFAULT, TIMES
 from qrlsuite.leaderboard.sheet import Sheet
@@ -100,7 +100,7 @@ class Row:
         Cells of the ranking grid, over all other entries, in which it needs significantly fewer samples, and more.
     """
 
-    entry: EntryCurves
+    entry: EntryResults
     tier: int | None
     reference: Complexity
     median_score: float
@@ -269,7 +269,7 @@ class EntryComparison(Shown, Comparison):
         return shown + (tables.comparison_html(self, self.headline) if self.show_cells else "")
 
 
-def learning_curves(entry: EntryCurves) -> LearningCurves:
+def learning_curves(entry: EntryResults) -> LearningCurves:
     """Return an entry's curves as the statistics take them."""
     return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
 
@@ -281,12 +281,12 @@ _PLANNED = (
 
 
 def build(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     refused: Sequence[str] = (),
     rule: SignificanceRule | None = None,
     horizon: int | None = None,
     alpha: float = ALPHA,
-    shown: Callable[[EntryCurves], bool] | None = None,
+    shown: Callable[[EntryResults], bool] | None = None,
 ) -> Leaderboard:
     """Rank entries, task by task and horizon by horizon.
 
@@ -337,7 +337,7 @@ def build(
     return Leaderboard(tuple(sections), tuple(problems))
 
 
-def of_one_definition(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], list[str]]:
+def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
     """Leave out entries of decision plans or chosen seeds, and those made under another definition than most.
 
     Returns
@@ -363,8 +363,8 @@ def of_one_definition(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves]
 
 
 def _by_horizon(
-    entries: Sequence[EntryCurves], requested: int | None
-) -> list[tuple[int, bool, list[EntryCurves]]]:
+    entries: Sequence[EntryResults], requested: int | None
+) -> list[tuple[int, bool, list[EntryResults]]]:
     """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
     horizons = sorted(ranking_of(entries).horizons)
     groups = []
@@ -382,17 +382,17 @@ def _by_horizon(
     ]
 
 
-def _length(entry: EntryCurves) -> int:
+def _length(entry: EntryResults) -> int:
     return int(entry.curves.shape[1]) * entry.steps_per_epoch
 
 
-def ranking_of(entries: Sequence[EntryCurves]) -> RankingSection:
+def ranking_of(entries: Sequence[EntryResults]) -> RankingSection:
     """Return the cells and horizons that most entries of a task have; they are equal where it is registered."""
     ranked = [entry.task_file.ranking for entry in entries]
     return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
 
 
-def rule_of(entries: Sequence[EntryCurves]) -> SignificanceRule:
+def rule_of(entries: Sequence[EntryResults]) -> SignificanceRule:
     """Return the rule that a task names in `[ranking]`, the paper's where it names none."""
     return rules.load(ranking_of(entries).rule or DEFAULT)
 
@@ -401,10 +401,10 @@ def _section(
     task: str,
     horizon: int,
     provisional: bool,
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     rule: SignificanceRule,
     alpha: float,
-    shown: Callable[[EntryCurves], bool] | None,
+    shown: Callable[[EntryResults], bool] | None,
 ) -> Section:
     ranking = ranking_of(entries)
     if getattr(rule, "paired", False):
@@ -490,7 +490,7 @@ def complexity_at(
     return Complexity(int(steps[0, 0]), low, high, bool(capped), bool(open_end))
 
 
-def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
+def _require_equal_seeds(entries: Sequence[EntryResults], rule: str) -> None:
     """Raise OptionError unless all entries have the same seeds, as a paired rule presupposes."""
     for entry in entries[1:]:
         if entry.seeds != entries[0].seeds:
@@ -502,7 +502,7 @@ def _require_equal_seeds(entries: Sequence[EntryCurves], rule: str) -> None:
 
 
 def compare_entries(
-    first: EntryCurves, second: EntryCurves, rule: SignificanceRule | None = None
+    first: EntryResults, second: EntryResults, rule: SignificanceRule | None = None
 ) -> EntryComparison:
     """Compare two entries of one task: by steps below threshold, by final score, and cell by cell of its ranking grid.
 
@@ -547,7 +547,7 @@ def compare_entries(
     return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
 
 
-def _common_seeds(first: EntryCurves, second: EntryCurves) -> tuple[EntryCurves, EntryCurves]:
+def _common_seeds(first: EntryResults, second: EntryResults) -> tuple[EntryResults, EntryResults]:
     """Return both entries with the runs of the seeds that they share, in one order."""
     shared = sorted(set(first.seeds) & set(second.seeds))
     if not shared:

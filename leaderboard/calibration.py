@@ -14,7 +14,7 @@ from typing import Any, Literal
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
 from qrlsuite.statistics import (
     Decided,
@@ -165,7 +165,7 @@ class Setup:
 
 def choose(
     runs: Path, names: Sequence[str] = (), task: str | None = None, published: bool = False
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Return the entries to simulate from: of one task, with two seeds or more, and trained equally long.
 
     Parameters
@@ -213,7 +213,7 @@ def choose(
     return sorted(entries, key=lambda entry: (entry.model, sum(entry.parameters), entry.label)), lines
 
 
-def prepare(entries: Sequence[EntryCurves]) -> Setup:
+def prepare(entries: Sequence[EntryResults]) -> Setup:
     """Cut the entries of a task to one horizon, and name them without the algorithm where that tells them apart."""
     horizon = choose_horizon(entries)
     names = [entry.label.removeprefix(f"{entry.algorithm} ") for entry in entries]

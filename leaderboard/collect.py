@@ -15,7 +15,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin
 from qrlsuite.leaderboard import published as published_entries
-from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
+from qrlsuite.leaderboard.curves import EntryResults, current, require_scores
 from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.lookup import Stored
 from qrlsuite.results.seeds import format_seeds
@@ -27,7 +27,7 @@ Key = tuple[str, str]
 
 def collect(
     runs: Path, tasks: Collection[str] = (), published: bool = False, only: Collection[Key] | None = None
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Read every entry below a folder of results or of published entries.
 
     Parameters
@@ -46,7 +46,7 @@ def collect(
     tuple
         The entries that have at least one epoch, and one line for each folder that was refused and why.
     """
-    good: dict[tuple[str, str, str], list[EntryCurves]] = {}
+    good: dict[tuple[str, str, str], list[EntryResults]] = {}
     refused = []
     if only is None:
         stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
@@ -76,9 +76,9 @@ def collect(
     return collected, refused
 
 
-def by_code(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
+def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
     """Return copies of an entry in lists, one for each code that trained some."""
-    kinds: list[list[EntryCurves]] = []
+    kinds: list[list[EntryResults]] = []
     for entry in copies:
         for kind in kinds:
             if kind[0].codes == entry.codes or set(kind[0].codes) & set(entry.codes):
@@ -89,7 +89,7 @@ def by_code(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
     return kinds
 
 
-def told_apart(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
+def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
     """Return copies of an entry by code, each with its mark where there are several codes."""
     kinds = by_code(copies)
     if len(kinds) == 1:
@@ -100,7 +100,7 @@ def told_apart(copies: Iterable[EntryCurves]) -> list[list[EntryCurves]]:
     ]
 
 
-def _marked(entry: EntryCurves, mark: str) -> EntryCurves:
+def _marked(entry: EntryResults, mark: str) -> EntryResults:
     """Return an entry whose name and label say of which code it is."""
     if "@" in entry.name:
         return entry
@@ -121,12 +121,12 @@ def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> 
 def select(
     runs: Path,
     tasks: Collection[str] = (),
-    names: Iterable[str | EntryCurves] = (),
+    names: Iterable[str | EntryResults] = (),
     published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
     only: Collection[Key] | None = None,
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Read the entries for a board or a picture.
 
     Parameters
@@ -156,7 +156,7 @@ def select(
         (copy.task_hash, copy.name): copy
         for name in names
         for copy in (
-            [name] if isinstance(name, EntryCurves) else _shown(_read_copies(runs, name, published, tasks))
+            [name] if isinstance(name, EntryResults) else _shown(_read_copies(runs, name, published, tasks))
         )
     }
     entries, left_out = list(named.values()), list[str]()
@@ -189,7 +189,7 @@ def select(
     return kept, left_out
 
 
-def equally_long(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], list[str]]:
+def equally_long(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
     """Leave out entries that would cut a picture: those shorter than half of the others, task by task.
 
     Where any entry of a task reaches the task's shortest horizon, those that do not are left out first.
@@ -216,7 +216,7 @@ def equally_long(entries: Sequence[EntryCurves]) -> tuple[list[EntryCurves], lis
     return kept, lines
 
 
-def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] = ()) -> EntryCurves:
+def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] = ()) -> EntryResults:
     """Read the entry that has a name (see `qrlsuite.results.lookup`), or whose folder it is.
 
     Parameters
@@ -234,12 +234,12 @@ def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] 
     return best(_read_copies(runs, name, published, tasks))
 
 
-def best(copies: Iterable[EntryCurves]) -> EntryCurves:
+def best(copies: Iterable[EntryResults]) -> EntryResults:
     """Return the copy of an entry that gets furthest towards the task's shortest horizon, then that with more seeds."""
     return max(copies, key=_weight)
 
 
-def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
+def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
     """Read the copies of the entry that has a name; `NAME @MARK` names its seeds of one code."""
     try:
         found, mark = _every_copy(runs, name, published, tasks), ""
@@ -256,7 +256,7 @@ def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str])
     return meant[0]
 
 
-def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryCurves]:
+def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
@@ -285,7 +285,7 @@ def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) 
     return copies
 
 
-def _shown(copies: Sequence[EntryCurves]) -> list[EntryCurves]:
+def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
     """Return what is shown of an entry's copies: the better one; or both where the own one gets less far."""
     own, further = copies[0], best(copies)
     if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
@@ -303,7 +303,7 @@ def _place(runs: Path, tasks: Collection[str]) -> str:
     return f"{runs}, task {' or '.join(sorted(tasks))}" if tasks else str(runs)
 
 
-def _weight(entry: EntryCurves) -> tuple[int, int, int]:
+def _weight(entry: EntryResults) -> tuple[int, int, int]:
     """Return what makes one of two copies of an entry the better one: epochs, seeds, epochs beyond the horizon."""
     epochs = int(entry.curves.shape[1])
     enough = min(entry.task_file.ranking.horizons) // entry.steps_per_epoch
@@ -344,7 +344,7 @@ def _task(store: EntryStore) -> str:
     return store.path.parent.name
 
 
-def read(store: EntryStore) -> EntryCurves | None:
+def read(store: EntryStore) -> EntryResults | None:
     """Read one entry, from runs or published; None where no run has finished an epoch.
 
     Raises
@@ -359,7 +359,7 @@ def read(store: EntryStore) -> EntryCurves | None:
     return found[0] if found else None
 
 
-def read_each(store: EntryStore) -> list[EntryCurves]:
+def read_each(store: EntryStore) -> list[EntryResults]:
     """Read a folder's entry, from runs or published; nothing where no run has finished an epoch.
 
     Seeds of several codes are as many entries.
@@ -370,18 +370,18 @@ def read_each(store: EntryStore) -> list[EntryCurves]:
         If a file is damaged, or a published entry is not what it says.
     """
     if published_entries.is_published(store.path):
-        return [published_entries.read(store.path).entry_curves()]
+        return [published_entries.read(store.path).entry_results()]
     groups = codes.of_seeds(store)
     found = [_of_code(store, group) for group in groups] if len(groups) > 1 else [read_entry(store)]
     return [entry for entry in found if entry is not None]
 
 
-def _of_code(store: EntryStore, group: codes.SameCode) -> EntryCurves | None:
+def _of_code(store: EntryStore, group: codes.SameCode) -> EntryResults | None:
     entry = read_entry(store, group.seeds)
     return None if entry is None else _marked(entry, f"@{group.mark}")
 
 
-def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryCurves | None:
+def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryResults | None:
     """Read one entry from its runs; None where no run has finished an epoch. Tuning seeds do not count.
 
     A seed of which a file is damaged, or which is not what its folder says, is left out alone.
@@ -414,7 +414,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     preset = record["preset"]
     own = {run.seed: run.curve for run in runs}
     values = np.stack([own[run.seed][:length] for run in kept])
-    return EntryCurves(
+    return EntryResults(
         name=record["name"] + store.mark,
         label=" ".join([record["label"], store.mark]).rstrip(),
         task=record["task_name"],

@@ -23,7 +23,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed, nearest
 from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_one_definition, ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
@@ -102,7 +102,7 @@ class Price:
     spread: float = 1.0
 
 
-def price(entry: EntryCurves, unit: str) -> Price:
+def price(entry: EntryResults, unit: str) -> Price:
     """Return what an entry's environment step costs, by its record.
 
     Parameters
@@ -136,7 +136,7 @@ def price(entry: EntryCurves, unit: str) -> Price:
     return found
 
 
-def _untimed(entry: EntryCurves) -> str:
+def _untimed(entry: EntryResults) -> str:
     """Say why an entry's hours are not processor time of one kind of processor; empty where they are."""
     if entry.clocked is None:
         return "its record does not say whether its hours are processor time or by the clock"
@@ -159,7 +159,7 @@ class CostRow:
         Its place in the section's comparison; None where it is not compared.
     """
 
-    entry: EntryCurves
+    entry: EntryResults
     price: Price
     complexity: Complexity
     index: int | None
@@ -402,7 +402,7 @@ class CostBoard(Shown):
 
 
 def build(
-    entries: Sequence[EntryCurves], by: str, alpha: float = ALPHA, refused: Sequence[str] = ()
+    entries: Sequence[EntryResults], by: str, alpha: float = ALPHA, refused: Sequence[str] = ()
 ) -> CostBoard:
     """Rank entries by what learning costs, task by task.
 
@@ -436,7 +436,7 @@ def build(
     return CostBoard(tuple(sections), (*refused, *problems))
 
 
-def _section(task: str, entries: Sequence[EntryCurves], unit: Unit, alpha: float) -> CostSection:
+def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: float) -> CostSection:
     ranking = ranking_of(entries)
     prices = _prices(entries, unit.name)
     costs = {
@@ -466,7 +466,7 @@ def _section(task: str, entries: Sequence[EntryCurves], unit: Unit, alpha: float
     return CostSection(task, cell_text(ranking), unit, tuple(rows), compared, budget, part, alpha)
 
 
-def _prices(entries: Sequence[EntryCurves], unit: str) -> list[Price]:
+def _prices(entries: Sequence[EntryResults], unit: str) -> list[Price]:
     """Return every entry's price; core-hours of a processor that most of the others were not made on are no price."""
     prices = [price(entry, unit) for entry in entries]
     if unit != "core-hours":
@@ -485,7 +485,7 @@ def _equal(costs: Sequence[float]) -> bool:
     return bool(np.allclose(costs, costs[0], rtol=1e-9, atol=0)) if costs else True
 
 
-def _along(entry: EntryCurves, cost: float, part: float, parts: int) -> LearningCurves:
+def _along(entry: EntryResults, cost: float, part: float, parts: int) -> LearningCurves:
     """Return curves along the cost: of every part of the budget, the epoch that is being paid for at its end."""
     ends = part * np.arange(1, parts + 1) / cost
     epochs = np.clip(np.ceil(ends - 1e-9).astype(np.int64) - 1, 0, entry.curves.shape[1] - 1)

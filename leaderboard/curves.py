@@ -26,7 +26,7 @@ from qrlsuite.results.text import counted
 
 
 @dataclass(frozen=True, repr=False)
-class EntryCurves(Shown):
+class EntryResults(Shown):
     """An entry with the learning curves of its complete runs. It shows itself as a short table.
 
     Attributes
@@ -121,7 +121,7 @@ class EntryCurves(Shown):
     chosen_seeds: str = ""
     first_thresholds: tuple[float, ...] | None = None
 
-    def reaching(self, epochs: int) -> EntryCurves | None:
+    def reaching(self, epochs: int) -> EntryResults | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
         if not self.runs:
             return self if self.curves.shape[1] >= epochs else None
@@ -131,12 +131,12 @@ class EntryCurves(Shown):
         out = tuple(sorted(set(self.runs) - set(kept)))
         return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
 
-    def cut(self, epochs: int) -> EntryCurves | None:
+    def cut(self, epochs: int) -> EntryResults | None:
         """Return the first epochs of every run that has reached a number of them; None for none."""
         reached = self.reaching(epochs)
         return None if reached is None else replace(reached, curves=reached.curves[:, :epochs], runs={})
 
-    def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryCurves:
+    def with_seeds(self, seeds: int | str | Iterable[int]) -> EntryResults:
         """Return the entry with these seeds only, to see what fewer seeds would have said.
 
         Parameters

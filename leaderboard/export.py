@@ -12,13 +12,13 @@ from typing import Any
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.leaderboard import published
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.fingerprint import fingerprint
 from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore, parameters_of
 
 
-def export(entry: EntryCurves, out: Path, force: bool = False) -> Path:
+def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
     """Write an entry's published form; returns its folder `out/<task>/<entry>`.
 
     Only complete runs are written. What the seeds looked like before training is computed anew, so that a file
@@ -81,7 +81,7 @@ def _frozen(record: Mapping[str, Any]) -> str:
     return json.dumps(record, sort_keys=True)
 
 
-def _refuse_smaller(folder: Path, entry: EntryCurves, force: bool) -> None:
+def _refuse_smaller(folder: Path, entry: EntryResults, force: bool) -> None:
     if force or not folder.exists():
         return
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.times import percent
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import (
@@ -233,7 +233,7 @@ class PairVerdict:
         }
 
 
-def judge_pair(first: EntryCurves, second: EntryCurves, grid: Grid, alpha: float) -> PairVerdict:
+def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: float) -> PairVerdict:
     """Compare two entries of one task by their times below threshold and by their final scores, with all their seeds.
 
     Raises
@@ -256,7 +256,7 @@ def judge_pair(first: EntryCurves, second: EntryCurves, grid: Grid, alpha: float
     )
 
 
-def _short(first: EntryCurves, second: EntryCurves) -> tuple[str, str]:
+def _short(first: EntryResults, second: EntryResults) -> tuple[str, str]:
     """Return both labels, without the algorithm where it is the same."""
     if first.algorithm != second.algorithm:
         return first.label, second.label
@@ -265,7 +265,7 @@ def _short(first: EntryCurves, second: EntryCurves) -> tuple[str, str]:
 
 
 def on_board(
-    first: EntryCurves, second: EntryCurves, entries: Sequence[EntryCurves], grid: Grid, alpha: float
+    first: EntryResults, second: EntryResults, entries: Sequence[EntryResults], grid: Grid, alpha: float
 ) -> OnBoard | None:
     """Return what the pair comes to on the board of its task at its horizon.
 

@@ -27,7 +27,7 @@ from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard import origin
-from qrlsuite.leaderboard.curves import EntryCurves, current, require_scores
+from qrlsuite.leaderboard.curves import EntryResults, current, require_scores
 from qrlsuite.leaderboard.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet
@@ -96,12 +96,12 @@ class PublishedEntry:
         missing = next(seed for seed, held in enumerate(self.seeds) if seed != held)
         return f"its {len(self.seeds)} seeds are not 0 to {len(self.seeds) - 1} ({missing} is missing): not ranked"
 
-    def entry_curves(self) -> EntryCurves:
+    def entry_results(self) -> EntryResults:
         """Return what a leaderboard ranks."""
         record, identity = self.record, self.record["identity"]
         count = record["published"]["parameters"]
         provenance = [made for last in self.provenance for made in origin.all_of(last)]
-        return EntryCurves(
+        return EntryResults(
             name=record["name"],
             label=record["label"],
             task=record["task_name"],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
@@ -50,7 +50,7 @@ class ScoreRanking:
     horizon: int
     by: str
     alpha: float
-    entries: tuple[EntryCurves, ...]
+    entries: tuple[EntryResults, ...]
     results: ScoreBoard
     n_last: int
     unranked: tuple[str, ...]
@@ -164,7 +164,7 @@ class ScoreRanking:
 
 
 def rank_by_score(
-    entries: Sequence[EntryCurves], horizon: int, by: str = "score", alpha: float = 0.05
+    entries: Sequence[EntryResults], horizon: int, by: str = "score", alpha: float = 0.05
 ) -> ScoreRanking:
     """Rank the entries of one task at one horizon by their scores, more is better.
 

@@ -15,7 +15,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, neares
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import collect, pictures, published
 from qrlsuite.leaderboard.board import ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
@@ -100,7 +100,7 @@ def check(study: Study) -> None:
                 options.build(backend, deployed.chosen(value), f"{location}.evaluation.deployed")
 
 
-def read(runs: Path, members: Sequence[Member], with_published: bool = False) -> dict[str, EntryCurves]:
+def read(runs: Path, members: Sequence[Member], with_published: bool = False) -> dict[str, EntryResults]:
     """Return the learning curves of the entries that have any, by entry name; seeds kept for tuning are left out.
 
     Parameters
@@ -121,7 +121,7 @@ def read(runs: Path, members: Sequence[Member], with_published: bool = False) ->
     return curves_by_name
 
 
-def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryCurves]:
+def _copies(folders: Iterable[Path], entry: Entry) -> list[EntryResults]:
     """Return the copies of an entry; only those of the same code as the first."""
     stores = [EntryStore.find(folder, entry) for folder in folders]
     found = [collect.read(store) for store in stores if (store.path / "entry.json").exists()]
@@ -145,7 +145,7 @@ def select(
     with_published: bool = False,
     horizon: int | None = None,
     min_seeds: int = 1,
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Read a study's entries for a board of that study alone.
 
     Parameters
@@ -178,13 +178,13 @@ def select(
     return selected, left_out
 
 
-def decided_pairs(entries: Iterable[EntryCurves]) -> tuple[int, int]:
+def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
     """Count the pairs of entries that rule `times` decides, and all pairs that it tests: both of 20 seeds or more.
 
     Entries are compared within a task, at its shortest horizon; Holm's procedure goes over the task's pairs. Entries
     of a decision plan are left out: their number of seeds depends on what the seeds showed.
     """
-    by_task: dict[str, list[EntryCurves]] = {}
+    by_task: dict[str, list[EntryResults]] = {}
     for entry in entries:
         if entry.plan is None:
             by_task.setdefault(entry.task_hash, []).append(entry)
@@ -295,12 +295,12 @@ def write(
     return written
 
 
-def _steps(entry: EntryCurves) -> int:
+def _steps(entry: EntryResults) -> int:
     return int(entry.curves.shape[1]) * entry.steps_per_epoch
 
 
 def _attempt(
-    picture: PictureSection, entries: Sequence[EntryCurves], head: Drawn, report: Report | None
+    picture: PictureSection, entries: Sequence[EntryResults], head: Drawn, report: Report | None
 ) -> Drawn:
     """Draw one picture; the finished seeds may not suffice for it."""
     try:
@@ -315,7 +315,7 @@ def _attempt(
     return dataclasses.replace(head, figure=figure)
 
 
-def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
+def _episodes(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
     """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
     assert picture.evaluation is not None  # `check` saw to it
     cells.one_task(entries, picture.kind)
@@ -338,7 +338,7 @@ def _episodes(picture: PictureSection, entries: Sequence[EntryCurves], report: R
     return histogram(values, **settings)
 
 
-def _deployed(picture: PictureSection, entries: Sequence[EntryCurves], report: Report | None) -> Figure:
+def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
     """Play the entries' best runs as they were trained, and those with a circuit on the backend at every value.
 
     What was played on the backend is kept in the entries' folders, and not played again.

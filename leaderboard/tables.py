@@ -20,7 +20,7 @@ from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
-    from qrlsuite.leaderboard.curves import EntryCurves
+    from qrlsuite.leaderboard.curves import EntryResults
     from qrlsuite.leaderboard.pair import PairVerdict
 
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
@@ -98,7 +98,7 @@ def title(section: Section) -> str:
     return f"{section.task}{only}, {steps_text(section.horizon)} steps{note}{by}"
 
 
-def names(entries: Sequence[EntryCurves]) -> list[str]:
+def names(entries: Sequence[EntryResults]) -> list[str]:
     """Return what entries are called in a table: without the algorithm where all have the same."""
     alike = len({entry.algorithm for entry in entries}) == 1
     return [
@@ -212,12 +212,12 @@ def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
     ]
 
 
-def _parameters(entry: EntryCurves) -> str:
+def _parameters(entry: EntryResults) -> str:
     classical, quantum = entry.parameters
     return (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text
 
 
-def _row_of(section: Section, entry: EntryCurves) -> Row:
+def _row_of(section: Section, entry: EntryResults) -> Row:
     return next(row for row in section.rows if row.entry is entry)
 
 
@@ -316,7 +316,7 @@ def facts(section: Section) -> list[str]:
     return lines
 
 
-def changed_thresholds(entries: Sequence[EntryCurves]) -> list[str]:
+def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
     """Say of which entries the thresholds changed after their first seed: they may have been chosen to flatter."""
     labels = [entry.label for entry in entries if entry.changed_thresholds]
     return [f"thresholds changed after the first seed: {', '.join(labels)}"] if labels else []

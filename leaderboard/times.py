@@ -1,7 +1,7 @@
 """A section of a board by steps below threshold: who outperforms whom, and which ranks that leaves.
 
 `rank_by_time` computes everything once; tables, files and the page
-write what it returns. The statistics are in `qrlsuite.statistics.standings`.
+write what it returns. The statistics are in `qrlsuite.statistics.times_board`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
 
 ALPHA = 0.05
@@ -37,7 +37,7 @@ class TimeRow:
         Whether it has fewer than 50 seeds, and another ranked entry another number.
     """
 
-    entry: EntryCurves
+    entry: EntryResults
     place: int | None
     place_at_half: int | None
     ranks: tuple[int, int] | None
@@ -169,7 +169,7 @@ class TimeRanking:
             "few_and_unequal": row.few,
         }
 
-    def flat(self, entry: EntryCurves) -> dict[str, object]:
+    def flat(self, entry: EntryResults) -> dict[str, object]:
         """Return the columns of one entry for a spreadsheet; p of pairs as `entry: p; ...` under the entry's name."""
         row = next(row for row in self.rows if row.entry is entry)
         i = self.order[self.rows.index(row)]
@@ -214,11 +214,11 @@ class TimeRanking:
 
 
 def rank_by_time(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     grid: Grid,
     horizon: int,
     alpha: float = ALPHA,
-    shown: Callable[[EntryCurves], bool] | None = None,
+    shown: Callable[[EntryResults], bool] | None = None,
 ) -> TimeRanking:
     """Rank the entries of a section by mean time below threshold.
 
@@ -238,7 +238,7 @@ def rank_by_time(
     Raises
     ------
     OptionError
-        As `qrlsuite.statistics.standings`.
+        As `qrlsuite.statistics.times_board`.
     """
     curves = [LearningCurves(entry.curves, entry.steps_per_epoch, entry.name) for entry in entries]
     board = times_board(curves, grid, alpha, horizon)

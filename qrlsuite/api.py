@@ -39,7 +39,7 @@ from qrlsuite.leaderboard import collect, rules, studies
 from qrlsuite.leaderboard import costs as by_cost
 from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pair import on_board
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.studies import Drawn
@@ -70,7 +70,7 @@ Seeds = int | str | Iterable[int]
 
 def load(
     entry: str, *, task: str | None = None, runs: str | PathLike[str] = "runs", published: bool = False
-) -> EntryCurves:
+) -> EntryResults:
     """Read an entry: the learning curves of its seeds, and how they were made.
 
     Parameters
@@ -87,7 +87,7 @@ def load(
 
     Returns
     -------
-    EntryCurves
+    EntryResults
         With `curves` of shape (N, T): the mean validation score of N seeds after each of T epochs, in the task's
         units ([0, 1] where scores are fractions of the optimum); `steps_per_epoch` environment steps each;
         `records` by seed; `to_table()` for pandas and polars.
@@ -117,7 +117,7 @@ def board(
     rule: str | None = None,
     alpha: float = ALPHA,
     horizon: int | None = None,
-    entries: Sequence[str | EntryCurves] = (),
+    entries: Sequence[str | EntryResults] = (),
     study: str | None = None,
     min_seeds: int = 1,
 ) -> Leaderboard:
@@ -175,7 +175,7 @@ def board(
     shown, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
     keys = {(entry.task_hash, entry.name) for entry in shown}
     family = shown
-    if (entries or min_seeds > 1) and not any(isinstance(entry, EntryCurves) for entry in entries):
+    if (entries or min_seeds > 1) and not any(isinstance(entry, EntryResults) for entry in entries):
         family = _family(shown, _selected(folder, task_names, (), study, published, horizon, 1)[0])
     return boards.build(
         family,
@@ -195,7 +195,7 @@ def costs(
     published: bool = False,
     alpha: float = ALPHA,
     horizon: int | None = None,
-    entries: Sequence[str | EntryCurves] = (),
+    entries: Sequence[str | EntryResults] = (),
     study: str | None = None,
     min_seeds: int = 1,
 ) -> CostBoard:
@@ -236,8 +236,8 @@ def costs(
 
 
 def compare(
-    first: str | EntryCurves,
-    second: str | EntryCurves,
+    first: str | EntryResults,
+    second: str | EntryResults,
     *,
     task: str | None = None,
     runs: str | PathLike[str] = "runs",
@@ -281,11 +281,11 @@ def compare(
     'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 57%, 100 seeds each, p < .0001)'
     """
     left, other = (
-        entry if isinstance(entry, EntryCurves) else load(entry, task=task, runs=runs, published=published)
+        entry if isinstance(entry, EntryResults) else load(entry, task=task, runs=runs, published=published)
         for entry in (first, second)
     )
     compared = boards.compare_entries(left, other, rules.load(rule) if rule else None)
-    if isinstance(first, EntryCurves) and isinstance(second, EntryCurves):
+    if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
     others, _ = collect.collect(Path(runs), [left.task], published)
     among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
@@ -296,7 +296,7 @@ def plot(
     kind: str,
     *,
     tasks: str | Sequence[str] | None = None,
-    entries: Sequence[str | EntryCurves] = (),
+    entries: Sequence[str | EntryResults] = (),
     horizon: int | None = None,
     min_seeds: int = 1,
     seeds: Seeds | None = None,
@@ -378,7 +378,7 @@ def train(
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
-) -> EntryCurves | None:
+) -> EntryResults | None:
     """Train the missing seeds of an entry: a model and an algorithm on a task.
 
     Interrupt it at any time: every finished epoch is saved, and the same call continues, to the same bytes as if it
@@ -420,7 +420,7 @@ def train(
 
     Returns
     -------
-    EntryCurves
+    EntryResults
         The entry with its learning curves (N, T), of all its seeds that are there; None where no epoch has finished
         yet, for it was handed to a queue, or `minutes` were too few.
 
@@ -865,12 +865,12 @@ def _seconds(minutes: float | None) -> float | None:
 def _selected(
     runs: Path,
     tasks: Sequence[str],
-    entries: Sequence[str | EntryCurves],
+    entries: Sequence[str | EntryResults],
     study: str | None,
     published: bool,
     horizon: int | None,
     min_seeds: int,
-) -> tuple[list[EntryCurves], list[str]]:
+) -> tuple[list[EntryResults], list[str]]:
     """Return the entries of a board, those named or those of a study, and a line for each that was left out."""
     if study is None:
         return collect.select(runs, tasks, entries, published, horizon, min_seeds)
@@ -879,7 +879,7 @@ def _selected(
     return studies.select(study, runs, tasks, published, horizon, min_seeds)
 
 
-def _family(shown: Sequence[EntryCurves], ranked: Sequence[EntryCurves]) -> list[EntryCurves]:
+def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:
     """Return what is compared: all ranked entries of the same definitions of tasks, and those shown beside them."""
     hashes = {entry.task_hash for entry in shown}
     family = [entry for entry in ranked if entry.task_hash in hashes]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.specs import resolve
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ KINDS: dict[str, Picture] = {
 """Pictures by name."""
 
 
-def draw(kind: str, entries: Sequence[EntryCurves] = (), **settings: Any) -> Figure:
+def draw(kind: str, entries: Sequence[EntryResults] = (), **settings: Any) -> Figure:
     """Draw a picture by name.
 
     Parameters

@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 
@@ -41,7 +41,7 @@ class BarsOptions:
     ] = None
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw a bar per entry and cell, from the 5th to the 95th percentile a whisker.
 
     A bar whose upper percentile is the horizon is faded, as in the paper: some runs did not get there.

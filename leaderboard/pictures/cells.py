@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
@@ -34,7 +34,7 @@ class Cells:
     unsettled: BoolArray
 
 
-def measure(entry: EntryCurves, grid: Grid, horizon: int) -> Cells:
+def measure(entry: EntryResults, grid: Grid, horizon: int) -> Cells:
     """Return an entry's sample complexity, with its interval and marks, at all its seeds."""
     curves = learning_curves(entry).cut(horizon)
     evidence = Evidence(curves, grid, curves.n_runs)
@@ -43,7 +43,7 @@ def measure(entry: EntryCurves, grid: Grid, horizon: int) -> Cells:
     return Cells(evidence.point, intervals, at_cap(intervals, horizon), marks)
 
 
-def one_task(entries: Sequence[EntryCurves], kind: str) -> None:
+def one_task(entries: Sequence[EntryResults], kind: str) -> None:
     """Raise OptionError unless there are entries, all of one task."""
     if not entries:
         raise OptionError(f"picture '{kind}' needs at least one entry")
@@ -57,7 +57,7 @@ def one_task(entries: Sequence[EntryCurves], kind: str) -> None:
 
 
 def choose_grid(
-    entry: EntryCurves,
+    entry: EntryResults,
     epsilons: Sequence[float] | None,
     deltas: Sequence[float] | None,
     thresholds: Sequence[float] | None = None,
@@ -89,7 +89,7 @@ def choose_grid(
     return Grid.absolute(own.thresholds, deltas)
 
 
-def choose_horizon(entries: Sequence[EntryCurves], requested: int | None = None) -> int:
+def choose_horizon(entries: Sequence[EntryResults], requested: int | None = None) -> int:
     """Return the steps to which all entries are cut: the task's longest horizon that all of them reach.
 
     Where one is shorter than all of the task's horizons, its length.
@@ -120,7 +120,7 @@ def probabilities(grid: Grid) -> list[str]:
     return [f"{float(value):g}" for value in grid.deltas]
 
 
-def cut_note(entries: Sequence[EntryCurves], horizon: int) -> str:
+def cut_note(entries: Sequence[EntryResults], horizon: int) -> str:
     """Say that the picture ends before the task's horizon, where it does."""
     if horizon in entries[0].task_file.ranking.horizons:
         return ""

@@ -13,7 +13,7 @@ from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.experiment import task as task_files
 from qrlsuite.leaderboard import collect, pictures
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
@@ -33,7 +33,7 @@ class Composed:
     """
 
     figure: Figure
-    entries: tuple[EntryCurves, ...] = ()
+    entries: tuple[EntryResults, ...] = ()
     tasks: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
 
@@ -41,7 +41,7 @@ class Composed:
 def compose(
     kind: str,
     tasks: Sequence[str] = (),
-    entries: Sequence[str | EntryCurves] = (),
+    entries: Sequence[str | EntryResults] = (),
     *,
     horizon: int | None = None,
     min_seeds: int = 1,
@@ -60,7 +60,7 @@ def compose(
     tasks, entries, horizon, min_seeds, runs, published:
         As for `qrlsuite.leaderboard.collect.select`.
     seeds:
-        Draw these alone, of every entry, see `EntryCurves.with_seeds`; None means all.
+        Draw these alone, of every entry, see `EntryResults.with_seeds`; None means all.
     settings:
         The picture's settings by name.
     environment:

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.leaderboard.costs import price
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 
@@ -45,7 +45,7 @@ class CostsOptions:
     ] = None
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat of each entry at one cell, with its 5th to 95th percentile, in each unit on a logarithmic axis.
 
     An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.costs.price`. One that

@@ -16,7 +16,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.statistics import Grid
 
@@ -31,7 +31,7 @@ class EstimatorOptions:
     ] = Field(default_factory=lambda: [0.3, 0.5, 0.75, 0.9])
 
 
-def draw(entries: Sequence[EntryCurves] = (), **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults] = (), **settings: Any) -> Figure:
     """Draw P(P_hat < delta) against P; no entries are needed, and any are ignored."""
     from scipy.stats import binom, norm
 

@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass
 from qrlsuite import options
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Grid
@@ -57,7 +57,7 @@ class _Draws:
         return f"{first} ahead: {ahead:.0%}\n{second} ahead: {behind:.0%}, neither: {1 - ahead - behind:.0%}"
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw two samples of few seeds that contradict each other, all seeds, and the distribution of S_hat.
 
     The two samples are no extremes: their difference is the 5th and the 95th percentile over the draws.
@@ -95,7 +95,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
 
 
 def _sample(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     grid: Grid,
     horizon: int,
     size: int,
@@ -123,7 +123,7 @@ def _sample(
 
 
 def _figure(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     names: Sequence[str],
     grid: Grid,
     horizon: int,
@@ -189,7 +189,7 @@ def _figure(
 
 def _learning(
     axes: Axes,
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     samples: Sequence[NDArray[np.float64]],
     grid: Grid,
     horizon: int,

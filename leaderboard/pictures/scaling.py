@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 
@@ -51,7 +51,7 @@ class _Line:
     """Entries that differ in size only, by size; several of one size are instances, shown with their mean."""
 
     label: str
-    members: tuple[tuple[float, EntryCurves], ...]
+    members: tuple[tuple[float, EntryResults], ...]
 
     @property
     def sizes(self) -> list[float]:
@@ -66,7 +66,7 @@ class _Panel:
     lines: tuple[_Line, ...]
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat with its percentiles against size; the numbers at the markers are parameters.
 
     Raises
@@ -213,7 +213,7 @@ def _seeds(panel: _Panel) -> str:
     return f"{counts[0]} to {counts[-1]} seeds{star}" if len(counts) > 1 else style.seeds_text(entries[0])
 
 
-def _not_shown(entries: Sequence[EntryCurves], panels: Sequence[_Panel]) -> str:
+def _not_shown(entries: Sequence[EntryResults], panels: Sequence[_Panel]) -> str:
     """Name the entries that are on no line, for lack of others of their kind."""
     shown = {id(entry) for panel in panels for line in panel.lines for _, entry in line.members}
     missing = [style.plain(entry.label) for entry in entries if id(entry) not in shown]
@@ -226,14 +226,14 @@ def _sizes(panels: Sequence[_Panel]) -> str:
     return names[0] if len(names) == 1 else "size"
 
 
-def _heading(entries: Sequence[EntryCurves]) -> str:
+def _heading(entries: Sequence[EntryResults]) -> str:
     tasks = sorted({entry.task for entry in entries})
     if len(tasks) == 1:
         return style.heading(entries)
     return style.plain(f"{len(tasks)} tasks, {tasks[0]} to {tasks[-1]}")
 
 
-def _panels(entries: Sequence[EntryCurves], by: Sequence[str] | None) -> list[_Panel]:
+def _panels(entries: Sequence[EntryResults], by: Sequence[str] | None) -> list[_Panel]:
     """Arrange entries into panels: one for each varied option of each model, or for each that was asked for."""
     if by is not None:
         groups = [(name, list(entries)) for name in by]
@@ -243,7 +243,7 @@ def _panels(entries: Sequence[EntryCurves], by: Sequence[str] | None) -> list[_P
         groups = [(name, members[model]) for model in models for name in _varied(members[model])]
     panels = []
     for name, members_ in groups:
-        lines: dict[str, list[tuple[float, EntryCurves]]] = {}
+        lines: dict[str, list[tuple[float, EntryResults]]] = {}
         for entry in members_:
             lines.setdefault(_rest(entry, name), []).append((_size(entry, name), entry))
         made = [_Line("", tuple(sorted(line, key=lambda pair: pair[0]))) for line in lines.values()]
@@ -259,7 +259,7 @@ def _panels(entries: Sequence[EntryCurves], by: Sequence[str] | None) -> list[_P
     return panels
 
 
-def _varied(entries: Sequence[EntryCurves]) -> list[str]:
+def _varied(entries: Sequence[EntryResults]) -> list[str]:
     """Return the numeric model options in which entries differ."""
     names = list(dict.fromkeys(name for entry in entries for name in _model_options(entry)))
     return [
@@ -270,17 +270,17 @@ def _varied(entries: Sequence[EntryCurves]) -> list[str]:
     ]
 
 
-def _model_options(entry: EntryCurves) -> Mapping[str, Any]:
+def _model_options(entry: EntryResults) -> Mapping[str, Any]:
     options: Mapping[str, Any] = entry.identity.get("model_options", {})
     return options
 
 
-def _environment_options(entry: EntryCurves) -> Mapping[str, Any]:
+def _environment_options(entry: EntryResults) -> Mapping[str, Any]:
     options: Mapping[str, Any] = entry.identity.get("task", {}).get("environment_options", {})
     return options
 
 
-def _size(entry: EntryCurves, by: str) -> float:
+def _size(entry: EntryResults, by: str) -> float:
     """Return the size of an entry: a number, or the length of a list."""
     if by == "parameters":
         return float(sum(entry.parameters))
@@ -304,7 +304,7 @@ def _size(entry: EntryCurves, by: str) -> float:
     return float(value)
 
 
-def _rest(entry: EntryCurves, by: str) -> str:
+def _rest(entry: EntryResults, by: str) -> str:
     """Return everything about an entry but its size: entries with the same rest are on one line."""
     model, world = dict(_model_options(entry)), dict(_environment_options(entry))
     if by == "parameters":
@@ -317,7 +317,7 @@ def _rest(entry: EntryCurves, by: str) -> str:
     return json.dumps([entry.algorithm, algorithm, entry.model, model, world], sort_keys=True)
 
 
-def _line_labels(entries: Sequence[EntryCurves], by: str) -> list[str]:
+def _line_labels(entries: Sequence[EntryResults], by: str) -> list[str]:
     """Name lines by their model and the options in which the lines differ."""
     varied = [name for name in dict.fromkeys(n for e in entries for n in _model_options(e)) if name != by]
     labels = []

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -42,23 +42,23 @@ def style(index: int) -> Style:
     )
 
 
-def of(entry: EntryCurves, index: int) -> Style:
+def of(entry: EntryResults, index: int) -> Style:
     """Return an entry's own style where it has one, else that of its place in the legend."""
     return style(index if entry.color is None else entry.color)
 
 
-def seeds_text(entry: EntryCurves) -> str:
+def seeds_text(entry: EntryResults) -> str:
     """Write the number of seeds of an entry, with a mark where the protocol asks for more: `50 seeds*`."""
     count = len(entry.seeds)
     return f"{count} seed{'s' * (count != 1)}{'*' * provisional(entry)}"
 
 
-def provisional(entry: EntryCurves) -> bool:
+def provisional(entry: EntryResults) -> bool:
     """Whether an entry has fewer seeds than its task's protocol asks for."""
     return len(entry.seeds) < entry.task_file.protocol.seeds
 
 
-def label(entry: EntryCurves) -> str:
+def label(entry: EntryResults) -> str:
     """Return what a legend says of an entry: its label and its seeds."""
     return f"{plain(entry.legend)}  ({seeds_text(entry)})"
 
@@ -70,7 +70,7 @@ def plain(text: str, longest: int = 60) -> str:
     return short.replace("$", r"\$")
 
 
-def note(entries: Sequence[EntryCurves]) -> str:
+def note(entries: Sequence[EntryResults]) -> str:
     """Return the sentence that explains the mark of provisional entries; empty where there is none."""
     protocol_seeds = sorted({entry.task_file.protocol.seeds for entry in entries if provisional(entry)})
     if not protocol_seeds:
@@ -78,7 +78,7 @@ def note(entries: Sequence[EntryCurves]) -> str:
     return f"* provisional: the protocol asks for {' or '.join(map(str, protocol_seeds))} seeds"
 
 
-def relative(entries: Sequence[EntryCurves]) -> bool:
+def relative(entries: Sequence[EntryResults]) -> bool:
     """Whether the scores of all entries are fractions of the optimum."""
     return all(entry.task_file.score.source == "info" for entry in entries)
 
@@ -90,14 +90,14 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
+def labels(entries: Sequence[EntryResults], longest: int = 60) -> list[str]:
     """Return what legends call entries: without the algorithm where all share it, never twice the same.
 
     An ansatz that no option chose is named where there is room for it.
     """
     algorithms = {entry.algorithm for entry in entries}
 
-    def short_name(entry: EntryCurves) -> str:
+    def short_name(entry: EntryResults) -> str:
         start = f"{entry.algorithm} " if len(algorithms) == 1 else ""
         whole = entry.legend.removeprefix(start)
         return whole if len(whole) <= longest else entry.label.removeprefix(start)
@@ -109,13 +109,13 @@ def labels(entries: Sequence[EntryCurves], longest: int = 60) -> list[str]:
     ]
 
 
-def parameters_text(entry: EntryCurves) -> str:
+def parameters_text(entry: EntryResults) -> str:
     """Write parameter counts: `387`, or `73 + 240` with the quantum ones second."""
     classical, quantum = entry.parameters
     return (f"{classical} + {quantum}" if quantum else f"{classical}") + entry.fixed_text
 
 
-def heading(entries: Sequence[EntryCurves]) -> str:
+def heading(entries: Sequence[EntryResults]) -> str:
     """Return what entries have in common: the task, and the algorithm where it is one."""
     tasks, algorithms = (
         {getattr(entry, attribute) for entry in entries} for attribute in ("task", "algorithm")

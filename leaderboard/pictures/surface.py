@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Grid
@@ -43,7 +43,7 @@ class SurfaceOptions:
     azimuth: Annotated[float, Field(description="3d: the viewer's direction, degrees")] = -128
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat of every cell, for every entry.
 
     Raises
@@ -62,7 +62,7 @@ def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
 
 
 def _maps(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     measured: Sequence[cells.Cells],
     grid: Grid,
     title: str,
@@ -123,7 +123,7 @@ def _maps(
 
 
 def _box(
-    entries: Sequence[EntryCurves],
+    entries: Sequence[EntryResults],
     measured: Sequence[cells.Cells],
     grid: Grid,
     title: str,

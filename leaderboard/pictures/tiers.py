@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Board, outperformance
@@ -41,7 +41,7 @@ class TiersOptions:
     ] = None
 
 
-def draw(entries: Sequence[EntryCurves], **settings: Any) -> Figure:
+def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw the ranking of a task's entries on its ranking grid.
 
     Raises
@@ -110,7 +110,7 @@ def _table(axes: Axes, board: Board) -> set[str]:
 
 
 def _name_rows_and_columns(
-    axes: Axes, entries: Sequence[EntryCurves], board: Board, shown: Sequence[str]
+    axes: Axes, entries: Sequence[EntryResults], board: Board, shown: Sequence[str]
 ) -> None:
     """Write entries beside rows and below columns, and set the tiers apart."""
     ranks = board.ranking.entries

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
 from qrlsuite.leaderboard.report.words import ranges
 from qrlsuite.results.text import counted
@@ -35,7 +35,7 @@ class EntryView:
     """
 
     index: int
-    curves: EntryCurves
+    curves: EntryResults
     label: str
     color: int
     legend: str
@@ -48,7 +48,7 @@ class EntryView:
         return self.curves.parameters[1] > 0
 
 
-def views(entries: Sequence[EntryCurves]) -> list[EntryView]:
+def views(entries: Sequence[EntryResults]) -> list[EntryView]:
     """Return the entries of a page, labels made harmless and unique within a task."""
     labels = [(entry.task, clean(entry.label)) for entry in entries]
     names: dict[str, dict[str, int]] = {}
@@ -71,7 +71,7 @@ def views(entries: Sequence[EntryCurves]) -> list[EntryView]:
     ]
 
 
-def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
+def _facts(entry: EntryResults) -> list[tuple[str, str]]:
     classical, quantum = entry.parameters
     return [
         ("Name", clean(entry.name)),
@@ -95,7 +95,7 @@ def _facts(entry: EntryCurves) -> list[tuple[str, str]]:
     ]
 
 
-def _networks(entry: EntryCurves) -> str:
+def _networks(entry: EntryResults) -> str:
     """Say over how many networks parameters are summed, where that is not one."""
     if entry.first_network_alone:
         return " (first network alone)"
@@ -124,7 +124,7 @@ def _told(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else clean(value)
 
 
-def _options(entry: EntryCurves) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
+def _options(entry: EntryResults) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
     tables = []
     for part in ("algorithm", "model"):
         values = entry.identity.get(f"{part}_options", {})

@@ -67,8 +67,8 @@ from qrlsuite.statistics.significance import (
     SignificanceRule,
     paired_difference_rule,
 )
-from qrlsuite.statistics.standings import Direction, TimesBoard, holm, rank_ranges, times_board
 from qrlsuite.statistics.times import MeanTime, mean_time, times_below
+from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board
 
 __all__ = [
     "MIN_RUNS",

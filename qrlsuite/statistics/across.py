@@ -17,8 +17,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
 from qrlsuite.statistics.permutation import CHUNK, relabelings, relabelings_for
-from qrlsuite.statistics.standings import holm
 from qrlsuite.statistics.times import check_probability, times_below
+from qrlsuite.statistics.times_board import holm
 
 Scores = Mapping[str, Sequence[ArrayLike] | NDArray[np.floating]]
 """For each entry K arrays (runs,), one per task, or rliable's array (runs, tasks)."""

@@ -13,8 +13,8 @@ from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray
 from qrlsuite.statistics.permutation import MaxT
-from qrlsuite.statistics.standings import Direction, direction, log_ratios, named_direction, refine
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
+from qrlsuite.statistics.times_board import Direction, direction, log_ratios, named_direction, refine
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -31,8 +31,8 @@ from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
 from qrlsuite.statistics.permutation import Blocks, MaxT, relabelings_for
-from qrlsuite.statistics.standings import direction, log_ratios
 from qrlsuite.statistics.times import check_probability, student_quantile, times_below
+from qrlsuite.statistics.times_board import direction, log_ratios
 
 RULES = ("times", "times-skewed")
 """What may judge the pairs of a plan."""

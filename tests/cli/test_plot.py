@@ -14,18 +14,18 @@ from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, UnknownNameError
 from qrlsuite.leaderboard import collect, pictures
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from tests.leaderboard.test_pictures import learner, noisy
 
 RUNNER = CliRunner()
 
 
 @pytest.fixture
-def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryCurves]:
+def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryResults]:
     """Three entries in place of a results folder."""
     found = [learner("ddqn mlp width=16", 40), learner("ddqn mlp width=64", 10), noisy("ddqn vqc qubits=6")]
 
-    def read(runs: Path, name: str, published: bool, tasks: Sequence[str]) -> list[EntryCurves]:
+    def read(runs: Path, name: str, published: bool, tasks: Sequence[str]) -> list[EntryResults]:
         return [next(entry for entry in found if name in entry.label)]
 
     monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False, only=None: (found, []))
@@ -56,14 +56,14 @@ def test_many_curves_have_their_legend_beside_them() -> None:
 
 
 @pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers"])
-def test_pictures_of_entries(kind: str, entries: list[EntryCurves], tmp_path: Path) -> None:
+def test_pictures_of_entries(kind: str, entries: list[EntryResults], tmp_path: Path) -> None:
     out = tmp_path / "p.svg"
     content = json.loads(call("plot", kind, "--out", str(out), "--json"))
     assert content["seeds"] == {entry.name: 30 for entry in entries}
     assert out.read_text().startswith("<?xml")
 
 
-def test_entries_are_drawn_in_the_order_named(entries: list[EntryCurves], tmp_path: Path) -> None:
+def test_entries_are_drawn_in_the_order_named(entries: list[EntryResults], tmp_path: Path) -> None:
     words = ("--entry", "width=64", "--entry", "qubits=6", "--out", str(tmp_path / "p.png"), "--json")
     assert list(json.loads(call("plot", "curves", *words))["seeds"]) == [
         "ddqn mlp width=64",
@@ -123,7 +123,7 @@ def not_a_figure(worlds: object, options: object) -> str:
     ],
 )
 def test_bad_input_says_what_to_type(
-    words: tuple[str, ...], kind: type[QrlSuiteError], message: str, entries: list[EntryCurves]
+    words: tuple[str, ...], kind: type[QrlSuiteError], message: str, entries: list[EntryResults]
 ) -> None:
     with pytest.raises(kind, match=message):
         call("plot", *words)
@@ -134,7 +134,7 @@ def test_settings_are_listed() -> None:
     assert "degrees" in call("plot", "trajectories", "--settings")
 
 
-def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[EntryCurves]) -> None:
+def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[EntryResults]) -> None:
     output = call("compare", "width=64", "width=16")
     assert all(len(line) <= 80 for line in output.splitlines())
     said = " ".join(output.split())
@@ -149,21 +149,21 @@ def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[E
     assert "rule '" not in output
 
 
-def test_compare_shows_cells_by_the_rule_that_is_named(entries: list[EntryCurves]) -> None:
+def test_compare_shows_cells_by_the_rule_that_is_named(entries: list[EntryResults]) -> None:
     output = call("compare", "width=64", "width=16", "--rule", "difference")
     assert all(len(line) <= 80 for line in output.splitlines())
     assert "rule 'difference':" in " ".join(output.split())
     assert output.strip().endswith("+ significantly fewer samples")
 
 
-def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryCurves]) -> None:
+def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryResults]) -> None:
     assert "difference-paired" in call("list", "significance-tests")
     assert "promises: the whole grid of one pair" in call("show", "difference")
     assert "rule 'difference': the whole grid" in call("leaderboard", "--rule", "difference")
     assert json.loads(call("leaderboard", "--format", "json"))["rule"] == "intervals"
 
 
-def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryCurves]) -> None:
+def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryResults]) -> None:
     words = ("calibrate", "qubits=6", "--draws", "4", "--seeds", "20", "--board", "2", "--part", "pairs")
     output = call(*words, "--rule", "intervals")
     assert "'intervals' promises each cell by itself" in output

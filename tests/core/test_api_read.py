@@ -20,7 +20,7 @@ from rich.console import Console
 from qrlsuite import api
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import collect
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from tests.conftest import HANGS
 from tests.core.test_dependencies import ALL
 
@@ -28,12 +28,12 @@ WHERE: dict[str, Any] = {"runs": "no-results-yet", "published": True}
 
 
 @pytest.fixture(scope="module")
-def small() -> EntryCurves:
+def small() -> EntryResults:
     return api.load("mlp width=16", task="beam6g", **WHERE)
 
 
 @pytest.fixture(scope="module")
-def large() -> EntryCurves:
+def large() -> EntryResults:
     return api.load("beam6g/mlp width=64", **WHERE)
 
 
@@ -46,7 +46,7 @@ def printed(thing: object, width: int = 200) -> str:
     return text.getvalue()
 
 
-def test_an_entry_is_read_with_its_curves_and_records(small: EntryCurves) -> None:
+def test_an_entry_is_read_with_its_curves_and_records(small: EntryResults) -> None:
     assert small.curves.shape == (100, 100)
     assert small.curves.dtype == np.float64
     assert list(small.records) == list(small.seeds) == list(range(100))
@@ -55,7 +55,7 @@ def test_an_entry_is_read_with_its_curves_and_records(small: EntryCurves) -> Non
 
 
 def test_runs_have_the_records_that_published_entries_have(
-    train: Callable[..., Path], tmp_path: Path, small: EntryCurves
+    train: Callable[..., Path], tmp_path: Path, small: EntryResults
 ) -> None:
     folder = train(tmp_path / "runs", [0, 1])
     found = api.load(str(folder), runs=tmp_path / "runs")
@@ -65,7 +65,7 @@ def test_runs_have_the_records_that_published_entries_have(
     assert found.curves.shape == (2, found.records[0]["epochs"])
 
 
-def test_a_table_has_a_row_per_seed_and_epoch(small: EntryCurves) -> None:
+def test_a_table_has_a_row_per_seed_and_epoch(small: EntryResults) -> None:
     table = small.to_table()
     assert table.column_names == ["task", "entry", "seed", "epoch", "steps", "score"]
     assert table.num_rows == small.curves.size
@@ -76,7 +76,7 @@ def test_a_table_has_a_row_per_seed_and_epoch(small: EntryCurves) -> None:
     assert set(seventh["entry"]) == {"ddqn mlp width=16"}
 
 
-def test_a_table_is_a_data_frame(small: EntryCurves) -> None:
+def test_a_table_is_a_data_frame(small: EntryResults) -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
     frame = small.to_table().to_pandas()
     assert isinstance(frame, pandas.DataFrame)
@@ -85,7 +85,7 @@ def test_a_table_is_a_data_frame(small: EntryCurves) -> None:
     )
 
 
-def test_a_board_ranks_what_it_is_given(small: EntryCurves, large: EntryCurves) -> None:
+def test_a_board_ranks_what_it_is_given(small: EntryResults, large: EntryResults) -> None:
     board = api.board("beam6g", entries=[large, "mlp width=16"], **WHERE)
     (section,) = board.sections
     assert [(row.tier, row.entry.label) for row in section.rows] == [
@@ -96,12 +96,12 @@ def test_a_board_ranks_what_it_is_given(small: EntryCurves, large: EntryCurves) 
     assert api.board(["beam6g"], entries=[small], horizon=20_000, **WHERE).sections[0].horizon == 20_000
 
 
-def test_what_is_left_out_of_a_board_is_named(large: EntryCurves) -> None:
+def test_what_is_left_out_of_a_board_is_named(large: EntryResults) -> None:
     with pytest.raises(UnknownNameError, match=r"no entry is left: .*100 seeds, fewer than 101"):
         api.board(entries=[large], min_seeds=101, **WHERE)
 
 
-def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryCurves) -> None:
+def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryResults) -> None:
     few = small.with_seeds([7, 3])
     assert few.seeds == (3, 7)
     assert np.array_equal(few.curves, small.curves[[3, 7]])
@@ -112,7 +112,7 @@ def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryCurve
         small.with_seeds([0, 100])
 
 
-def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None:
+def test_results_show_themselves(small: EntryResults, large: EntryResults) -> None:
     board = api.board("beam6g", entries=[small, large], **WHERE)
     comparison = api.compare(large, small)
     for shown in (board._repr_html_(), printed(board), repr(board), str(board)):
@@ -134,7 +134,7 @@ def test_results_show_themselves(small: EntryCurves, large: EntryCurves) -> None
     assert ["settings" in head for head in heads] == [False, True], "80 columns have no room for it"
 
 
-def test_html_holds_nothing_but_text(large: EntryCurves) -> None:
+def test_html_holds_nothing_but_text(large: EntryResults) -> None:
     hostile = replace(large, label="<script>alert(1)</script>", folder=Path("<img src=x>"))
     for shown in (
         hostile._repr_html_(),
@@ -146,7 +146,7 @@ def test_html_holds_nothing_but_text(large: EntryCurves) -> None:
         assert "&lt;script&gt;" in shown
 
 
-def test_names_and_entries_are_compared_alike(small: EntryCurves, large: EntryCurves) -> None:
+def test_names_and_entries_are_compared_alike(small: EntryResults, large: EntryResults) -> None:
     by_name = api.compare("mlp width=64", "mlp width=16", task="beam6g", **WHERE)
     assert api.compare(large, small).as_dict() == {**by_name.as_dict(), "board": None}
     assert str(by_name.outcome) == "outperforms"
@@ -158,13 +158,13 @@ def test_names_and_entries_are_compared_alike(small: EntryCurves, large: EntryCu
 
 
 @pytest.mark.parametrize("kind", ["curves", "bars", "tiers"])
-def test_pictures_are_figures(kind: str, small: EntryCurves, large: EntryCurves) -> None:
+def test_pictures_are_figures(kind: str, small: EntryResults, large: EntryResults) -> None:
     figure = api.plot(kind, entries=[small, large], **WHERE)
     texts = " ".join(text.get_text() for text in figure.findobj() if hasattr(text, "get_text"))
     assert "mlp width=64" in texts
 
 
-def test_a_picture_of_equal_numbers(small: EntryCurves, large: EntryCurves) -> None:
+def test_a_picture_of_equal_numbers(small: EntryResults, large: EntryResults) -> None:
     figure = api.plot("bars", entries=[small, large], seeds=30, **WHERE)
     shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert ["30 seeds*" in text for text in shown] == [True, True]
@@ -179,7 +179,7 @@ def test_pictures_of_an_environment_take_its_options() -> None:
 
 
 def test_a_picture_names_what_it_leaves_out(
-    small: EntryCurves, large: EntryCurves, monkeypatch: pytest.MonkeyPatch
+    small: EntryResults, large: EntryResults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     short = small.cut(50)
     assert short is not None

@@ -66,7 +66,7 @@ def test_the_cells_of_the_retuned_network(first: str, second: str, sentence: str
 
 
 def test_the_two_halves_of_the_seeds() -> None:
-    published = [read(folder).entry_curves() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
+    published = [read(folder).entry_results() for folder in sorted((PUBLISHED / "beam6g").iterdir())]
     entries = {entry.label: entry for entry in published}
     circuit, network = entries["ddqn vqc-native qubits=10"], entries["ddqn mlp width=16 lr=0.002"]
 

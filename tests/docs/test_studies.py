@@ -22,8 +22,8 @@ from qrlsuite.leaderboard.times import percent
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoard, Verdict, times_board
 from qrlsuite.statistics.estimator import sample_complexity
-from qrlsuite.statistics.standings import holm
 from qrlsuite.statistics.times import times_below
+from qrlsuite.statistics.times_board import holm
 from qrlsuite.studies.decided import versus
 
 if TYPE_CHECKING:
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from qrlsuite.leaderboard.curves import EntryCurves
+    from qrlsuite.leaderboard.curves import EntryResults
     from qrlsuite.leaderboard.times import TimeRanking
     from qrlsuite.statistics.sequential import PairDecision
 
-    Placements = dict[tuple[str, int], list[EntryCurves]]
+    Placements = dict[tuple[str, int], list[EntryResults]]
 
 PAGE = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
 FIDELITY = (Path(__file__).parents[2] / "docs" / "fidelity.md").read_text()
@@ -212,11 +212,11 @@ def test_rows_of_pairs(boards: dict[tuple[str | None, str], TimeRanking]) -> Non
     assert not changed, "rows of docs/studies.md, as they should be:\n" + "\n".join(changed)
 
 
-def published_pairs(first: str, second: str, task: str | None) -> Iterator[tuple[EntryCurves, EntryCurves]]:
+def published_pairs(first: str, second: str, task: str | None) -> Iterator[tuple[EntryResults, EntryResults]]:
     """Yield every model on one task and on another, or with one algorithm and with another on `task`."""
     if task is None:
         for folder in (PUBLISHED / first).iterdir():
-            entry = read(folder).entry_curves()
+            entry = read(folder).entry_results()
             yield entry, api.load(entry.label, task=second, published=True, runs="none")
         return
     found = api.board(task, study=first, published=True, runs="none")
@@ -226,7 +226,7 @@ def published_pairs(first: str, second: str, task: str | None) -> Iterator[tuple
 
 
 def each_model(
-    found: Iterable[tuple[EntryCurves, EntryCurves]], first: str, second: str
+    found: Iterable[tuple[EntryResults, EntryResults]], first: str, second: str
 ) -> list[tuple[str, TimesBoard, Direction, str]]:
     """Compare the entries of each pair by `times`, with Holm's correction over the pairs.
 
@@ -457,7 +457,7 @@ def test_scores_at_the_end(placements: Placements) -> None:
     assert f"{ends[0]:.3f} of the optimum with `u3` and {ends[1]:.3f} with `rot`" in TABLE
     assert f"scatter by {spreads[0]:.3f} and {spreads[1]:.3f}" in TABLE
     hard = [
-        np.median(read(folder).entry_curves().curves[:, -1])
+        np.median(read(folder).entry_results().curves[:, -1])
         for folder in (PUBLISHED / "beam6g-degree6").iterdir()
     ]
     assert f"all four models end at {min(hard):.3f} to {max(hard):.3f} of the optimum" in TABLE

@@ -9,7 +9,7 @@ import numpy as np
 
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 
 HOSTILE = (
     "<script>alert(1)</script>",
@@ -27,14 +27,14 @@ def entry(
     speed: float = 1.0,
     quantum: int = 0,
     task: str = "beam6g",
-) -> EntryCurves:
+) -> EntryResults:
     """An entry whose score rises to .93 within about 50 / speed epochs, with noise per run and epoch."""
     file = tasks.load(task).file
     generator = np.random.default_rng([len(label), seeds, int(100 * speed)])
     pace = speed * generator.lognormal(0, 0.25, (seeds, 1)) / 20
     rising = 0.93 - 0.6 * np.exp(-pace * np.arange(1, epochs + 1))
     curves = np.clip(rising + 0.02 * generator.standard_normal((seeds, epochs)), 0, 1)
-    return EntryCurves(
+    return EntryResults(
         name=label,
         label=label,
         task=task,
@@ -52,12 +52,12 @@ def entry(
     )
 
 
-def of(entries: Sequence[EntryCurves], refused: Sequence[str] = ()) -> board.Leaderboard:
+def of(entries: Sequence[EntryResults], refused: Sequence[str] = ()) -> board.Leaderboard:
     """The board of some entries."""
     return board.build(entries, refused)
 
 
-def graded(count: int, seeds: int = 20, epochs: int = 100) -> list[EntryCurves]:
+def graded(count: int, seeds: int = 20, epochs: int = 100) -> list[EntryResults]:
     """`count` entries, each somewhat slower than the one before."""
     return [
         entry(f"model-{i} width={2**i % 1000}", seeds, epochs, 2.4 * 0.85**i, quantum=144 * (i % 3 == 1))

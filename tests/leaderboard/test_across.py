@@ -21,7 +21,7 @@ from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import across
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore
 from tests.conftest import POLE, TINY
@@ -30,7 +30,7 @@ from tests.leaderboard import boards
 TASKS = ("beam6g", "cartpole")
 
 
-def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) -> EntryCurves:
+def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) -> EntryResults:
     """Runs that score 0, and 1 from an epoch on."""
     entry = boards.entry(label, len(epochs_below), 500 if task == "cartpole" else 100, task=task)
     curves = np.ones(entry.curves.shape)
@@ -39,7 +39,7 @@ def runs_of(label: str, task: str, epochs_below: list[int], **identity: object) 
     return replace(entry, curves=curves, identity={**entry.identity, **identity})
 
 
-def both(label: str, share: float, seeds: int = 20) -> list[EntryCurves]:
+def both(label: str, share: float, seeds: int = 20) -> list[EntryResults]:
     """Below threshold for a share of the horizon of both tasks; every second run a twentieth longer."""
     return [
         runs_of(label, "beam6g", [round(100 * share) + 5 * (i % 2) for i in range(seeds)]),

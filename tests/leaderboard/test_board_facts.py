@@ -17,7 +17,7 @@ from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board, collect, origin, published, report, tables
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.export import export
 from qrlsuite.leaderboard.pictures import tiers
 from qrlsuite.leaderboard.sheet import csv_rows
@@ -37,7 +37,7 @@ def paper(made: board.Leaderboard) -> str:
     return markdown(replace(made, sections=sections))
 
 
-def flat(label: str, score: float, last: float | None = None) -> EntryCurves:
+def flat(label: str, score: float, last: float | None = None) -> EntryResults:
     """An entry of 20 seeds at one score all along, or from epoch 50 on at another."""
     curves = np.full((20, 100), score)
     if last is not None:

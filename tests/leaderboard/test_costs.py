@@ -18,7 +18,7 @@ from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import costs, report
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from tests.leaderboard import boards
 
 STEPS = 2000
@@ -28,7 +28,7 @@ PAID = {"epochs": 100, "executions": 1, "hours": 1}
 
 def learner(
     label: str, epochs_below: int, per_step: float, seeds: int = 20, epochs: int = 100, **facts: Any
-) -> EntryCurves:
+) -> EntryResults:
     """An entry whose runs score 0, and 1 from an epoch on (every second one an epoch later); each step has a cost."""
     entry = boards.entry(label, seeds, epochs, quantum=144)
     curves = np.ones((seeds, epochs))
@@ -43,7 +43,7 @@ def learner(
     return replace(entry, curves=curves, records=dict.fromkeys(range(seeds), paid), **{**known, **facts})
 
 
-def section(*entries: EntryCurves, by: str = "executions") -> costs.CostSection:
+def section(*entries: EntryResults, by: str = "executions") -> costs.CostSection:
     (found,) = costs.build(entries, by).sections
     return found
 

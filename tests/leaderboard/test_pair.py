@@ -13,14 +13,14 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.leaderboard import board, pair, tables
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
 
 
 def entry(
     label: str, reached_at: list[int] | np.ndarray, score: float = 0.95, start: float = 0.1
-) -> EntryCurves:
+) -> EntryResults:
     """One run per number: the epoch of 100 from which it has the score."""
     curves = np.full((len(reached_at), 100), start)
     for run, epoch in enumerate(reached_at):

@@ -21,7 +21,7 @@ from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells
 from qrlsuite.statistics import Grid
 
@@ -37,11 +37,11 @@ def learner(
     task: str = "beam6g",
     model_options: dict[str, Any] | None = None,
     environment_options: dict[str, Any] | None = None,
-) -> EntryCurves:
+) -> EntryResults:
     """All runs reach .95 after the same epoch and stay: S_hat is that epoch in every cell, without spread."""
     curves = np.zeros((seeds, epochs))
     curves[:, first_good:] = 0.95
-    return EntryCurves(
+    return EntryResults(
         name=label,
         label=label,
         task=task,
@@ -62,7 +62,7 @@ def learner(
     )
 
 
-def noisy(label: str, seeds: int = 30, level: float = 0.9) -> EntryCurves:
+def noisy(label: str, seeds: int = 30, level: float = 0.9) -> EntryResults:
     entry = learner(label, seeds=seeds)
     generator = np.random.default_rng(len(label))
     pace = generator.lognormal(2.5, 0.4, (seeds, 1))
@@ -84,7 +84,7 @@ def bars(axes: Axes) -> list[Rectangle]:
     return [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height() > 0]
 
 
-ENTRIES: Sequence[EntryCurves] = (
+ENTRIES: Sequence[EntryResults] = (
     learner("ddqn mlp width=16", 40, model_options={"width": 16}),
     learner("ddqn mlp width=64", 10, model_options={"width": 64}),
 )

@@ -536,7 +536,7 @@ def test_the_page_says_how_many_seeds_are_trained_again() -> None:
 
 
 def test_hours_of_published_entries_rank_nothing(folder: Path) -> None:
-    assert costs.price(published.read(folder).entry_curves(), "core-hours").problem
+    assert costs.price(published.read(folder).entry_results(), "core-hours").problem
 
 
 @pytest.mark.parametrize(
@@ -635,7 +635,7 @@ def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
     entry = collect.read_entry(EntryStore(runs))
     assert entry is not None
     assert entry.seeds == (0,)
-    there = published.read(export(entry, tmp_path / "entries")).entry_curves()
+    there = published.read(export(entry, tmp_path / "entries")).entry_results()
     for found in (entry, there):
         assert board.as_dict(board.build([found]))["sections"][0]["rows"][0]["tuning"] == {"steps": 7}
 

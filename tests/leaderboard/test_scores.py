@@ -10,12 +10,12 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.scores import rank_by_score
 from tests.leaderboard.test_pair import entry, spread
 
 
-def both() -> list[EntryCurves]:
+def both() -> list[EntryResults]:
     return [entry("fast", spread(10), 0.7), entry("slow", spread(60), 0.9), entry("few", spread(10, 19))]
 
 

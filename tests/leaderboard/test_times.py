@@ -22,7 +22,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, TaskError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board, report, sheet, tables
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction
 from tests.conftest import TINY
@@ -32,7 +32,7 @@ EPSILONS = [0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40]
 """Of beam6g's ranking grid, at 2000 steps per epoch and 100 epochs."""
 
 
-def reaching(label: str, *steps: tuple[float, float], seeds: int = 20, spread: int = 2) -> EntryCurves:
+def reaching(label: str, *steps: tuple[float, float], seeds: int = 20, spread: int = 2) -> EntryResults:
     """Runs that score 0, and `score` from about an epoch on, for each (score, epoch); run i is i % spread later."""
     curves = np.zeros((seeds, 100))
     for run in range(seeds):
@@ -41,12 +41,12 @@ def reaching(label: str, *steps: tuple[float, float], seeds: int = 20, spread: i
     return replace(boards.entry(label, seeds), curves=curves)
 
 
-def times_of(*entries: EntryCurves, alpha: float = 0.05) -> Any:
+def times_of(*entries: EntryResults, alpha: float = 0.05) -> Any:
     (section,) = board.build(entries, alpha=alpha).sections
     return section.times
 
 
-def markdown(*entries: EntryCurves) -> str:
+def markdown(*entries: EntryResults) -> str:
     (made,) = boards.of(entries).sheets(explain=True)
     return made.markdown()
 

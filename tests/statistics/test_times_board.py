@@ -20,7 +20,7 @@ from qrlsuite.statistics import (
     times_board,
 )
 from qrlsuite.statistics.permutation import CHUNK
-from qrlsuite.statistics.standings import direction, log_ratios, refine
+from qrlsuite.statistics.times_board import direction, log_ratios, refine
 from tests.statistics.conftest import SURFACE, entry
 
 CELL = Grid.relative([0.1, 0.5], [0.5])

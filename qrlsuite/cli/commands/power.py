@@ -18,7 +18,7 @@ from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, Run
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.leaderboard import board, collect
-from qrlsuite.leaderboard.curves import EntryCurves
+from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.results import speed
 from qrlsuite.results.speed import BASES
 from qrlsuite.results.store import EntryStore
@@ -100,7 +100,7 @@ def power(
 
 
 def _core_hours(
-    entries: list[EntryCurves], curves: list[LearningCurves], runs: Path
+    entries: list[EntryResults], curves: list[LearningCurves], runs: Path
 ) -> tuple[float | None, str]:
     """Return the core-hours of a seed of each of two entries together, None where unknown; and what that rests on."""
     speeds = speed.known(runs)
@@ -137,7 +137,7 @@ def _row(title: str, need: Need, per_pair: float | None) -> dict[str, Any]:
 
 
 def _as_dict(
-    entries: list[EntryCurves], horizon: int, rows: list[dict[str, Any]], basis: str, draws: int
+    entries: list[EntryResults], horizon: int, rows: list[dict[str, Any]], basis: str, draws: int
 ) -> dict[str, Any]:
     return {
         "task": entries[0].task,
@@ -152,7 +152,7 @@ def _as_dict(
 
 
 def _show(
-    entries: list[EntryCurves],
+    entries: list[EntryResults],
     horizon: int,
     rows: list[dict[str, Any]],
     per_pair: float | None,
