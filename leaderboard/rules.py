@@ -12,7 +12,7 @@ from typing import Any, cast
 from qrlsuite import registry
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.specs import SignificanceTestSpec, resolve
+from qrlsuite.specs import RuleSpec, resolve
 from qrlsuite.statistics import Evidence, SignificanceRule
 from qrlsuite.statistics.grid import IntArray
 from qrlsuite.statistics.significance import check_signs
@@ -29,45 +29,45 @@ _PERMUTATION = "qrlsuite.statistics.permutation"
 
 
 @hookimpl
-def register_significance_tests(register: Callable[[SignificanceTestSpec], None]) -> None:
+def register_rules(register: Callable[[RuleSpec], None]) -> None:
     """Register the paper's rule, the bootstrap of the difference, and three permutation tests."""
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name=DEFAULT,
             summary="the paper's (`--rule paper`): 5th to 95th percentile intervals do not overlap; per cell",
             factory=f"{_HERE}:IntervalRule",
         )
     )
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name="difference",
             summary="bootstrap of the difference; error probability 5 percent over a pair's whole grid",
             factory=f"{_HERE}:DifferenceRule",
         )
     )
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name="difference-paired",
             summary="the same, run by run of the same seed: sharper where equal seeds do similarly",
             factory=f"{_HERE}:paired_difference_rule",
         )
     )
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name="permutation",
             summary="labels of runs permuted, per cell; error probability 5 percent over a pair's whole grid",
             factory=f"{_PERMUTATION}:PermutationRule",
         )
     )
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name=TIMES,
             summary="labels of runs permuted, mean time below each tolerance; 5 percent over all tolerances",
             factory=f"{_PERMUTATION}:TimesRule",
         )
     )
     register(
-        SignificanceTestSpec(
+        RuleSpec(
             name="times-skewed",
             summary="the same with a t corrected for skewness: errs less where some runs of one entry fail",
             factory=f"{_PERMUTATION}:SkewedTimesRule",
@@ -89,12 +89,12 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     name = DEFAULT if name == PAPER else name
     known = registry.load()
     try:
-        registered = known.get("significance_tests", name)
+        registered = known.get("rules", name)
     except UnknownNameError:
-        choices = [PAPER, *known.names("significance_tests")]
-        raise UnknownNameError(f"unknown significance test '{name}'{nearest(name, choices)}") from None
-    spec = cast(SignificanceTestSpec, registered.spec)
-    origin = f"significance test '{name}' of distribution '{registered.distribution}'"
+        choices = [PAPER, *known.names("rules")]
+        raise UnknownNameError(f"unknown rule '{name}'{nearest(name, choices)}") from None
+    spec = cast(RuleSpec, registered.spec)
+    origin = f"rule '{name}' of distribution '{registered.distribution}'"
     try:
         rule = resolve(spec.factory)()
     except Exception as error:

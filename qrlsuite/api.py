@@ -132,7 +132,7 @@ def board(
         task: name the study.
     rule:
         None ranks by significant outperformance with the error of the whole board held. `paper`, or another name of
-        `qrlsuite list significance-tests`, shows tiers by the cells of the task's grid in the place of ranks. A task
+        `qrlsuite list rules`, shows tiers by the cells of the task's grid in the place of ranks. A task
         may name a rule of its own.
     alpha:
         Probability of any false decision on the board.

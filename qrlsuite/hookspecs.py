@@ -198,7 +198,7 @@ def register_circuit_backends(register: Callable[[specs.CircuitBackendSpec], Non
 
 
 @hookspec
-def register_significance_tests(register: Callable[[specs.SignificanceTestSpec], None]) -> None:
+def register_rules(register: Callable[[specs.RuleSpec], None]) -> None:
     """Register rules that decide whether one entry needs significantly fewer samples than another.
 
     They appear as `qrlsuite leaderboard --rule NAME`, `compare --rule NAME` and `calibrate --rule NAME`. A rule has
@@ -216,8 +216,8 @@ def register_significance_tests(register: Callable[[specs.SignificanceTestSpec],
                 return fewer.astype("int8") - more.astype("int8")
 
         @hookimpl
-        def register_significance_tests(register):
-            register(SignificanceTestSpec(name="half", summary="...", factory="my_package:Half"))
+        def register_rules(register):
+            register(RuleSpec(name="half", summary="...", factory="my_package:Half"))
 
     Equal numbers, the limit of 20 runs, outperformance and ranking hold for every rule. A rule whose attribute
     `paired` is true is given entries with the same seeds in the same order.

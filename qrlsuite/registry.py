@@ -39,7 +39,7 @@ KINDS: dict[str, type[specs.Spec]] = {
     "tasks": specs.TaskSpec,
     "ansatzes": specs.AnsatzSpec,
     "circuit_backends": specs.CircuitBackendSpec,
-    "significance_tests": specs.SignificanceTestSpec,
+    "rules": specs.RuleSpec,
     "engines": specs.EngineSpec,
     "studies": specs.StudySpec,
     "trackers": specs.TrackerSpec,

@@ -244,7 +244,7 @@ class CircuitBackendSpec(NumericSpec):
 
 
 @dataclass(frozen=True, slots=True)
-class SignificanceTestSpec(Spec):
+class RuleSpec(Spec):
     """A rule that decides, per (epsilon, delta) cell, whether one entry needs significantly fewer samples.
 
     Attributes

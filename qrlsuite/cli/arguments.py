@@ -54,7 +54,7 @@ RuleOption = Annotated[
     typer.Option(
         "--rule",
         metavar="NAME",
-        help="What counts as significant: qrlsuite list significance-tests; default: the task's, else intervals.",
+        help="What counts as significant: qrlsuite list rules; default: the task's, else intervals.",
     ),
 ]
 AlphaOption = Annotated[

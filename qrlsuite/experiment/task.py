@@ -115,7 +115,7 @@ class RankingSection(_TaskTable):
         ),
     ]
     rule: Annotated[
-        str | None, Field(description="significance test of its boards; the paper's where absent")
+        str | None, Field(description="rule by which its boards compare; the paper's where absent")
     ] = None
 
     @model_serializer(mode="wrap")
@@ -239,7 +239,7 @@ class Task:
         self.hash = digest(self.definition)
         if file.ranking.rule is not None:
             try:
-                registry.load().get("significance_tests", file.ranking.rule)
+                registry.load().get("rules", file.ranking.rule)
             except UnknownNameError as error:
                 raise TaskError(f"{source}: ranking.rule: {error}") from None
         epoch = file.protocol.interactions

@@ -181,7 +181,7 @@ class Evidence:
 
 @runtime_checkable
 class SignificanceRule(Protocol):
-    """A rule for one pair of entries; register one with the hook `register_significance_tests`.
+    """A rule for one pair of entries; register one with the hook `register_rules`.
 
     A rule must be antisymmetric: `rule(a, b) == -rule(b, a)`. A rule that can judge one entry against many
     at once may also have a method `against(first, others) -> (M, E, D)`; boards use it where it exists. A rule

@@ -32,7 +32,7 @@ __all__ = [
     "check_engine",
     "check_environment",
     "check_model",
-    "check_significance_test",
+    "check_rule",
     "check_study",
     "check_task",
     "check_tracker",
@@ -46,7 +46,7 @@ _FILES = {
     "algorithms": "algorithm",
     "tasks": "task",
     "engines": "engine",
-    "significance_tests": "significance",
+    "rules": "rule",
     "studies": "study",
     "trackers": "tracker",
 }
@@ -169,9 +169,9 @@ def check_engine(name_or_spec: Any, settings: Settings = None) -> list[Finding]:
     return check("engine", name_or_spec, settings)
 
 
-def check_significance_test(name_or_spec: Any) -> list[Finding]:
+def check_rule(name_or_spec: Any) -> list[Finding]:
     """Check a significance rule: signs, antisymmetry, direction, equal entries, one against many."""
-    return check("significance_test", name_or_spec)
+    return check("rule", name_or_spec)
 
 
 def check_tracker(name_or_plugin: Any) -> list[Finding]:

@@ -22,7 +22,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from qrlsuite import hookimpl
-from qrlsuite.specs import EngineSpec, SignificanceTestSpec
+from qrlsuite.specs import EngineSpec, RuleSpec
 
 @dataclass(frozen=True)
 class Options:
@@ -48,8 +48,8 @@ def register_engines(register):
 """
 TWICE = """
 @hookimpl
-def register_significance_tests(register):
-    register(SignificanceTestSpec("twice", "A rule beside an engine", f"{__name__}:Engine"))
+def register_rules(register):
+    register(RuleSpec("twice", "A rule beside an engine", f"{__name__}:Engine"))
 """
 
 Command = Callable[..., tuple[int, str, str]]
@@ -212,7 +212,7 @@ def test_what_the_messages_tell_to_type_works(check: Command) -> None:
     assert {row["name"] for row in json.loads(check("distribution:local", "--json")[1])} == {"elsewhere"}
     assert check("twice", "--json")[0] == 1, "both things are the distribution's, and its rule is none"
     assert check("engine:twice")[0] == 0
-    assert check("significance-test:twice")[0] == 1
+    assert check("rule:twice")[0] == 1
 
 
 def test_without_a_name_it_says_what_can_be_checked(check: Command) -> None:

@@ -157,7 +157,7 @@ def test_compare_shows_cells_by_the_rule_that_is_named(entries: list[EntryResult
 
 
 def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryResults]) -> None:
-    assert "difference-paired" in call("list", "significance-tests")
+    assert "difference-paired" in call("list", "rules")
     assert "promises: the whole grid of one pair" in call("show", "difference")
     assert "rule 'difference': the whole grid" in call("leaderboard", "--rule", "difference")
     assert json.loads(call("leaderboard", "--format", "json"))["rule"] == "intervals"

@@ -33,7 +33,7 @@ def example(hook: str, folder: Path) -> types.ModuleType:
     lines = [line for line in f"    {code}".splitlines() if not line.strip() or line.startswith("    ")]
     module = types.ModuleType(f"example_{hook}")
     module.__file__ = str(folder / "plugin.py")
-    names = {"hookimpl": hookspecs.hookimpl, "SignificanceTestSpec": registry.specs.SignificanceTestSpec}
+    names = {"hookimpl": hookspecs.hookimpl, "RuleSpec": registry.specs.RuleSpec}
     module.__dict__.update(names)
     exec(compile(textwrap.dedent("\n".join(lines)), f"<manual of {hook}>", "exec"), module.__dict__)
     return module

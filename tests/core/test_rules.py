@@ -69,10 +69,10 @@ def third_party(monkeypatch: pytest.MonkeyPatch) -> Callable[[type], Any]:
         module.Rule = rule  # type: ignore[attr-defined]
 
         @hookimpl
-        def register_significance_tests(register: Callable[[specs.SignificanceTestSpec], None]) -> None:
-            register(specs.SignificanceTestSpec("half", "Half as many", "acme_rules:Rule"))
+        def register_rules(register: Callable[[specs.RuleSpec], None]) -> None:
+            register(specs.RuleSpec("half", "Half as many", "acme_rules:Rule"))
 
-        module.register_significance_tests = register_significance_tests  # type: ignore[attr-defined]
+        module.register_rules = register_rules  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, "acme_rules", module)
         found = registry.create(
             points=lambda: [("acme", metadata.EntryPoint("rules", "acme_rules", "qrlsuite"))]
@@ -89,9 +89,9 @@ def curves(first_good: int, name: str) -> LearningCurves:
 
 def test_built_in_rules_are_registered_like_anyones() -> None:
     known = registry.load()
-    assert {"intervals", "difference", "difference-paired"} <= set(known.names("significance_tests"))
+    assert {"intervals", "difference", "difference-paired"} <= set(known.names("rules"))
     for name in ("intervals", "difference", "difference-paired"):
-        assert known.get("significance_tests", name).distribution == "qrlsuite"
+        assert known.get("rules", name).distribution == "qrlsuite"
         assert rules.load(name).name == name
     assert isinstance(rules.load(), IntervalRule), "the paper's rule is the default"
     with pytest.raises(UnknownNameError, match="did you mean 'intervals'"):
@@ -125,7 +125,7 @@ def test_what_goes_wrong_in_it_names_the_distribution(
     rule: type, message: str, third_party: Callable[[type], Any]
 ) -> None:
     loaded = third_party(rule)
-    pattern = f"significance test 'half' of distribution 'acme'.*{message}"
+    pattern = f"rule 'half' of distribution 'acme'.*{message}"
     with pytest.raises(PluginError, match=pattern):
         compare(curves(10, "a"), curves(20, "b"), GRID, loaded)
     with pytest.raises(PluginError, match="distribution 'acme'"):
@@ -163,5 +163,5 @@ def test_a_paired_rule_sees_the_seeds_that_entries_share(third_party: Callable[[
 
 
 def test_the_papers_rule_is_named_among_the_choices() -> None:
-    with pytest.raises(UnknownNameError, match="unknown significance test 'papr'; did you mean 'paper'"):
+    with pytest.raises(UnknownNameError, match="unknown rule 'papr'; did you mean 'paper'"):
         rules.load("papr")

@@ -384,13 +384,11 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
 
 
 def test_an_unknown_rule_is_one_line_with_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(
-        TaskError, match=r"ranking.rule: unknown significance test 'tims'; did you mean 'times'"
-    ):
+    with pytest.raises(TaskError, match=r"ranking.rule: unknown rule 'tims'; did you mean 'times'"):
         tasks.parse(RULED.replace('"times"', '"tims"'), "tiny.toml")
     entry = boards.entry("some one")
     ranking = entry.task_file.ranking.model_copy(update={"rule": "gone"})
     stored = replace(entry, task_file=entry.task_file.model_copy(update={"ranking": ranking}))
     made = board.build([stored, boards.entry("another", task="cartpole")])
     assert [section.task for section in made.sections] == ["cartpole"]
-    assert "task 'beam6g' at 200000 steps: unknown significance test 'gone'" in made.refused[0]
+    assert "task 'beam6g' at 200000 steps: unknown rule 'gone'" in made.refused[0]

@@ -60,7 +60,7 @@ def test_functions_on_the_page_exist(name: str) -> None:
 
 
 def test_rules_verdicts_and_outcomes_are_on_the_page() -> None:
-    for name in (*registry.load().names("significance_tests"), *Verdict, *Outcome):
+    for name in (*registry.load().names("rules"), *Verdict, *Outcome):
         assert name in PAGE
 
 

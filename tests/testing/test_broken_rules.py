@@ -12,7 +12,7 @@ import pytest
 
 from qrlsuite import hookimpl
 from qrlsuite.engine.api import Answer
-from qrlsuite.specs import EngineSpec, SignificanceTestSpec, Spec, TrackerSpec
+from qrlsuite.specs import EngineSpec, RuleSpec, Spec, TrackerSpec
 from qrlsuite.testing import check
 from qrlsuite.training.advance import advance
 from tests.testing.broken import Broken, assert_breaks, own_rules
@@ -242,7 +242,7 @@ class Rewriting(GoodTracker):
 
 
 def rule(name: str) -> Spec:
-    return SignificanceTestSpec(name="broken", summary="Breaks a rule", factory=f"{HERE}:{name}")
+    return RuleSpec(name="broken", summary="Breaks a rule", factory=f"{HERE}:{name}")
 
 
 def engine(name: str) -> Spec:
@@ -254,15 +254,15 @@ def tracker(name: str) -> Spec:
 
 
 BROKEN = [
-    ("significance_tests", "builds", Broken(rule("NoPromise"), r"promise is '', and must be text")),
-    ("significance_tests", "signs", Broken(rule("Floats"), r"as float64, and must hold -1, 0 and 1 as int8")),
-    ("significance_tests", "repeatable", Broken(
+    ("rules", "builds", Broken(rule("NoPromise"), r"promise is '', and must be text")),
+    ("rules", "signs", Broken(rule("Floats"), r"as float64, and must hold -1, 0 and 1 as int8")),
+    ("rules", "repeatable", Broken(
         rule("Moody"), r"judged differently the second time: draw", frozenset({"antisymmetric"})
     )),
-    ("significance_tests", "antisymmetric", Broken(rule("Partial"), r"ranks would depend on the order")),
-    ("significance_tests", "equal entries", Broken(rule("Vain"), r"same curves differ significantly")),
-    ("significance_tests", "direction", Broken(rule("Backwards"), r"-1 for an entry that needs about 300")),
-    ("significance_tests", "against", Broken(rule("Hasty"), r"is not rule\(first, other\) for each")),
+    ("rules", "antisymmetric", Broken(rule("Partial"), r"ranks would depend on the order")),
+    ("rules", "equal entries", Broken(rule("Vain"), r"same curves differ significantly")),
+    ("rules", "direction", Broken(rule("Backwards"), r"-1 for an entry that needs about 300")),
+    ("rules", "against", Broken(rule("Hasty"), r"is not rule\(first, other\) for each")),
     ("engines", "builds", Broken(engine("picky_engine"), r"the factory takes the options, or None")),
     ("engines", "methods", Broken(engine("ShortRun"), r"run\(work, show\) cannot be called")),
     ("engines", "workers", Broken(engine("Many"), r"workers\(1\) returned 4: more than --workers 1 allows")),
@@ -270,8 +270,8 @@ BROKEN = [
     ("trackers", "builds", Broken(tracker("deaf_tracker"), r"object has none of the methods run_started")),
     ("trackers", "target", Broken(tracker("no_target"), r"not supported; the factory takes one argument")),
     ("trackers", "events", Broken(tracker("Careless"), r"epoch_finished raises TypeError: .*show hook")),
-    ("significance_tests", "builds", Broken(rule("Unnamed"), r"Unnamed has no name: see qrlsuite.statistics")),
-    ("significance_tests", "signs", Broken(rule("Flat"), r"has shape \(6,\), and must have \(epsilons, deltas\)")),
+    ("rules", "builds", Broken(rule("Unnamed"), r"Unnamed has no name: see qrlsuite.statistics")),
+    ("rules", "signs", Broken(rule("Flat"), r"has shape \(6,\), and must have \(epsilons, deltas\)")),
     ("engines", "methods", Broken(engine("WithoutQueue"), r"has no method queued\(store\): see qrlsuite.engine.api")),
     ("engines", "workers", Broken(engine("Idle"), r"workers\(None\) returned 0, and must return how many")),
     ("engines", "methods", Broken(engine("ShortConnect"), r"connect\(workers, versions\) cannot be called")),
@@ -292,7 +292,7 @@ def test_one_rule_is_broken(kind: str, name: str, case: Broken) -> None:
 @pytest.mark.parametrize(
     ("kind", "spec"),
     [
-        ("significance_tests", rule("GoodRule")),
+        ("rules", rule("GoodRule")),
         ("engines", engine("GoodEngine")),
         ("engines", engine("GoodRemote")),
         ("trackers", tracker("GoodTracker")),
@@ -301,7 +301,7 @@ def test_one_rule_is_broken(kind: str, name: str, case: Broken) -> None:
 def test_every_rule_is_broken_by_one(kind: str, spec: Spec) -> None:
     findings = own_rules(kind, spec)
     assert all(finding.ok for finding in findings), findings
-    optional = {"significance_tests": {"against"}, "engines": {"answers", "once"}}.get(kind, set())
+    optional = {"rules": {"against"}, "engines": {"answers", "once"}}.get(kind, set())
     assert {finding.rule for finding in findings} | optional == {name for k, name, _ in BROKEN if k == kind}
 
 

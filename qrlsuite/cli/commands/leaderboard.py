@@ -93,8 +93,7 @@ def leaderboard(
         typer.Option(
             "--rule",
             metavar="NAME",
-            help="Tiers by cells of the grid in the place of ranks: paper, or a name of `qrlsuite list "
-            "significance-tests`.",
+            help="Tiers by cells of the grid in the place of ranks: paper, or a name of `qrlsuite list rules`.",
         ),
     ] = None,
     alpha: AlphaOption = ALPHA,

@@ -100,7 +100,7 @@ def show(
         typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
         return
     content = describe(kinds[0], target)
-    if kinds[0] == "significance_tests":
+    if kinds[0] == "rules":
         content["promises"] = rules.load(target).promise
     if kinds[0] != "ansatzes" and (settings or figure or format or qubits is not None or layers is not None):
         raise OptionError(

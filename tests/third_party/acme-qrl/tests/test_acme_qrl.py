@@ -8,7 +8,7 @@ EVERYTHING = [
     ("task", "channel-hop"),
     ("circuit-backend", "damped"),
     ("model", "vqc-damped"),
-    ("significance-test", "half"),
+    ("rule", "half"),
     ("tracker", "acme-log"),
 ]
 

@@ -72,9 +72,9 @@ def register_circuit_backends(register):
 
 
 @hookimpl
-def register_significance_tests(register):
+def register_rules(register):
     register(
-        specs.SignificanceTestSpec(
+        specs.RuleSpec(
             name="half",
             summary="significant where one entry needs less than half the samples",
             factory="acme_qrl.rule:HalfRule",

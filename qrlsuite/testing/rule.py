@@ -1,4 +1,4 @@
-"""Rules of significance tests: valid signs, from the evidence alone, antisymmetric in the two entries."""
+"""What a rule must keep to: valid signs, from the evidence alone, antisymmetric in the two entries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ENTRIES = ("fast", "same", "slow", "never", "mixed")
 def check(subject: Subject) -> list[Finding]:
     """Check a rule on entries of 30 runs, 12 epochs, and a grid of three thresholds and two probabilities."""
     spec = subject.spec
-    assert isinstance(spec, specs.SignificanceTestSpec)
+    assert isinstance(spec, specs.RuleSpec)
     rules = Checklist()
     rules_built: list[Any] = []
     cause = "the factory is called without arguments"
@@ -51,7 +51,7 @@ def evidence(name: str) -> Evidence:
     return Evidence(LearningCurves(values, STEPS, name), GRID, RUNS, Resampling(n_resamples=200))
 
 
-def _build(spec: specs.SignificanceTestSpec) -> Any:
+def _build(spec: specs.RuleSpec) -> Any:
     rule = specs.resolve(spec.factory)()
     missing = [name for name in ("name", "promise", "__call__") if not hasattr(rule, name)]
     require(
