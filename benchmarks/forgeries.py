@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from qrlsuite.leaderboard import plausible, published
-from qrlsuite.leaderboard.published import PublishedEntry
-from qrlsuite.leaderboard.verify import retrain
+from qrlsuite.leaderboard.shelf import plausible, published
+from qrlsuite.leaderboard.shelf.published import PublishedEntry
+from qrlsuite.leaderboard.shelf.verify import retrain
 
 WIDTH_16, WIDTH_32 = "ddqn mlp width=16", "ddqn mlp width=32"
 KERNELS = {"ATEN_CPU_CAPABILITY": "default"}

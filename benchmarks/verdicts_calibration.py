@@ -17,7 +17,7 @@ from functools import cache
 
 import numpy as np
 
-from qrlsuite.leaderboard.published import PUBLISHED, read
+from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,

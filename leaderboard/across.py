@@ -17,10 +17,10 @@ import numpy as np
 
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import MIN_RUNS, AcrossTasks, across_tasks, horizon_shares, rliable_arrays
@@ -203,7 +203,7 @@ def collected(
     tasks:
         Two or more.
     names, published, horizon, min_seeds:
-        As for `qrlsuite.leaderboard.collect.select`; every name must be found on every task.
+        As for `qrlsuite.leaderboard.shelf.collect.select`; every name must be found on every task.
 
     Raises
     ------

@@ -19,10 +19,10 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
 from qrlsuite.leaderboard.rules import DEFAULT, TIMES
 from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import ALPHA, TimeRanking, rank_by_time
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures.cells import choose_horizon
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
@@ -171,9 +171,9 @@ def choose(
     Parameters
     ----------
     names:
-        The entries (see `qrlsuite.leaderboard.collect.find`); all of the task where empty.
+        The entries (see `qrlsuite.leaderboard.shelf.collect.find`); all of the task where empty.
     task, published:
-        As for `qrlsuite.leaderboard.collect.collect`; None where the entries belong to one task.
+        As for `qrlsuite.leaderboard.shelf.collect.collect`; None where the entries belong to one task.
 
     Returns
     -------

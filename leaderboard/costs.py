@@ -21,10 +21,10 @@ from rich.text import Text
 
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, listed, nearest
-from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_one_definition, ranking_of
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board

@@ -18,9 +18,9 @@ from rich.text import Text
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import collect
 from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
 from qrlsuite.leaderboard.pictures import histogram
+from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import evaluation
@@ -184,7 +184,7 @@ def evaluate(
     runs:
         The results folder.
     names:
-        The entries, of one task, as `qrlsuite.leaderboard.collect.find` finds them.
+        The entries, of one task, as `qrlsuite.leaderboard.shelf.collect.find` finds them.
     task:
         Look among the entries of this task only.
     best, episodes, seed, device:

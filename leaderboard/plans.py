@@ -2,7 +2,7 @@
 
     <name>/plan.toml                the plan as it was when its first seed began
            looks.jsonl              when the first seed was begun and each look taken, and what it found
-           <task>/<entry>/...       as published entries, see `qrlsuite.leaderboard.published`
+           <task>/<entry>/...       as published entries, see `qrlsuite.leaderboard.shelf.published`
 
 Verdicts are not stored: they are computed from the plan and the curves.
 """
@@ -16,10 +16,10 @@ from typing import Any
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.leaderboard import collect, published, takeover
-from qrlsuite.leaderboard.export import export as export_entry
-from qrlsuite.leaderboard.published import PublishedEntry
-from qrlsuite.leaderboard.takeover import TakenOver
+from qrlsuite.leaderboard.shelf import collect, importing, published
+from qrlsuite.leaderboard.shelf.export import export as export_entry
+from qrlsuite.leaderboard.shelf.importing import Imported
+from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import LearningCurves
 from qrlsuite.studies import decisions
@@ -170,7 +170,7 @@ def export(study: DecisionStudy, out: Path) -> Path:
     return folder
 
 
-def take_over(folder: Path, runs: Path) -> list[TakenOver]:
+def import_plan(folder: Path, runs: Path) -> list[Imported]:
     """Copy the seeds of a published plan to a results folder, where `decide run` goes on with it.
 
     Raises
@@ -181,7 +181,9 @@ def take_over(folder: Path, runs: Path) -> list[TakenOver]:
     source = PublishedDecision(folder)
     study = DecisionStudy(source.file, source.source, runs)
     study.begin()
-    done = [takeover.take_over(store, study.folder, source.file.hash) for store in takeover.sources(folder)]
+    done = [
+        importing.import_seeds(store, study.folder, source.file.hash) for store in importing.sources(folder)
+    ]
     if (folder / LOG).exists() and not study.taken:  # the seeds were begun where they were trained
         shutil.copyfile(folder / LOG, study.folder / LOG)
     return done

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,

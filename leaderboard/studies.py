@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.leaderboard import collect, pictures, published
+from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.board import ranking_of
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.leaderboard.shelf import collect, published
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS

@@ -11,8 +11,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.leaderboard.absent import absent
 from qrlsuite.leaderboard.sheet import Column, Sheet
+from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.leaderboard.times import p_text, percent
 from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Comparison, Direction
@@ -20,8 +20,8 @@ from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
     from qrlsuite.leaderboard.board import Leaderboard, Row, Section
-    from qrlsuite.leaderboard.curves import EntryResults
     from qrlsuite.leaderboard.pair import PairVerdict
+    from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
 """What a spreadsheet shows of the win that a tier rests on."""

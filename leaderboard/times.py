@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import MIN_RUNS, Direction, Grid, LearningCurves, MeanTime, TimesBoard, times_board
 
 ALPHA = 0.05

@@ -35,13 +35,14 @@ from qrlsuite.engine.terminal import Shown, show_figures_in_notebook
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board as boards
-from qrlsuite.leaderboard import collect, rules, studies
 from qrlsuite.leaderboard import costs as by_cost
+from qrlsuite.leaderboard import rules, studies
 from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pair import on_board
 from qrlsuite.leaderboard.pictures.compose import compose
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.studies import Drawn
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping

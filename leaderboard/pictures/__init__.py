@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.specs import resolve
 
 if TYPE_CHECKING:

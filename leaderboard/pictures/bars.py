@@ -12,8 +12,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 
 WIDEST = 12.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.board import learning_curves
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import style
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 from qrlsuite.statistics.grid import BoolArray, FloatArray

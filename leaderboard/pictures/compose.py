@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.experiment import task as task_files
-from qrlsuite.leaderboard import collect, pictures
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
@@ -58,7 +59,7 @@ def compose(
     kind:
         A name of `summaries`.
     tasks, entries, horizon, min_seeds, runs, published:
-        As for `qrlsuite.leaderboard.collect.select`.
+        As for `qrlsuite.leaderboard.shelf.collect.select`.
     seeds:
         Draw these alone, of every entry, see `EntryResults.with_seeds`; None means all.
     settings:

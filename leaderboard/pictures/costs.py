@@ -13,8 +13,8 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.leaderboard.costs import price
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 
 Unit = Literal["steps", "executions", "shots"]

@@ -16,8 +16,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import style
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Grid
 
 

@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
 from qrlsuite.leaderboard.report.words import ranges
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted
 
 SINGLE_RUNS = 100_000

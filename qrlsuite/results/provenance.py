@@ -1,4 +1,4 @@
-"""Provenance of a run: versions, machine, code revision. Recorded per seed, never part of an identity."""
+"""Provenance: versions, machine, code revision. Recorded per seed, never part of an identity; summed up per entry."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ INSTRUCTIONS = {
 }
 """Variables that fix the instruction sets that bits depend on, with the values of the Containerfile.
 
-Where all are set alike, the name of the processor does not count, see `qrlsuite.leaderboard.verify`.
+Where all are set alike, the name of the processor does not count, see `qrlsuite.leaderboard.shelf.verify`.
 """
 
 
@@ -81,6 +81,37 @@ def device_kind(made_with: Mapping[str, Any]) -> str:
     """Return the kind of device (`cpu`, `cuda`) of what `collect` returned; before it was recorded, read as `cpu`."""
     device = made_with.get("device")
     return str(device.get("kind", "cpu")) if isinstance(device, Mapping) else "cpu"
+
+
+def records(made_with: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the record of a published seed's last epochs, and those of earlier ones that were made otherwise."""
+    before = made_with.get("before")
+    return [
+        made_with,
+        *(each for each in (before if isinstance(before, list) else []) if isinstance(each, dict)),
+    ]
+
+
+def versions(made: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
+    """Return every version that occurs, by distribution; Python's under "python"."""
+    by_package: dict[str, set[str]] = {}
+    for origin in made:
+        packages = origin.get("versions")
+        named = {**(packages if isinstance(packages, Mapping) else {}), "python": origin.get("python")}
+        for name, version in named.items():
+            if isinstance(version, str):
+                by_package.setdefault(str(name), set()).add(version)
+    return {name: tuple(sorted(by_package[name])) for name in sorted(by_package)}
+
+
+def texts(made: Iterable[Mapping[str, Any]], name: str) -> tuple[str, ...]:
+    """Return every text that stands under a name, sorted, each once."""
+    return tuple(sorted({value for origin in made if isinstance(value := origin.get(name), str)}))
+
+
+def devices(made: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return every kind of device that occurs (`cpu`, `cuda`), sorted; what names none was trained on the CPU."""
+    return tuple(sorted({device_kind(origin) for origin in made}))
 
 
 def _device(device: torch.device) -> dict[str, str]:

@@ -13,8 +13,9 @@ from typer.testing import CliRunner
 from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, UnknownNameError
-from qrlsuite.leaderboard import collect, pictures
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard.test_pictures import learner, noisy
 
 RUNNER = CliRunner()

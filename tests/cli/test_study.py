@@ -23,7 +23,8 @@ from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import task
-from qrlsuite.leaderboard import published, studies
+from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.shelf import published
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore

@@ -19,8 +19,8 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
-from qrlsuite.leaderboard import collect
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.conftest import HANGS
 from tests.core.test_dependencies import ALL
 

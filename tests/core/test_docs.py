@@ -15,8 +15,9 @@ import pytest
 
 from qrlsuite import options, registry, specs
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import collect, studies
-from qrlsuite.leaderboard.published import PUBLISHED
+from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.tuning.search import split_model
 

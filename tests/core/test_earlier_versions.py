@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import from_record, resolve
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.published import PUBLISHED
+from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.results.store import EntryStore, json_line
 from tests.golden.make import EPOCHS, GOLDEN, SEEDS, machine
 

@@ -21,7 +21,7 @@ from qrlsuite.engine.display import RunDisplay
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment import identity, source
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.options import parse_setting
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire

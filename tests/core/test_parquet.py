@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from qrlsuite.errors import StoreError
-from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard.shelf import published
 from qrlsuite.results import parquet
 from qrlsuite.results.store import read_table, table_bytes
 

@@ -75,3 +75,9 @@ def test_the_suite_s_own_working_copy_is_recorded() -> None:
     recorded = provenance.collect([])["commit"]
     assert recorded is not None
     assert head.startswith(recorded.removesuffix("-dirty").rpartition("-g")[2])
+
+
+def test_every_version_is_told_once() -> None:
+    made = [{"versions": {"numpy": v}, "python": "3.11", "commit": None} for v in ("2.4", "2.3", "2.4")]
+    assert provenance.versions(made) == {"numpy": ("2.3", "2.4"), "python": ("3.11",)}
+    assert provenance.texts(made, "commit") == ()

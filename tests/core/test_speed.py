@@ -14,7 +14,7 @@ import qrlsuite
 from qrlsuite import registry
 from qrlsuite.errors import TaskError
 from qrlsuite.experiment.entry import Entry, from_record, resolve
-from qrlsuite.leaderboard import published
+from qrlsuite.leaderboard.shelf import published
 from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance, speed
 from qrlsuite.results.speed import Estimate, Speed, Speeds

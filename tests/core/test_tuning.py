@@ -16,7 +16,7 @@ from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError, U
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard.published import PUBLISHED
+from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore
 from qrlsuite.tuning import objective, samplers, search, space

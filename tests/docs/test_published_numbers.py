@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.cli.app import build
-from qrlsuite.leaderboard.published import PUBLISHED, read
+from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import LearningCurves, Verdict, compare
 from tests.statistics.conftest import SURFACE
 

@@ -17,7 +17,7 @@ from qrlsuite import api
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.leaderboard import across, plans
 from qrlsuite.leaderboard.board import ranking_of
-from qrlsuite.leaderboard.published import PUBLISHED, read
+from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.leaderboard.times import percent
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoard, Verdict, times_board
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from qrlsuite.leaderboard.curves import EntryResults
+    from qrlsuite.leaderboard.shelf.curves import EntryResults
     from qrlsuite.leaderboard.times import TimeRanking
     from qrlsuite.statistics.sequential import PairDecision
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from qrlsuite.cli.commands import demo
-from qrlsuite.leaderboard.changed import PLACES
+from qrlsuite.leaderboard.shelf.changed import PLACES
 from tests.commands import qrlsuite
 
 ROOT = Path(__file__).parents[2]

@@ -20,7 +20,7 @@ from qrlsuite.engine import api, execution, remote
 from qrlsuite.engine.api import Answer, EngineOutcome, Link
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.leaderboard import collect
+from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.options import parse_setting
 from qrlsuite.results import checkpoint, claims
 from qrlsuite.results.progress import ProgressFile

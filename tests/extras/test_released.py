@@ -25,7 +25,7 @@ from qrlsuite import registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.collect import collect
+from qrlsuite.leaderboard.shelf.collect import collect
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, entries, learning_curve
 from qrlsuite_released import entries as imports

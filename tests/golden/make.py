@@ -27,7 +27,7 @@ from qrlsuite import registry
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import load
-from qrlsuite.leaderboard.published import PUBLISHED
+from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance
 from qrlsuite.results.progress import Progress

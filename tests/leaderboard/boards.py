@@ -9,7 +9,7 @@ import numpy as np
 
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 HOSTILE = (
     "<script>alert(1)</script>",

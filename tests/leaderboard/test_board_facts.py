@@ -16,12 +16,14 @@ from qrlsuite import api
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import board, collect, origin, published, report, tables
-from qrlsuite.leaderboard.curves import EntryResults
-from qrlsuite.leaderboard.export import export
+from qrlsuite.leaderboard import board, report, tables
 from qrlsuite.leaderboard.pictures import tiers
 from qrlsuite.leaderboard.sheet import csv_rows
+from qrlsuite.leaderboard.shelf import collect, published
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.options import parse_setting
+from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
 from tests.leaderboard import boards
 
@@ -176,7 +178,7 @@ def test_devices_that_mix_within_an_entry_are_named() -> None:
     made = boards.of([replace(one, devices=("cpu", "cuda")), replace(two, devices=("cpu",))])
     note = f"trained on several kinds of device, see `qrlsuite show ENTRY`: {one.label} (cpu, cuda)"
     assert note in markdown(made).split("  \n")
-    assert origin.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
+    assert provenance.devices([{}, {"device": {"kind": "cuda", "name": "H100"}}]) == ("cpu", "cuda")
     assert "several kinds of device" not in markdown(boards.of([one, two]))
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import plans, published
-from qrlsuite.leaderboard.changed import PLACES, _problem, changed
+from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf.changed import PLACES, _problem, changed
 from tests.commands import qrlsuite
 
 ROOT = Path(__file__).parents[2]

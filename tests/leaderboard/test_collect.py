@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board, collect
+from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY
 from tests.leaderboard.boards import entry as drawn

@@ -18,7 +18,7 @@ from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import costs, report
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard import boards
 
 STEPS = 2000

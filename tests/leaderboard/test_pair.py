@@ -13,7 +13,7 @@ from rich.console import Console
 
 from qrlsuite import api
 from qrlsuite.leaderboard import board, pair, tables
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
 

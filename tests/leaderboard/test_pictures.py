@@ -21,8 +21,8 @@ from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.pictures import cells
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Grid
 
 FILE = tasks.load("beam6g").file

@@ -22,8 +22,9 @@ from qrlsuite import api, hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import board, calibration, collect, costs, plausible, published, studies, verify
-from qrlsuite.leaderboard.export import export
+from qrlsuite.leaderboard import board, calibration, costs, studies
+from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
+from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies.study import parse
@@ -130,7 +131,7 @@ def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
 
 def test_the_beginning_of_a_seed_does_not_depend_on_its_company(folder: Path) -> None:
     from qrlsuite.experiment.entry import from_record
-    from qrlsuite.leaderboard.fingerprint import fingerprint
+    from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
 
     stated = published.read(folder)
     alone = fingerprint(from_record(stated.record, ""), [5])

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.leaderboard import board, collect
+from qrlsuite.leaderboard import board
 from qrlsuite.leaderboard.report import render
+from qrlsuite.leaderboard.shelf import collect
 from tests.leaderboard import boards
 
 Open = Callable[..., Any]

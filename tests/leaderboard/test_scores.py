@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.curves import EntryResults
 from qrlsuite.leaderboard.scores import rank_by_score
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard.test_pair import entry, spread
 
 

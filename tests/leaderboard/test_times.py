@@ -22,7 +22,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, TaskError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board, report, sheet, tables
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction
 from tests.conftest import TINY

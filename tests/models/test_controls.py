@@ -16,7 +16,7 @@ from qrlsuite.circuit import Circuit
 from qrlsuite.circuit.resources import jacobian_rank
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.leaderboard.collect import collect
+from qrlsuite.leaderboard.shelf.collect import collect
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.circuits.ansatz import NoOptions
 from qrlsuite.results.store import EntryStore

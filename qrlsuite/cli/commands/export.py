@@ -14,8 +14,8 @@ from qrlsuite.cli.arguments import AcrossOption, JsonOption, RunsOption, TaskOpt
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import across as several
-from qrlsuite.leaderboard import collect
-from qrlsuite.leaderboard.export import export as write
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted

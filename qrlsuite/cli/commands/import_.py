@@ -1,4 +1,4 @@
-"""`qrlsuite import`: take over seeds that were trained elsewhere."""
+"""`qrlsuite import`: import seeds that were trained elsewhere."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
-from qrlsuite.leaderboard import plans, takeover
-from qrlsuite.leaderboard.takeover import TakenOver
+from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard.shelf import importing
+from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
 
 
-def _taken(folder: Path, runs: Path) -> Iterator[TakenOver]:
+def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
     if plans.is_published(folder):
-        yield from plans.take_over(folder, runs)
+        yield from plans.import_plan(folder, runs)
     else:
-        yield from (takeover.take_over(source, runs) for source in takeover.sources(folder))
+        yield from (importing.import_seeds(source, runs) for source in importing.sources(folder))
 
 
 def import_entries(

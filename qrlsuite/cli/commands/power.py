@@ -17,8 +17,9 @@ from rich.text import Text
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.leaderboard import board, collect
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results import speed
 from qrlsuite.results.speed import BASES
 from qrlsuite.results.store import EntryStore

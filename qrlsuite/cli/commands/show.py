@@ -18,8 +18,9 @@ from qrlsuite.engine.terminal import printable_lines
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.catalog import describe, hooks
-from qrlsuite.leaderboard import collect, pictures, rules
-from qrlsuite.leaderboard import published as published_entries
+from qrlsuite.leaderboard import pictures, rules
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf import published as published_entries
 from qrlsuite.options import parse_setting
 from qrlsuite.results import codes, lookup
 from qrlsuite.results.seeds import format_seeds

@@ -14,9 +14,10 @@ from rich.text import Text
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import plans, published
-from qrlsuite.leaderboard import verify as checks
-from qrlsuite.leaderboard.changed import changed
+from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf import verify as checks
+from qrlsuite.leaderboard.shelf.changed import changed
 from qrlsuite.results.progress import Progress as RunProgress
 
 

@@ -2,7 +2,7 @@
 
 Which seeds, is drawn after the files are read, from fresh entropy. Curves that come out bit for bit are `verified`,
 wherever they were trained. Where bits must be equal, one that is not is a failure; elsewhere the entry is `plausible`
-at best, see `qrlsuite.leaderboard.plausible`.
+at best, see `qrlsuite.leaderboard.shelf.plausible`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from qrlsuite.errors import QrlSuiteError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
-from qrlsuite.leaderboard import origin, plausible, published
-from qrlsuite.leaderboard.curves import current
-from qrlsuite.leaderboard.fingerprint import CHUNK, fingerprint
-from qrlsuite.leaderboard.published import PublishedEntry
+from qrlsuite.leaderboard.shelf import plausible, published
+from qrlsuite.leaderboard.shelf.curves import current
+from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
+from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import codes, provenance, speed
 from qrlsuite.results.progress import Progress
 from qrlsuite.results.store import learning_curve
@@ -136,7 +136,7 @@ def verify(
     episodes and the score before training must agree to 1e-5, parameters and circuit executions must be those of the
     record. Curves that the same versions made on the same type of machine must be equal, bit for bit. If others
     differ, each must begin like the published one of its seed, and the steps below the thresholds must be plausible
-    (`qrlsuite.leaderboard.plausible`).
+    (`qrlsuite.leaderboard.shelf.plausible`).
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def _elsewhere(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> 
     recorded: they are then not compared, and the device was the CPU.
     """
     here = provenance.of(made_by)
-    for record in (made for place in places for made in origin.all_of(entry.provenance[place])):
+    for record in (made for place in places for made in provenance.records(entry.provenance[place])):
         if provenance.device_kind(record) != "cpu":
             name = record["device"].get("name", "unknown")
             return f"trained on the CPU here, on {provenance.device_kind(record)} ({name}) there"
@@ -387,7 +387,7 @@ def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[i
     """Return whether curves of another machine may be those of the entry, and what says so, with its power."""
     count, first = len(entry.seeds), plausible.FIRST
     unlike = plausible.strangers(again, entry.curves, places)
-    made = (record for place in places for record in origin.all_of(entry.provenance[place]))
+    made = (record for place in places for record in provenance.records(entry.provenance[place]))
     if len(unlike) > plausible.tolerated(len(places), any(provenance.device_kind(m) != "cpu" for m in made)):
         numbers = ", ".join(str(entry.seeds[places[row]]) for row in unlike)
         return (

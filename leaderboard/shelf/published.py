@@ -26,18 +26,17 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard import origin
-from qrlsuite.leaderboard.curves import EntryResults, current, require_scores
-from qrlsuite.leaderboard.fingerprint import Fingerprint
+from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
+from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
-from qrlsuite.results import codes, parquet
+from qrlsuite.results import codes, parquet, provenance
 from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
-PUBLISHED = Path(__file__).parent / "entries"
+PUBLISHED = Path(__file__).parents[1] / "entries"
 """The entries that come with the suite and stand on its boards."""
 
-UNRANKED = Path(__file__).parent / "unranked"
+UNRANKED = Path(__file__).parents[1] / "unranked"
 """The others that come with the suite: each answers a study's question. A board ranks them only when it is asked.
 
 It is asked by a study or an entry's name. And where all published entries of a task are unranked, they are on its board
@@ -100,7 +99,7 @@ class PublishedEntry:
         """Return what a leaderboard ranks."""
         record, identity = self.record, self.record["identity"]
         count = record["published"]["parameters"]
-        provenance = [made for last in self.provenance for made in origin.all_of(last)]
+        made_with = [record for last in self.provenance for record in provenance.records(last)]
         return EntryResults(
             name=record["name"],
             label=record["label"],
@@ -124,10 +123,10 @@ class PublishedEntry:
                 "environment": self.task_file.environment.options,
             },
             preset=record["preset"] if isinstance(record["preset"], str) else None,
-            versions=origin.versions(provenance),
-            commits=origin.texts(provenance, "commit"),
-            processors=origin.texts(provenance, "processor"),
-            devices=origin.devices(provenance),
+            versions=provenance.versions(made_with),
+            commits=provenance.texts(made_with, "commit"),
+            processors=provenance.texts(made_with, "processor"),
+            devices=provenance.devices(made_with),
             executions=int(self.executions.sum()),
             tuning=record["tuning"],
             plan=record.get("plan"),
@@ -194,11 +193,9 @@ def _read(folder: Path) -> PublishedEntry:
     published = record["published"]
     codes.read(record, folder / "entry.json")
     _check_identity(folder, record, task_file)
-    provenance = published["provenance"]
+    made_with = published["provenance"]
     _require(
-        isinstance(provenance, list)
-        and len(provenance) > 0
-        and all(isinstance(made, dict) for made in provenance),
+        isinstance(made_with, list) and made_with != [] and all(isinstance(made, dict) for made in made_with),
         folder,
         "provenance is not a list of records",
     )
@@ -227,7 +224,7 @@ def _read(folder: Path) -> PublishedEntry:
     )
     _require(bool((executions >= 0).all()), folder, "circuit executions must not be negative")
     _require(
-        bool((origins >= 0).all() and (origins < len(provenance)).all()),
+        bool((origins >= 0).all() and (origins < len(made_with)).all()),
         folder,
         "a seed names a provenance that is not there",
     )
@@ -370,7 +367,7 @@ def files(
     curves: NDArray[np.float64],
     hours: list[float],
     executions: list[int],
-    provenance: list[Mapping[str, Any]],
+    made_with: list[Mapping[str, Any]],
     parameters: Mapping[str, int],
     beginning: Fingerprint,
 ) -> dict[str, bytes]:
@@ -384,11 +381,11 @@ def files(
         (N, T).
     parameters:
         As `qrlsuite.results.store.parameters_of` returns them.
-    hours, executions, provenance, beginning:
+    hours, executions, made_with, beginning:
         Per seed, N of each.
     """
     distinct: list[Mapping[str, Any]] = []
-    for made in provenance:
+    for made in made_with:
         if made not in distinct:
             distinct.append(made)
     count, length = curves.shape
@@ -415,7 +412,7 @@ def files(
         SEEDS: _encode(
             {
                 "seed": np.array(seeds, np.int64),
-                "origin": np.array([distinct.index(made) for made in provenance], np.int64),
+                "origin": np.array([distinct.index(made) for made in made_with], np.int64),
                 "hours": np.array(hours, np.float64),
                 "executions": np.array(executions, np.int64),
                 "before": beginning.before,

@@ -1,4 +1,4 @@
-"""Taking over seeds that were trained elsewhere: of an exported entry, or of another results folder.
+"""Importing seeds that were trained elsewhere: of an exported entry, or of another results folder.
 
 They count as seeds that were trained here, and `qrlsuite run` trains only what is missing. Each seed's folder is copied
 beside its place and renamed into it, so that it is there whole or not at all, and an import that was stopped goes on
@@ -22,9 +22,9 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import TUNING_SEEDS
-from qrlsuite.leaderboard import origin, published
-from qrlsuite.leaderboard.curves import require_scores
-from qrlsuite.leaderboard.published import PublishedEntry
+from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf.curves import require_scores
+from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results import checkpoint, codes, provenance
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
@@ -40,8 +40,8 @@ from qrlsuite.results.store import (
 
 
 @dataclass(frozen=True)
-class TakenOver:
-    """What was taken over of an entry.
+class Imported:
+    """What was imported of an entry.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def sources(folder: Path) -> list[EntryStore]:
     return stores
 
 
-def take_over(source: EntryStore, runs: Path, plan: str | None = None) -> TakenOver:
+def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imported:
     """Copy the seeds of an entry that are not in a results folder yet.
 
     Parameters
@@ -167,7 +167,7 @@ def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
         )
 
 
-def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, store: EntryStore) -> TakenOver:
+def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, store: EntryStore) -> Imported:
     """Copy seeds with their agents and checkpoints."""
     training = {seed for claim in living(source) for seed in claim.seeds}
     newest, present = checkpoint.latest(source), set(store.seeds())
@@ -189,7 +189,7 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
         )
-    return TakenOver(store, entry, tuple(new), tuple(known), tuple(notes))
+    return Imported(store, entry, tuple(new), tuple(known), tuple(notes))
 
 
 def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int]) -> None:
@@ -206,7 +206,7 @@ def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int
             checkpoint.save(store, group, epoch, arrays)
 
 
-def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> TakenOver:
+def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> Imported:
     """Write seeds from their curves; the agents and checkpoints were not exported."""
     present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
     for row, seed in enumerate(exported.seeds):
@@ -251,7 +251,7 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> T
         notes.append(
             "an export holds curves alone: these seeds cannot be evaluated, nor trained to more epochs"
         )
-    return TakenOver(store, entry, tuple(new), tuple(known), tuple(notes))
+    return Imported(store, entry, tuple(new), tuple(known), tuple(notes))
 
 
 def _unplaced(store: EntryStore, seed: int) -> SeedStore:
@@ -291,7 +291,7 @@ def _differences(seeds: Sequence[int]) -> list[str]:
 def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:
     """Say which versions the seeds were made with, where they are not those that are installed here."""
     here = provenance.collect(entry.distributions())["versions"]
-    versions_there = origin.versions(list(made_with))
+    versions_there = provenance.versions(list(made_with))
     relevant = {"qrlsuite", "torch", "numpy", "numba", *entry.distributions()}
     other = [
         f"{name} {', '.join(known)} (here {here[name]})"

@@ -11,9 +11,9 @@ from typing import Any
 
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
-from qrlsuite.leaderboard import published
-from qrlsuite.leaderboard.curves import EntryResults
-from qrlsuite.leaderboard.fingerprint import fingerprint
+from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
 from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore, parameters_of
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from qrlsuite import registry
-from qrlsuite.leaderboard.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 
 def absent(entry: EntryResults) -> list[str]:

@@ -13,10 +13,9 @@ from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard import origin
-from qrlsuite.leaderboard import published as published_entries
-from qrlsuite.leaderboard.curves import EntryResults, current, require_scores
-from qrlsuite.results import codes, genuine, lookup, probes
+from qrlsuite.leaderboard.shelf import published as published_entries
+from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
+from qrlsuite.results import codes, genuine, lookup, probes, provenance
 from qrlsuite.results.lookup import Stored
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
@@ -407,8 +406,8 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
     found = _require_independent(store, runs)
     length = _common_length(runs)
     kept = [run for run in runs if len(run.scores) >= length]
-    provenance = [made for run in runs for made in run.record.get("provenance", [])]
-    foreign = any(probes.third_party(made) for made in provenance)
+    made_with = [made for run in runs for made in run.record.get("provenance", [])]
+    foreign = any(probes.third_party(made) for made in made_with)
     parameters = parameters_of(run.record for run in runs)
     identity = record["identity"]
     preset = record["preset"]
@@ -438,10 +437,10 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
             "environment": task_file.environment.options,
         },
         preset=preset if isinstance(preset, str) else None,
-        versions=origin.versions(provenance),
-        commits=origin.texts(provenance, "commit"),
-        processors=origin.texts(provenance, "processor"),
-        devices=origin.devices(provenance),
+        versions=provenance.versions(made_with),
+        commits=provenance.texts(made_with, "commit"),
+        processors=provenance.texts(made_with, "processor"),
+        devices=provenance.devices(made_with),
         tuning=record["tuning"],
         plan=record.get("plan"),
         codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),

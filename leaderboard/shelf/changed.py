@@ -13,7 +13,7 @@ from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard.plans import LOG, PLAN
-from qrlsuite.leaderboard.published import CURVES, SEEDS
+from qrlsuite.leaderboard.shelf.published import CURVES, SEEDS
 
 PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
 """Where a repository keeps what is published."""

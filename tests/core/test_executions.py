@@ -1,4 +1,4 @@
-"""What an entry says of its origin is gathered over all its seeds."""
+"""Circuit executions are counted over all of a seed's epochs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.errors import StoreError
-from qrlsuite.leaderboard import origin
 from qrlsuite.results.store import SeedStore, json_line, table_bytes
 
 
@@ -31,9 +30,3 @@ def test_counts_that_are_no_counts_are_refused(tmp_path: Path, count: object) ->
     seed.lines.write_bytes(json_line({"epoch": 1, "scores": [0.5], "executions": {"forward": count}}))
     with pytest.raises(StoreError, match="circuit executions"):
         _ = seed.read().executions
-
-
-def test_every_version_is_told_once() -> None:
-    made = [{"versions": {"numpy": v}, "python": "3.11", "commit": None} for v in ("2.4", "2.3", "2.4")]
-    assert origin.versions(made) == {"numpy": ("2.3", "2.4"), "python": ("3.11",)}
-    assert origin.texts(made, "commit") == ()

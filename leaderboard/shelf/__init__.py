@@ -1,0 +1,1 @@
+"""Entries as files: found, read, published, imported and checked."""
