@@ -17,11 +17,11 @@ from functools import cache
 from pathlib import Path
 
 from qrlsuite import api
-from qrlsuite.leaderboard import plans
-from qrlsuite.leaderboard.plans import PublishedDecision
 from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.leaderboard.shelf.published_studies import PublishedStudy
 from qrlsuite.results.text import hours_text, steps_text
-from qrlsuite.studies.decided import DecisionOutcome, by_question, difference_text, versus
+from qrlsuite.studies.outcome import StudyOutcome, by_question, difference_text, versus
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
@@ -40,7 +40,7 @@ TABLE = re.compile(r"(?<=<!-- table: )([\w+-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\
 Rows = Iterator[Sequence[str]]
 
 
-def settings(outcome: DecisionOutcome, questions: int | None) -> Rows:
+def settings(outcome: StudyOutcome, questions: int | None) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     yield "entry", "parameters", "settings", "trials", "M"
     for planned in outcome.study.file.entries:
@@ -57,7 +57,7 @@ def settings(outcome: DecisionOutcome, questions: int | None) -> Rows:
         yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(planned.tuning.value)
 
 
-def verdicts(outcome: DecisionOutcome, questions: int | None) -> Rows:
+def verdicts(outcome: StudyOutcome, questions: int | None) -> Rows:
     """Every pair below its question."""
     yield "pair A / B", "verdict", "seeds", "B against A", "interval"
     for question, pairs in by_question(outcome.study, outcome.pairs)[:questions]:
@@ -67,9 +67,9 @@ def verdicts(outcome: DecisionOutcome, questions: int | None) -> Rows:
             yield versus(pair), pair.verdict, seeds, *difference_text(pair, outcome.study.grid)
 
 
-def entries(outcome: DecisionOutcome, questions: int | None) -> Rows:
+def entries(outcome: StudyOutcome, questions: int | None) -> Rows:
     """Mean times and costs of the entries that a look has reached."""
-    assert isinstance(outcome.study, PublishedDecision)
+    assert isinstance(outcome.study, PublishedStudy)
     yield "entry", "seeds", "steps below threshold (95%)", "core-hours", "circuits per seed"
     for entry in outcome.as_dict()["entries"]:
         if entry["mean_time"] is not None:
@@ -114,7 +114,7 @@ def executions(task: str) -> Rows:
     return _chosen(kept.sheet(), kept.columns()[:5])
 
 
-OF_PLANS: dict[str, Callable[[DecisionOutcome, int | None], Rows]] = {
+OF_PLANS: dict[str, Callable[[StudyOutcome, int | None], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
@@ -127,9 +127,9 @@ def _padded(cell: str) -> str:
 
 
 @cache
-def published(name: str) -> DecisionOutcome:
+def published(name: str) -> StudyOutcome:
     """Return what a published plan has decided."""
-    return plans.read(plans.PUBLISHED / name)
+    return published_studies.read(published_studies.PUBLISHED / name)
 
 
 def filled(text: str) -> str:

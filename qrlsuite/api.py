@@ -48,10 +48,11 @@ from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import read_seeds
-from qrlsuite.studies import decided, decisions
+from qrlsuite.studies import looks
+from qrlsuite.studies import outcome as outcomes
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
-from qrlsuite.studies.decided import DecisionOutcome
+from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning import space
@@ -553,7 +554,7 @@ def decide(
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
-) -> DecisionOutcome:
+) -> StudyOutcome:
     """Compare entries with as many seeds as it takes, by a plan that `qrlsuite decide new` wrote.
 
     Seeds are trained look by look, until every pair is decided or the plan's last look was taken. Interrupt it at any
@@ -572,7 +573,7 @@ def decide(
 
     Returns
     -------
-    DecisionOutcome
+    StudyOutcome
         With `pairs`, each with its `verdict`, `difference` (mean time below threshold of the second over that of the
         first, minus 1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
 
@@ -594,9 +595,9 @@ def decide(
     [('mlp width=64', 'mlp width=16', 'mlp width=64 needs fewer')]
     """
     if not train:
-        return decided.read(Path(plan), Path(runs))
-    study = decisions.DecisionStudy(decisions.load(Path(plan)), str(plan), Path(runs))
-    return decided.run(study, _execution(engine, workers, device, same=same), not progress, "call")
+        return outcomes.read(Path(plan), Path(runs))
+    study = looks.StudyWithLooks(looks.load(Path(plan)), str(plan), Path(runs))
+    return outcomes.run(study, _execution(engine, workers, device, same=same), not progress, "call")
 
 
 def tune(

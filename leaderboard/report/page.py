@@ -15,12 +15,13 @@ import qrlsuite
 from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
-from qrlsuite.leaderboard.report import entries, planned, sections
+from qrlsuite.leaderboard.report import entries, sections
+from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.studies.decided import DecisionOutcome
+from qrlsuite.studies.outcome import StudyOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
 SCRIPTS = ("plotly-basic.min.js", "page.js", "pairs.js", "figures.js")
@@ -30,7 +31,7 @@ LONGEST_REASON = 600
 def render(
     board: Leaderboard,
     title: str = "Sample complexity leaderboard",
-    plans: Sequence[DecisionOutcome] = (),
+    plans: Sequence[StudyOutcome] = (),
     across: AcrossBoard | None = None,
     costs: CostBoard | None = None,
 ) -> str:
@@ -69,7 +70,7 @@ def render(
             headline=sections.headline(boards, shown),
             sections=boards,
             entries=shown,
-            plans=[planned.view(plan) for plan in plans],
+            plans=[looks_report.view(plan) for plan in plans],
             across=across,
             costs=() if costs is None else costs.sections,
             tasks=len({section.task for section in board.sections}),

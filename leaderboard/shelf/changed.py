@@ -12,8 +12,8 @@ import subprocess
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard.plans import LOG, PLAN
 from qrlsuite.leaderboard.shelf.published import CURVES, SEEDS
+from qrlsuite.leaderboard.shelf.published_studies import LOG, PLAN
 
 PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
 """Where a repository keeps what is published."""

@@ -27,11 +27,11 @@ from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import TaskError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
-from qrlsuite.leaderboard import plans
-from qrlsuite.leaderboard.pictures import decided as drawing
+from qrlsuite.leaderboard.pictures import outcome as drawing
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
-from qrlsuite.studies import decided
+from qrlsuite.studies import outcome as outcomes
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
 
@@ -550,7 +550,7 @@ def test_the_picture_has_a_row_for_each_pair_below_its_question(refused: Refused
     answer("run", plan, "--engine", "scripted")
     assert say("plot", plan, "--out", "pairs.svg").stdout == "wrote pairs.svg\n"
     assert Path("pairs.svg").read_bytes().startswith(b"<?xml")
-    outcome = decided.read(Path(plan), Path("runs"))
+    outcome = outcomes.read(Path(plan), Path("runs"))
     figure = drawing.draw(outcome)
     [axes] = figure.axes
     rows = [label.get_text() for label in axes.get_yticklabels()]
@@ -579,7 +579,7 @@ def test_the_picture_of_entries_has_the_shortest_mean_time_first(refused: Refuse
     assert "nothing to draw" in refused("plot", plan, "--entries")
     answer("run", plan, "--engine", "scripted")
     assert say("plot", plan, "--entries", "--out", "entries.svg").stdout == "wrote entries.svg\n"
-    outcome = decided.read(Path(plan), Path("runs"))
+    outcome = outcomes.read(Path(plan), Path("runs"))
     [axes] = drawing.draw_entries(outcome).axes
     times = outcome.mean_times()
     names = [label.get_text() for label in axes.get_yticklabels()]
@@ -695,7 +695,7 @@ def test_a_published_plan_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch) 
     answer("run", plan, "--engine", "scripted")
     say("export", plan, "--out", "published")
     Path(plan).unlink()
-    monkeypatch.setattr(plans, "PUBLISHED", Path("published").absolute())
+    monkeypatch.setattr(published_studies, "PUBLISHED", Path("published").absolute())
     published = say("status", "widths", "--json", "--runs", "none").stdout
     assert json.loads(published)["pairs"][0]["decided"] is not None
     assert "2 pairs" in say("show", "widths", "--runs", "none").stdout
@@ -721,5 +721,5 @@ def test_far_more_seeds_than_planned_are_not_counted(seeds: int, said: str) -> N
     study: Any = SimpleNamespace(ended=False, plan=SimpleNamespace(looks=(20, 40, 60)))
     needs = {"level": 0.0021, "seeds": 40, "seeds_at_this_difference": seeds}
     assert (
-        decided.needs_text(study, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
+        outcomes.needs_text(study, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
     )

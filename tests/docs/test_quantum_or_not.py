@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite.leaderboard import plans
+from qrlsuite.leaderboard.shelf import published_studies
 from tests.docs import load
 
 PAGE = (Path(__file__).parents[2] / "docs" / "quantum-or-not.md").read_text()
 PROSE = " ".join(PAGE.split())
-NAMES = sorted(folder.name for folder in plans.PUBLISHED.iterdir())
+NAMES = sorted(folder.name for folder in published_studies.PUBLISHED.iterdir())
 ELSEWHERE = {
     "cartpole-sizes": "fidelity.md",
     "paper-settings": "fidelity.md",

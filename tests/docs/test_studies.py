@@ -15,8 +15,9 @@ import pytest
 
 from qrlsuite import api
 from qrlsuite.errors import UnknownNameError
-from qrlsuite.leaderboard import across, plans
+from qrlsuite.leaderboard import across
 from qrlsuite.leaderboard.board import ranking_of
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.leaderboard.times import percent
 from qrlsuite.results.text import steps_text
@@ -24,7 +25,7 @@ from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoar
 from qrlsuite.statistics.estimator import sample_complexity
 from qrlsuite.statistics.times import times_below
 from qrlsuite.statistics.times_board import holm
-from qrlsuite.studies.decided import versus
+from qrlsuite.studies.outcome import versus
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -363,7 +364,7 @@ def test_rows_of_a_plan() -> None:
         "cartpole-sizes",
     }
     for name, row in rows:
-        found = plans.read(plans.PUBLISHED / name)
+        found = published_studies.read(published_studies.PUBLISHED / name)
         verdicts = {versus(pair): pair.verdict for pair in found.pairs}
         said = {match["pair"]: match["verdict"] for match in PLANNED.finditer(row[4])}
         assert len(said) == row[4].count(" / ") > 0

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import plans
-from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf import published, published_studies
 from qrlsuite.leaderboard.shelf.changed import PLACES, _problem, changed
 from tests.commands import qrlsuite
 
@@ -158,7 +157,7 @@ def test_a_badly_named_file_can_be_removed(repository: Path) -> None:
 def test_the_command_checks_entries_and_plans_that_differ(repository: Path) -> None:
     done = qrlsuite("leaderboard", "verify", "--base", "HEAD", cwd=repository)
     assert (done.returncode, done.stdout) == (0, "no entry differs from HEAD\n")
-    shutil.copytree(plans.PUBLISHED / PLAN, repository / "leaderboard" / "plans" / PLAN)
+    shutil.copytree(published_studies.PUBLISHED / PLAN, repository / "leaderboard" / "plans" / PLAN)
     done = qrlsuite("leaderboard", "verify", "--base", "HEAD", cwd=repository)
     assert f"ok     {PLAN}: plan sound" in done.stdout
     assert "10 of 10 entries ok" in done.stdout

@@ -24,14 +24,16 @@ from qrlsuite.cli.training import (
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
-from qrlsuite.leaderboard import pictures, plans
+from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted, hours_range
 from qrlsuite.statistics.sequential import Decision, Spending
-from qrlsuite.studies import decided, decisions
-from qrlsuite.studies.decided import DecisionOutcome
-from qrlsuite.studies.decisions import DecisionStudy
+from qrlsuite.studies import looks as with_looks
+from qrlsuite.studies import outcome as outcomes
+from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -113,7 +115,7 @@ def new(
         raise OptionError(f"{path}: a plan's name ends in .toml")
     if path.exists():
         raise OptionError(f"{path} is there already: choose another name, or delete it")
-    study = decisions.write(
+    study = with_looks.write(
         path.stem,
         task,
         entries,
@@ -129,7 +131,7 @@ def new(
         reason=reason,
     )
     study.check()
-    write_atomically(path, decisions.dumps(study.file).encode())
+    write_atomically(path, with_looks.dumps(study.file).encode())
     if json_output:
         typer.echo(json.dumps(_plan_as_dict(study)))
         return
@@ -174,7 +176,7 @@ def run(
     chosen_execution = execution_of(engine, workers, partition, time, engine_options, device, same=same)
     console = Console(stderr=True, quiet=json_output, highlight=False)
     try:
-        outcome = decided.run(
+        outcome = outcomes.run(
             study, chosen_execution, json_output, looked=lambda so_far: _say_look(so_far.decision, console)
         )
     except KeyboardInterrupt:
@@ -228,7 +230,7 @@ def plot(
     """
     format_ = pictures.format_of(output)
     outcome = _outcome(path, runs)
-    from qrlsuite.leaderboard.pictures import decided as drawing  # matplotlib
+    from qrlsuite.leaderboard.pictures import outcome as drawing  # matplotlib
 
     draw = drawing.draw_entries if entries else drawing.draw
     target = output or Path(f"{outcome.study.file.name}-{'entries' if entries else 'pairs'}.png")
@@ -252,7 +254,7 @@ def export(
 
     Example: qrlsuite decide export width.toml
     """
-    folder = plans.export(_study(path, runs), out)
+    folder = published_studies.export(_study(path, runs), out)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     typer.echo(f"wrote {folder} ({size / 1000:.0f} kB)")
     typer.echo(f"next: {command('decide', 'status', str(folder))}")
@@ -277,28 +279,32 @@ def _published(path: Path) -> Path | None:
     UnknownNameError
         If nothing has that name, neither a published plan nor a file.
     """
-    folder = plans.PUBLISHED / path
+    folder = published_studies.PUBLISHED / path
     if len(path.parts) != 1 or path.suffix == ".toml" or path.exists():
         return None
-    if plans.is_published(folder):
+    if published_studies.is_published(folder):
         return folder
     file = path.with_name(f"{path.name}.toml")
-    known = [file.name] if file.exists() else [each.name for each in plans.PUBLISHED.iterdir()]
+    known = [file.name] if file.exists() else [each.name for each in published_studies.PUBLISHED.iterdir()]
     raise UnknownNameError(f"no file and no published plan is named '{path}'{nearest(path.name, known)}")
 
 
-def _outcome(path: Path, runs: Path) -> DecisionOutcome:
+def _outcome(path: Path, runs: Path) -> StudyOutcome:
     """Read what a plan has decided; of a published one that has begun in the results folder, there."""
     if (folder := _published(path)) is not None:
         study = _study(path, runs)
-        return decided.read(folder / plans.PLAN, runs) if study.begun else plans.read(folder)
-    return plans.read(path) if path.is_dir() else decided.read(path, runs)
+        return (
+            outcomes.read(folder / published_studies.PLAN, runs)
+            if study.begun
+            else published_studies.read(folder)
+        )
+    return published_studies.read(path) if path.is_dir() else outcomes.read(path, runs)
 
 
-def _study(path: Path, runs: Path) -> DecisionStudy:
+def _study(path: Path, runs: Path) -> StudyWithLooks:
     folder = _published(path)
-    file = path if folder is None else folder / plans.PLAN
-    study = DecisionStudy(decisions.load(file), str(path), runs)
+    file = path if folder is None else folder / published_studies.PLAN
+    study = StudyWithLooks(with_looks.load(file), str(path), runs)
     study.check()
     return study
 
@@ -310,7 +316,7 @@ def _numbers(text: str) -> list[int]:
         raise OptionError(f"--looks {text}: write numbers of seeds, for example --looks 20,40,60") from None
 
 
-def _plan_as_dict(study: DecisionStudy) -> dict[str, Any]:
+def _plan_as_dict(study: StudyWithLooks) -> dict[str, Any]:
     plan, family = study.plan, len(study.plan.family)
     looks = range(len(plan.looks))
     return {
@@ -323,15 +329,15 @@ def _plan_as_dict(study: DecisionStudy) -> dict[str, Any]:
         "names": list(study.entries),
         "levels": [plan.level(look, family) for look in looks],
         "equal_levels": [plan.equal_level(look) for look in looks],
-        "core_hours_at_most": {name: decided.hours(study, name, plan.looks[-1]) for name in study.entries},
+        "core_hours_at_most": {name: outcomes.hours(study, name, plan.looks[-1]) for name in study.entries},
     }
 
 
-def _show_plan(study: DecisionStudy) -> None:
+def _show_plan(study: StudyWithLooks) -> None:
     file, plan, family = study.file, study.plan, len(study.plan.family)
     console = Console(highlight=False, soft_wrap=True, markup=False)
     state = f"ended {study.ended}" if study.ended else "begun" if study.begun else "not begun"
-    console.print(Text(f"{file.name}: {decided.question(study)}", style="bold"))
+    console.print(Text(f"{file.name}: {outcomes.question(study)}", style="bold"))
     console.print(f"written {file.written:%Y-%m-%d %H:%M} UTC, hash {file.hash}, {state}")
     first = next(iter(study.entries.values()))
     steps = file.epochs * first.task.file.protocol.interactions
@@ -342,7 +348,7 @@ def _show_plan(study: DecisionStudy) -> None:
         f"seeds {format_seeds(file.block)}; any false difference with probability {file.alpha:g} "
         f"({counted(family, 'pair')}, {file.spending} spending); equal within {100 * file.margin:g} percent"
     )
-    for asked, pairs in decided.by_question(study, plan.family):
+    for asked, pairs in outcomes.by_question(study, plan.family):
         if asked:
             console.print(f"  {asked} {'; '.join(' / '.join(pair) for pair in pairs)}")
     for look, seeds in enumerate(plan.looks):
@@ -353,9 +359,9 @@ def _show_plan(study: DecisionStudy) -> None:
             + (" while all pairs are open" if family > 1 else "")
             + equality
         )
-    if note := decided.reason_note(study):
+    if note := outcomes.reason_note(study):
         console.print(note)
-    total = decided.total_hours(study, dict.fromkeys(study.entries, plan.looks[-1]))
+    total = outcomes.total_hours(study, dict.fromkeys(study.entries, plan.looks[-1]))
     cost = "unknown before a first epoch is trained" if total is None else f"{hours_range(*total)} core-hours"
     console.print(f"at most {len(study.entries) * plan.looks[-1]} seeds: {cost}")
 
@@ -369,13 +375,13 @@ def _say_look(decision: Decision, console: Console) -> None:
     for pair in decision.pairs:
         if len(pair.p) == looks:
             console.print(
-                f"{decided.versus(pair)}: {pair.verdict} (p = {pair.p[-1]:.2g}, level {pair.levels[-1]:.2g})",
+                f"{outcomes.versus(pair)}: {pair.verdict} (p = {pair.p[-1]:.2g}, level {pair.levels[-1]:.2g})",
                 markup=False,
                 soft_wrap=True,
             )
 
 
-def _show_status(outcome: DecisionOutcome) -> None:
+def _show_status(outcome: StudyOutcome) -> None:
     console = Console(highlight=False, soft_wrap=True, markup=False)
     for part in outcome.parts():
         (table_console() if isinstance(part, Table) else console).print(part)

@@ -11,16 +11,15 @@ import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
-from qrlsuite.leaderboard import plans
-from qrlsuite.leaderboard.shelf import importing
+from qrlsuite.leaderboard.shelf import importing, published_studies
 from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
 
 
 def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
-    if plans.is_published(folder):
-        yield from plans.import_plan(folder, runs)
+    if published_studies.is_published(folder):
+        yield from published_studies.import_study(folder, runs)
     else:
         yield from (importing.import_seeds(source, runs) for source in importing.sources(folder))
 

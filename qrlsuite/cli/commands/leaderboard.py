@@ -30,12 +30,12 @@ from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import across as several
 from qrlsuite.leaderboard import board as boards
-from qrlsuite.leaderboard import plans as decision_plans
 from qrlsuite.leaderboard import report, tables
 from qrlsuite.leaderboard.board import Leaderboard
 from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.scores import rank_by_score
 from qrlsuite.leaderboard.sheet import WIDE, Sheet, csv_rows
+from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
 
@@ -297,7 +297,7 @@ def _page(
     costs: CostBoard | None = None,
 ) -> bool:
     """Write the page, with the decision plans of the tasks; returns whether there is anything to show."""
-    plans, unreadable = decision_plans.collected(runs, tasks, published)
+    plans, unreadable = published_studies.collected(runs, tasks, published)
     for line in unreadable:
         typer.echo(f"left out: {line}", err=True)
     if not board.sections and not plans:

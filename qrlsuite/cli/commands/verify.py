@@ -14,8 +14,7 @@ from rich.text import Text
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import plans
-from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf import published, published_studies
 from qrlsuite.leaderboard.shelf import verify as checks
 from qrlsuite.leaderboard.shelf.changed import changed
 from qrlsuite.results.progress import Progress as RunProgress
@@ -73,7 +72,7 @@ def verify(
     if base is not None and paths:
         raise OptionError("give PATH or --base, not both")
     given = list(paths or published.folders())
-    plan_folders = [path for path in given if plans.is_published(path)]
+    plan_folders = [path for path in given if published_studies.is_published(path)]
     if base is not None:
         given, plan_folders = changed(base, Path.cwd())
     folders = [folder for path in given for folder in checks.find(path)]
@@ -121,7 +120,7 @@ def _say(ok: bool, name: str, message: str) -> None:
 def _plan(folder: Path) -> dict[str, Any]:
     """Read a published plan, and say what is wrong with it."""
     try:
-        outcome = plans.read(folder)
+        outcome = published_studies.read(folder)
     except QrlSuiteError as error:
         return {"plan": folder.name, "folder": str(folder), "ok": False, "message": str(error)}
     message = f"plan sound: {len(outcome.pairs)} pairs, its verdicts computed again"

@@ -10,8 +10,8 @@ from typing import Any
 
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.studies.decided import (
-    DecisionOutcome,
+from qrlsuite.studies.outcome import (
+    StudyOutcome,
     difference_text,
     needs_text,
     question,
@@ -88,7 +88,7 @@ class PlanView:
     picture: DecisionPicture
 
 
-def view(outcome: DecisionOutcome) -> PlanView:
+def view(outcome: StudyOutcome) -> PlanView:
     """Return a plan with its decisions for the template."""
     study, plan = outcome.study, outcome.study.plan
     plain = outcome.as_dict()
@@ -116,7 +116,7 @@ def view(outcome: DecisionOutcome) -> PlanView:
     )
 
 
-def _facts(outcome: DecisionOutcome, plain: dict[str, Any]) -> list[tuple[str, str]]:
+def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]]:
     study = outcome.study
     entry = next(iter(study.entries.values()))
     steps = study.file.epochs * entry.task.file.protocol.interactions
@@ -142,7 +142,7 @@ def _facts(outcome: DecisionOutcome, plain: dict[str, Any]) -> list[tuple[str, s
     ]
 
 
-def _look(outcome: DecisionOutcome, index: int) -> LookLine:
+def _look(outcome: StudyOutcome, index: int) -> LookLine:
     plan, taken = outcome.study.plan, outcome.study.taken
     seeds = plan.looks[index]
     spent = 2 * plan.spending.spent([seeds / plan.looks[-1]], plan.alpha / 2)[0]
@@ -160,7 +160,7 @@ def _look(outcome: DecisionOutcome, index: int) -> LookLine:
     )
 
 
-def _picture(outcome: DecisionOutcome) -> DecisionPicture:
+def _picture(outcome: StudyOutcome) -> DecisionPicture:
     plan = outcome.study.plan
     looks = range(len(plan.looks))
     strict = [plan.level(look, len(plan.family)) for look in looks]

@@ -13,8 +13,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import style
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics.sequential import Decided, PairDecision
-from qrlsuite.studies import decided
-from qrlsuite.studies.decided import DecisionOutcome
+from qrlsuite.studies import outcome as outcomes
+from qrlsuite.studies.outcome import StudyOutcome
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +36,7 @@ LOOKS: dict[Decided | None, tuple[str, str, str]] = {
 """What the legend says, color and marker, by what was decided of a pair."""
 
 
-def draw(outcome: DecisionOutcome) -> Figure:
+def draw(outcome: StudyOutcome) -> Figure:
     """Draw a row for each pair, below the question that it answers.
 
     The axis is the mean time below threshold of B over that of A, in logarithms: twice as long is as far to the right
@@ -50,11 +50,11 @@ def draw(outcome: DecisionOutcome) -> Figure:
     study, decision = outcome.study, outcome.decision
     if not any(pair.p for pair in decision.pairs):
         raise OptionError(f"{study.file.name} has taken no look yet: there is nothing to draw")
-    groups = decided.by_question(study, decision.pairs)
+    groups = outcomes.by_question(study, decision.pairs)
     rows: list[str | PairDecision] = []
     for question, pairs in groups:
         rows += [question] * bool(question) + list(pairs)
-    names = [decided.versus(row) if isinstance(row, PairDecision) else row for row in rows]
+    names = [outcomes.versus(row) if isinstance(row, PairDecision) else row for row in rows]
     figure = Figure(figsize=(9.5, 1.4 + 0.25 * len(rows)), layout="constrained")
     axes = figure.subplots()
     ends = [1.0]
@@ -70,7 +70,7 @@ def draw(outcome: DecisionOutcome) -> Figure:
     axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(
-        FuncFormatter(lambda ratio, _: decided.percent(ratio - 1) if ratio != 1 else "0")
+        FuncFormatter(lambda ratio, _: outcomes.percent(ratio - 1) if ratio != 1 else "0")
     )
     axes.set_xlabel("pair A / B: how much longer B is below the thresholds than A")
     _name_rows(axes, names)
@@ -95,7 +95,7 @@ def draw(outcome: DecisionOutcome) -> Figure:
     return figure
 
 
-def draw_entries(outcome: DecisionOutcome) -> Figure:
+def draw_entries(outcome: StudyOutcome) -> Figure:
     """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
 
     An entry called `X, tuned` shares the row of the plan's entry X.
@@ -168,7 +168,7 @@ def _at_right(axes: Axes, height: int, text: str) -> None:
     )
 
 
-def _finish(figure: Figure, outcome: DecisionOutcome, *footnotes: str) -> None:
+def _finish(figure: Figure, outcome: StudyOutcome, *footnotes: str) -> None:
     """Add legend, title and remarks."""
     figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
     task = next(iter(outcome.study.entries.values())).task.name

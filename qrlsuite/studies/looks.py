@@ -130,7 +130,7 @@ class PlanFile(_PlanTable):
 
 
 def parse(text: str, source: str) -> PlanFile:
-    """Parse a plan file; entries and numbers are checked by `DecisionStudy`.
+    """Parse a plan file; entries and numbers are checked by `StudyWithLooks`.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def write(
     margin: float = 0.10,
     first_seed: int | None = None,
     reason: str = "",
-) -> DecisionStudy:
+) -> StudyWithLooks:
     """Return a new plan, dated now; writes nothing.
 
     Parameters
@@ -235,10 +235,10 @@ def write(
         )
     except pydantic.ValidationError as error:
         raise OptionError("; ".join(options.file_problems(error, PlanFile))) from None
-    study = DecisionStudy(file, "the plan", runs)
+    study = StudyWithLooks(file, "the plan", runs)
     while first_seed is None and study.trained_before():
         moved = file.model_copy(update={"first_seed": _next_block(study.file)})
-        study = DecisionStudy(moved, "the plan", runs)
+        study = StudyWithLooks(moved, "the plan", runs)
     return study
 
 
@@ -301,7 +301,7 @@ def _next_block(file: PlanFile) -> int:
     return file.first_seed + max(1000, len(file.block))
 
 
-class DecisionStudy:
+class StudyWithLooks:
     """A decision plan with its results folder.
 
     Parameters

@@ -25,8 +25,8 @@ from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
 from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
-from qrlsuite.studies import decisions
-from qrlsuite.studies.decisions import DecisionStudy
+from qrlsuite.studies import looks
+from qrlsuite.studies.looks import StudyWithLooks
 
 Pair = TypeVar("Pair")
 """What is known of a pair: its decision, or more."""
@@ -36,7 +36,7 @@ Hours = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DecisionOutcome(Shown):
+class StudyOutcome(Shown):
     """A plan with what it has decided so far.
 
     Attributes
@@ -49,7 +49,7 @@ class DecisionOutcome(Shown):
         One line for each entry whose seeds were handed to a queue.
     """
 
-    study: DecisionStudy
+    study: StudyWithLooks
     decision: Decision
     submitted: tuple[str, ...] = ()
 
@@ -173,12 +173,12 @@ class DecisionOutcome(Shown):
 
 
 def run(
-    study: DecisionStudy,
+    study: StudyWithLooks,
     chosen_execution: Execution,
     quiet: bool = False,
     again: Literal["command", "call"] = "command",
-    looked: Callable[[DecisionOutcome], None] | None = None,
-) -> DecisionOutcome:
+    looked: Callable[[StudyOutcome], None] | None = None,
+) -> StudyOutcome:
     """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
 
     Parameters
@@ -216,11 +216,11 @@ def run(
         if study.missing(decision) and study.wanted(decision) == wanted:
             break  # a queue or another process has the seeds
         if looked is not None:
-            looked(DecisionOutcome(study, decision))
-    return DecisionOutcome(study, decision, tuple(submitted))
+            looked(StudyOutcome(study, decision))
+    return StudyOutcome(study, decision, tuple(submitted))
 
 
-def read(path: Path, runs: Path) -> DecisionOutcome:
+def read(path: Path, runs: Path) -> StudyOutcome:
     """Return what a plan has decided so far; trains and writes nothing.
 
     Raises
@@ -228,11 +228,11 @@ def read(path: Path, runs: Path) -> DecisionOutcome:
     QrlSuiteError
         If the plan or its results cannot be used.
     """
-    study = DecisionStudy(decisions.load(path), str(path), runs)
-    return DecisionOutcome(study, study.decision())
+    study = StudyWithLooks(looks.load(path), str(path), runs)
+    return StudyOutcome(study, study.decision())
 
 
-def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutcome], list[str]]:
+def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome], list[str]]:
     """Return what the plans that have begun in a results folder have decided, and a line for each that is unreadable.
 
     Parameters
@@ -241,7 +241,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutco
         Only plans of these tasks; all where empty.
     """
     outcomes, refused = [], []
-    for path in sorted((runs / decisions.FOLDER).glob("*/plan.toml")):
+    for path in sorted((runs / looks.FOLDER).glob("*/plan.toml")):
         try:
             outcome = read(path, runs)
         except QrlSuiteError as error:
@@ -253,7 +253,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[DecisionOutco
     return outcomes, refused
 
 
-def hours(study: DecisionStudy, name: str, seeds: int) -> Hours | None:
+def hours(study: StudyWithLooks, name: str, seeds: int) -> Hours | None:
     """Return the core-hours of so many seeds of an entry: measured on its own, else estimated; None where unknown."""
     done = len(study.seeds(name))
     if done:
@@ -267,7 +267,7 @@ def hours(study: DecisionStudy, name: str, seeds: int) -> Hours | None:
     return low, high
 
 
-def total_hours(study: DecisionStudy, seeds: Mapping[str, int]) -> Hours | None:
+def total_hours(study: StudyWithLooks, seeds: Mapping[str, int]) -> Hours | None:
     """Return the core-hours of seeds of several entries together; None where one is unknown."""
     known = [each for name, count in seeds.items() if (each := hours(study, name, count)) is not None]
     if len(known) < len(seeds):
@@ -275,7 +275,7 @@ def total_hours(study: DecisionStudy, seeds: Mapping[str, int]) -> Hours | None:
     return sum(low for low, _ in known), sum(high for _, high in known)
 
 
-def question(study: DecisionStudy) -> str:
+def question(study: StudyWithLooks) -> str:
     """Return what a plan asks: `which needs fewer steps, A, B or C?`, or the number of its questions."""
     if study.questions:
         return f"{counted(len(study.file.questions), 'question')}, {counted(len(study.plan.family), 'pair')}"
@@ -283,7 +283,7 @@ def question(study: DecisionStudy) -> str:
     return f"which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
 
 
-def by_question(study: DecisionStudy, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
+def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
     """Return each question of a plan with what is known of its pairs, in order; an empty text where none is asked."""
     texts = study.questions or [""] * len(pairs)
     return [
@@ -292,7 +292,7 @@ def by_question(study: DecisionStudy, pairs: Sequence[Pair]) -> list[tuple[str, 
     ]
 
 
-def reason_note(study: DecisionStudy) -> str:
+def reason_note(study: StudyWithLooks) -> str:
     """Return a warning with the reason given where a plan looks below 20 seeds; else an empty text."""
     if study.plan.looks[0] >= 20:
         return ""
@@ -333,7 +333,7 @@ def _leading_text(pair: PairDecision, grid: Grid) -> str:
     return f"; at {grid.thresholds[pair.leading]:g}: {percent(pair.leading_difference)}, {ends}"
 
 
-def needs_text(study: DecisionStudy, needs: Mapping[str, Any] | None) -> str:
+def needs_text(study: StudyWithLooks, needs: Mapping[str, Any] | None) -> str:
     """Say what an open pair needs, as `as_dict` gives it."""
     if needs is None or study.ended:
         return ""
@@ -358,7 +358,7 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _pair_as_dict(study: DecisionStudy, decision: Decision, pair: PairDecision) -> dict[str, Any]:
+def _pair_as_dict(study: StudyWithLooks, decision: Decision, pair: PairDecision) -> dict[str, Any]:
     plan = decision.plan
     needs = None
     if pair.decided is None:
@@ -387,7 +387,7 @@ def _pair_as_dict(study: DecisionStudy, decision: Decision, pair: PairDecision) 
     }
 
 
-def _table(study: DecisionStudy, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
+def _table(study: StudyWithLooks, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
     for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
         table.add_column(column, overflow="fold")

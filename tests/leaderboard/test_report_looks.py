@@ -14,10 +14,12 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.leaderboard import across, board
-from qrlsuite.leaderboard.report import planned, render
+from qrlsuite.leaderboard.report import looks as looks_report
+from qrlsuite.leaderboard.report import render
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
-from qrlsuite.studies import decided, decisions
-from qrlsuite.studies.decided import DecisionOutcome
+from qrlsuite.studies import looks as with_looks
+from qrlsuite.studies import outcome as outcomes
+from qrlsuite.studies.outcome import StudyOutcome
 from tests.conftest import TINY
 from tests.leaderboard import boards
 
@@ -25,7 +27,7 @@ STARTS = {"mlp width=16": 5, "mlp width=8": 5, "mlp width=4": 14}
 """The epoch from which the runs of an entry are good, one epoch earlier or later by turns."""
 
 
-def put(study: decisions.DecisionStudy, looks: int) -> DecisionOutcome:
+def put(study: with_looks.StudyWithLooks, looks: int) -> StudyOutcome:
     """Leave the seeds of some looks in the plan's folder as workers would, and take the looks."""
     study.begin()
     decision = study.look()
@@ -42,7 +44,7 @@ def put(study: decisions.DecisionStudy, looks: int) -> DecisionOutcome:
                 record = {"status": "finished", "epochs": 20, "parameters": {}, "provenance": []}
                 folder.write_record({"plan": study.file.hash, "seed": seed, **store.names, **record})
         decision = study.look()
-    return DecisionOutcome(study, decision)
+    return StudyOutcome(study, decision)
 
 
 @pytest.fixture(scope="module")
@@ -51,15 +53,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("decisions")
     task = folder / "tiny.toml"
     task.write_text(TINY.replace("seeds = 4\nepochs = 3", "seeds = 100\nepochs = 20"))
-    put(decisions.write("three", str(task), list(STARTS), folder / "runs"), looks=2)
-    put(decisions.write("two", str(task), list(STARTS)[:2], folder / "runs"), looks=1)
+    put(with_looks.write("three", str(task), list(STARTS), folder / "runs"), looks=2)
+    put(with_looks.write("two", str(task), list(STARTS)[:2], folder / "runs"), looks=1)
     return folder / "runs"
 
 
 def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -> None:
-    found, refused = decided.in_folder(runs)
+    found, refused = outcomes.in_folder(runs)
     assert refused == []
-    three, two = (planned.view(outcome) for outcome in found)
+    three, two = (looks_report.view(outcome) for outcome in found)
     assert [line.verdict for line in three.pairs] == [
         "equal within 10 percent",
         "mlp width=16 needs fewer",
@@ -86,7 +88,7 @@ def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) ->
     assert "p ≤ 0.015 at 40 seeds" in two.pairs[0].needs
     assert len(three.picture.lines) == 3
     assert [len(dots) for _, _, dots in three.picture.lines] == [2, 1, 1]
-    other, _ = decided.in_folder(runs, ["beam6g"])
+    other, _ = outcomes.in_folder(runs, ["beam6g"])
     assert other == []
 
 
@@ -99,13 +101,13 @@ def test_the_command_puts_plans_on_the_page(runs: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     text = (tmp_path / "runs" / "leaderboard.html").read_text()
     assert "three: which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in text
-    assert decided.in_folder(runs)[0][0].study.file.hash in text
+    assert outcomes.in_folder(runs)[0][0].study.file.hash in text
     assert re.search(r"plan.toml: alpha = 2.* is outside \(0, 1\)", text), "left out, with the reason"
 
 
 def test_times_of_the_log_are_written_to_the_minute() -> None:
-    assert planned._minute("2026-01-02T03:04:05+01:00") == "2026-01-02 02:04 UTC"
-    assert planned._minute("when it rained") == "when it rained"
+    assert looks_report._minute("2026-01-02T03:04:05+01:00") == "2026-01-02 02:04 UTC"
+    assert looks_report._minute("when it rained") == "when it rained"
 
 
 @pytest.mark.parametrize("width", [1400, 390])
@@ -114,7 +116,7 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
     for task in ("beam6g", "cartpole"):
         entries += [replace(each, task=task, task_hash=task) for each in boards.graded(2, seeds=30)]
     compared = across.compare(entries, ["beam6g", "cartpole"])
-    page = render(board.build(entries), plans=decided.in_folder(runs)[0], across=compared)
+    page = render(board.build(entries), plans=outcomes.in_folder(runs)[0], across=compared)
     tab = opened(page, width=width)
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.locator("nav a[href='#decisions']").count() == 1

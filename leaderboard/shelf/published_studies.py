@@ -22,17 +22,17 @@ from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import LearningCurves
-from qrlsuite.studies import decisions
-from qrlsuite.studies.decided import DecisionOutcome, in_folder
-from qrlsuite.studies.decisions import DecisionStudy
+from qrlsuite.studies import looks
+from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome, in_folder
 
-PUBLISHED = Path(__file__).parent / "plans"
+PUBLISHED = Path(__file__).parents[1] / "plans"
 """The plans that come with the suite."""
 
 PLAN, LOG = "plan.toml", "looks.jsonl"
 
 
-class PublishedDecision(DecisionStudy):
+class PublishedStudy(StudyWithLooks):
     """A published plan with its results.
 
     Parameters
@@ -47,7 +47,7 @@ class PublishedDecision(DecisionStudy):
     """
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(decisions.load(folder / PLAN), str(folder / PLAN), folder.parent)
+        super().__init__(looks.load(folder / PLAN), str(folder / PLAN), folder.parent)
         self.folder = folder
         self._published: dict[str, PublishedEntry] = {}
         for name, entry in self.entries.items():
@@ -96,7 +96,7 @@ def is_published(path: Path) -> bool:
     return (path / PLAN).is_file()
 
 
-def read(folder: Path) -> DecisionOutcome:
+def read(folder: Path) -> StudyOutcome:
     """Return what a published plan has decided.
 
     Raises
@@ -108,13 +108,13 @@ def read(folder: Path) -> DecisionOutcome:
         raise StoreError(
             f"{folder} holds no {PLAN}: give a plan's file, or a folder that `decide export` wrote"
         )
-    study = PublishedDecision(folder)
-    return DecisionOutcome(study, study.decision())
+    study = PublishedStudy(folder)
+    return StudyOutcome(study, study.decision())
 
 
 def collected(
     runs: Path, tasks: Sequence[str] = (), published: bool = False
-) -> tuple[list[DecisionOutcome], list[str]]:
+) -> tuple[list[StudyOutcome], list[str]]:
     """Return what the plans of a results folder have decided, and a line for each that is unreadable.
 
     Parameters
@@ -138,7 +138,7 @@ def collected(
     return outcomes, refused
 
 
-def export(study: DecisionStudy, out: Path) -> Path:
+def export(study: StudyWithLooks, out: Path) -> Path:
     """Write a plan and its finished seeds to `out/<name>`; returns that folder.
 
     Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less, and the plan's own
@@ -154,8 +154,8 @@ def export(study: DecisionStudy, out: Path) -> Path:
         raise OptionError(f"{study.source}: the plan has not begun, so there is nothing to export")
     folder = out / study.file.name
     if not is_published(folder):
-        write_atomically(folder / PLAN, decisions.dumps(study.file).encode())
-    elif (there := decisions.load(folder / PLAN).hash) != study.file.hash:
+        write_atomically(folder / PLAN, looks.dumps(study.file).encode())
+    elif (there := looks.load(folder / PLAN).hash) != study.file.hash:
         raise OptionError(
             f"{folder} holds another plan ({there}, this one is {study.file.hash}): choose another --out"
         )
@@ -170,7 +170,7 @@ def export(study: DecisionStudy, out: Path) -> Path:
     return folder
 
 
-def import_plan(folder: Path, runs: Path) -> list[Imported]:
+def import_study(folder: Path, runs: Path) -> list[Imported]:
     """Copy the seeds of a published plan to a results folder, where `decide run` goes on with it.
 
     Raises
@@ -178,8 +178,8 @@ def import_plan(folder: Path, runs: Path) -> list[Imported]:
     QrlSuiteError
         If another plan of its name has begun there, or an entry is damaged.
     """
-    source = PublishedDecision(folder)
-    study = DecisionStudy(source.file, source.source, runs)
+    source = PublishedStudy(folder)
+    study = StudyWithLooks(source.file, source.source, runs)
     study.begin()
     done = [
         importing.import_seeds(store, study.folder, source.file.hash) for store in importing.sources(folder)
