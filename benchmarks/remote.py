@@ -84,7 +84,7 @@ def task(given: argparse.Namespace) -> dict[str, Any]:
     from qrlsuite.options import parse_setting
     from qrlsuite.results import checkpoint
     from qrlsuite.results.store import EntryStore
-    from qrlsuite.training.advance import advance, pack, unpack
+    from qrlsuite.training.remote_task import pack, unpack, work_on
 
     entry = resolve("beam6g", given.model, settings=[parse_setting(word) for word in given.set])
     seeds, arrays, beside, size = list(range(given.seeds)), {}, [], 0
@@ -100,7 +100,7 @@ def task(given: argparse.Namespace) -> dict[str, Any]:
         store = EntryStore.create(Path(folder), entry)
         for epoch in range(given.repeat + 1):  # the first imports and compiles
             began = time.process_time()
-            content = advance(pack({**header, "epoch": epoch, "epochs": given.repeat + 2}, arrays))
+            content = work_on(pack({**header, "epoch": epoch, "epochs": given.repeat + 2}, arrays))
             answer, arrays = unpack(content)
             arrays = {name: array for name, array in arrays.items() if not name.startswith(POLICY)}
             checkpoint.save(store, seeds, epoch + 1, arrays)

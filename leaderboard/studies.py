@@ -133,9 +133,9 @@ def published_seeds(items: Iterable[PendingEntry]) -> dict[str, int]:
     """Return how many seeds of each entry come with the suite and reach its last epoch, by entry name."""
     counts = {}
     for item in items:
-        copies = _copies(published.folders(), item.plan.entry)
-        reached = [long for copy in copies if (long := copy.reaching(item.plan.epochs)) is not None]
-        counts[item.plan.entry.name] = max((len(copy.seeds) for copy in reached), default=0)
+        copies = _copies(published.folders(), item.missing.entry)
+        reached = [long for copy in copies if (long := copy.reaching(item.missing.epochs)) is not None]
+        counts[item.missing.entry.name] = max((len(copy.seeds) for copy in reached), default=0)
     return counts
 
 

@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from matplotlib.figure import Figure
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from qrlsuite.engine import execution
+from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.terminal import Shown, show_figures_in_notebook
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard import board as boards
@@ -371,7 +371,7 @@ def train(
     preset: str | None = None,
     seeds: Seeds | None = None,
     epochs: int | None = None,
-    engine: str | Execution = "local",
+    engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
     minutes: float | None = None,
@@ -401,7 +401,7 @@ def train(
     epochs:
         The epoch to which each is trained; None takes the task's protocol.
     engine:
-        Where the work is done: a name (`qrlsuite list engines`), or what `qrlsuite.engine.execution.create` built
+        Where the work is done: a name (`qrlsuite list engines`), or what `qrlsuite.engine.where.Where.create` built
         of a name and options.
     workers:
         Processes, or tasks in a queue; None takes one per core, or what the engine takes.
@@ -447,14 +447,12 @@ def train(
     watching = [track] if isinstance(track, str) else list(track)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     _check_positive("epochs", epochs)
-    chosen_execution = _execution(engine, workers, device, fresh, same)
-    execution.check_minutes(minutes, chosen_execution)
-    execution.require_same_code(Path(runs), [entry], chosen_execution)
-    work = execution.plan(Path(runs), entry, chosen_execution, seed_numbers, epochs)
+    where = _where(engine, workers, device, fresh, same)
+    missing.check_minutes(minutes, where)
+    missing.require_same_code(Path(runs), [entry], where)
+    work = missing.find(Path(runs), entry, where, seed_numbers, epochs)
     with trackers.asking(watching):
-        execution.train(
-            work, chosen_execution, RunDisplay(work, chosen_execution.workers, not progress, "call"), minutes
-        )
+        missing.train(work, where, RunDisplay(work, where.workers, not progress, "call"), minutes)
     return collect.read(work.store)
 
 
@@ -548,7 +546,7 @@ def decide(
     plan: str | PathLike[str],
     *,
     train: bool = True,
-    engine: str | Execution = "local",
+    engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
     same: str | None = None,
@@ -597,7 +595,7 @@ def decide(
     if not train:
         return outcomes.read(Path(plan), Path(runs))
     study = looks.StudyWithLooks(looks.load(Path(plan)), str(plan), Path(runs))
-    return outcomes.run(study, _execution(engine, workers, device, same=same), not progress, "call")
+    return outcomes.run(study, _where(engine, workers, device, same=same), not progress, "call")
 
 
 def tune(
@@ -617,7 +615,7 @@ def tune(
     objective: Literal["time", "cell", "area"] = "time",
     minutes: float | None = None,
     out: str | PathLike[str] | None = None,
-    engine: str | Execution = "local",
+    engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
     fresh: bool = False,
@@ -690,7 +688,7 @@ def tune(
         raise OptionError(f"out = {str(out)!r}: the preset file's name ends in .toml")
     _check_positive("epochs", epochs)
     _check_positive("trials", trials)
-    chosen_execution = _execution(engine, workers, device, fresh, same)
+    where = _where(engine, workers, device, fresh, same)
     budget = _seconds(minutes)
     varied = {
         name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
@@ -713,9 +711,9 @@ def tune(
     if not requests or (preset is not None and len(requests) > 1):
         raise OptionError("model: give at least one model, and with `out` only one")
     searches = tuning_runner.build(requests, Path(runs))
-    display = TuneDisplay(searches, chosen_execution, not progress, "call")
+    display = TuneDisplay(searches, where, not progress, "call")
     display.begin()
-    tuning_runner.run(searches, Path(runs), chosen_execution, display, budget, preset)
+    tuning_runner.run(searches, Path(runs), where, display, budget, preset)
     return searches
 
 
@@ -768,7 +766,7 @@ def run_study(
     epochs: int | None = None,
     minutes: float | None = None,
     format: Literal["png", "pdf", "svg"] = "png",
-    engine: str | Execution = "local",
+    engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
     fresh: bool = False,
@@ -821,7 +819,7 @@ def run_study(
         raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
     _check_positive("epochs", epochs)
     budget = _seconds(minutes)
-    chosen_execution = _execution(engine, workers, device, fresh, same)
+    where = _where(engine, workers, device, fresh, same)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     study = study_files.load(name)
     studies.check(study)
@@ -829,28 +827,28 @@ def run_study(
     members = study_runner.select(study, from_mapping(options), models, names)
     folder = Path(runs)
     speeds = speed.known(folder)
-    execution.require_same_code(folder, [member.entry for member in members], chosen_execution)
-    items = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
+    missing.require_same_code(folder, [member.entry for member in members], where)
+    items = study_runner.survey(members, folder, where, speeds, seed_numbers, epochs)
     if budget is not None:
-        study_runner.check_budget(items, budget, chosen_execution.workers)
-    session = study_runner.Session(folder, chosen_execution, speeds, budget, not progress, "call")
+        study_runner.check_budget(items, budget, where.workers)
+    session = study_runner.Session(folder, where, speeds, budget, not progress, "call")
     session.run(items)
     drawn = studies.write(study, members, folder, format)
-    after = study_runner.survey(members, folder, chosen_execution, speeds, seed_numbers, epochs)
-    overview = study_runner.Overview(study, after, chosen_execution.workers)
+    after = study_runner.survey(members, folder, where, speeds, seed_numbers, epochs)
+    overview = study_runner.Overview(study, after, where.workers)
     return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
 
 
-def _execution(
-    engine: str | Execution, workers: int | None, device: str, fresh: bool = False, same: str | None = None
-) -> Execution:
+def _where(
+    engine: str | Where, workers: int | None, device: str, fresh: bool = False, same: str | None = None
+) -> Where:
     """Return where training is done."""
-    if isinstance(engine, Execution):
+    if isinstance(engine, Where):
         if workers is not None or device != "cpu":
             raise OptionError("workers and device belong to an engine that is built already: give them there")
         return replace(engine, fresh=engine.fresh or fresh, same=engine.same if same is None else same)
     _check_positive("workers", workers)
-    return replace(execution.create(engine, workers, device=device), fresh=fresh, same=same)
+    return replace(Where.create(engine, workers, device=device), fresh=fresh, same=same)
 
 
 def _check_positive(name: str, value: int | None) -> None:

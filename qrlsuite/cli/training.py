@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite import options
-from qrlsuite.engine import execution
-from qrlsuite.engine.execution import Execution
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError
 
 WorkersOption = Annotated[
@@ -68,7 +67,7 @@ SameOption = Annotated[
 ]
 
 
-def execution_of(
+def where_of(
     engine: str,
     workers: int | None,
     partition: str | None = None,
@@ -77,10 +76,10 @@ def execution_of(
     device: str = "cpu",
     fresh: bool = False,
     same: str | None = None,
-) -> Execution:
-    """Build the engine that a command's options name; the errors are those of `qrlsuite.engine.execution.create`."""
+) -> Where:
+    """Build the engine that a command's options name; the errors are those of `Where.create`."""
     chosen = {setting.name: setting.value for setting in map(options.parse_setting, settings or [])}
-    built = execution.create(engine, workers, {"partition": partition, "time": time, **chosen}, device)
+    built = Where.create(engine, workers, {"partition": partition, "time": time, **chosen}, device)
     return replace(built, fresh=fresh, same=same)
 
 

@@ -19,7 +19,7 @@ from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.genuine import require_plain
-from qrlsuite.training.advance import POLICY
+from qrlsuite.training.remote_task import POLICY
 
 if TYPE_CHECKING:
     from qrlsuite.training.trainer import Trainer

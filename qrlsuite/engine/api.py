@@ -5,8 +5,8 @@ it starts finds everything it needs in the entry's folder and leaves everything 
 same group: the second finds the seeds claimed, or done. `qrlsuite/engine/local.py` is the shortest example.
 
 A `RemoteEngine` needs no shared folder: it carries tasks to workers and answers back, both bytes, and a worker calls
-`qrlsuite.training.advance.advance(task)`. Claims, trackers and the results folder stay with the process that sends the
-tasks (`qrlsuite/engine/remote.py`). `qrlsuite/engine/dask.py` is the example.
+`qrlsuite.training.remote_task.work_on(task)`. Claims, trackers and the results folder stay with the process that sends
+the tasks (`qrlsuite/engine/remote.py`). `qrlsuite/engine/dask.py` is the example.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.experiment.entry import Entry
 from qrlsuite.results.seeds import SeedGroup, format_seeds
 from qrlsuite.results.store import EntryStore
 
@@ -26,6 +28,50 @@ Snapshot = dict[str, dict[str, Any]]
 """Progress by group id."""
 
 Show = Callable[[Snapshot], None]
+
+
+@dataclass(frozen=True)
+class Missing:
+    """The seeds of an entry that are to be trained, and in which groups.
+
+    Attributes
+    ----------
+    runs:
+        The results folder.
+    store:
+        The entry's folder in it, which need not exist yet.
+    seeds:
+        All seeds that were asked for.
+    epochs:
+        The epoch to which each is to be trained.
+    busy:
+        Those that another process trains, or that wait in a queue.
+    groups:
+        The rest of those that are missing.
+    """
+
+    runs: Path
+    entry: Entry
+    store: EntryStore
+    seeds: Sequence[int]
+    epochs: int
+    busy: frozenset[int] = frozenset()
+    groups: Sequence[SeedGroup] = field(default_factory=list)
+
+    @property
+    def todo(self) -> list[int]:
+        """The seeds of the groups, sorted."""
+        return sorted(seed for group in self.groups for seed in group.seeds)
+
+    @property
+    def left(self) -> int:
+        """Epochs to train, summed over the seeds; none for those that an interrupted longer run has already."""
+        return sum(len(group.seeds) * max(0, self.epochs - group.epoch) for group in self.groups)
+
+    @property
+    def together(self) -> int | None:
+        """Seeds of the largest group, None where there is none."""
+        return max((len(group.seeds) for group in self.groups), default=None)
 
 
 @dataclass(frozen=True)
@@ -96,7 +142,7 @@ class Answer:
     key:
         With which the task was sent.
     content:
-        What `advance` returned for it, None where the task was lost, as when its worker died.
+        What `work_on` returned for it, None where the task was lost, as when its worker died.
     problem:
         Why it was lost.
     """
@@ -107,7 +153,7 @@ class Answer:
 
 
 class Link(Protocol):
-    """A connection to workers that call `qrlsuite.training.advance.advance`."""
+    """A connection to workers that call `qrlsuite.training.remote_task.work_on`."""
 
     def send(self, key: str, task: bytes, priority: int) -> None:
         """Have a task worked on by any worker, now or when one is free.
@@ -159,7 +205,7 @@ class RemoteEngine(Protocol):
         workers:
             How many tasks will be sent at a time.
         versions:
-            What a worker must have: versions of distributions, and of `python`. `advance` refuses where they differ;
+            What a worker must have: versions of distributions, and of `python`. `work_on` refuses where they differ;
             a link that knows which worker has what sends it nothing.
 
         Raises

@@ -1,7 +1,7 @@
 """The engine `dask`: workers of a Dask cluster, which need no shared folder.
 
-A task is one call of `qrlsuite.training.advance.advance`: bytes go out and come back. Dask pickles its own message, in
-which the call is text that names the function; of an answer, the client accepts bytes only.
+A task is one call of `qrlsuite.training.remote_task.work_on`: bytes go out and come back. Dask pickles its own message,
+in which the call is text that names the function; of an answer, the client accepts bytes only.
 
 The scheduler is somebody else's (`scheduler`), or one on this machine for the time of the run. TLS is set up by Dask's
 own settings (`distributed.comm.tls` in its configuration, addresses that begin with `tls://`).
@@ -25,11 +25,11 @@ from qrlsuite.engine.local import usable_cores
 from qrlsuite.errors import QrlSuiteError, listed
 from qrlsuite.registry import words
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training.advance import MOST_BYTES, differing
+from qrlsuite.training.remote_task import MOST_BYTES, differing
 
 log = logging.getLogger("qrlsuite")
 
-CALL = "__import__('qrlsuite.training.advance', fromlist=['advance']).advance(task)"
+CALL = "__import__('qrlsuite.training.remote_task', fromlist=['work_on']).work_on(task)"
 """What a worker evaluates. A pickled function of ours would end a worker that cannot import it."""
 
 TASKS = 10
@@ -163,7 +163,7 @@ class DaskLink:
         restricted = {"workers": sorted(allowed)} if allowed else {}
         self._allowed[key] = allowed
         self._futures[key] = self._client.submit(
-            eval, CALL, {"task": task}, key=f"advance-{key}", priority=priority, pure=False, **restricted
+            eval, CALL, {"task": task}, key=f"train-{key}", priority=priority, pure=False, **restricted
         )
 
     def receive(self, seconds: float) -> list[Answer]:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn
 
 from qrlsuite import registry
-from qrlsuite.engine.execution import Plan
+from qrlsuite.engine.api import Missing
 from qrlsuite.engine.terminal import command
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.text import counted, duration
@@ -205,7 +205,7 @@ class Bar:
 
 
 class RunDisplay:
-    """Shows the training of one plan: a live bar on a terminal or in a notebook, lines elsewhere, nothing when quiet.
+    """Shows the training of one entry: a live bar on a terminal or in a notebook, lines elsewhere, nothing when quiet.
 
     Parameters
     ----------
@@ -217,15 +217,20 @@ class RunDisplay:
 
     def __init__(
         self,
-        plan: Plan,
+        missing: Missing,
         workers: int,
         quiet: bool = False,
         again: Literal["command", "call"] = "command",
     ) -> None:
-        self.plan, self.entry, self.epochs, self.groups = plan, plan.entry, plan.epochs, plan.groups
+        self.missing, self.entry, self.epochs, self.groups = (
+            missing,
+            missing.entry,
+            missing.epochs,
+            missing.groups,
+        )
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
-        self.estimate = CostEstimate(plan.groups, plan.epochs, workers)
-        self.workers = min(workers, max(1, len(plan.groups)))
+        self.estimate = CostEstimate(missing.groups, missing.epochs, workers)
+        self.workers = min(workers, max(1, len(missing.groups)))
         self.again = again
         self.bar = Bar(self.console)
         self.deadline: float | None = None
@@ -249,10 +254,10 @@ class RunDisplay:
         holders:
             Who trains the seeds that are busy: `process 12 on HOST`.
         """
-        task, busy = self.entry.task, self.plan.busy
+        task, busy = self.entry.task, self.missing.busy
         self.console.print(
             f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  "
-            f"({escape(str(self.plan.store.path))})"
+            f"({escape(str(self.missing.store.path))})"
         )
         todo = sum(len(group.seeds) for group in self.groups)
         if busy:
@@ -269,7 +274,7 @@ class RunDisplay:
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
-        complete = len(self.plan.seeds) - len(busy) - todo
+        complete = len(self.missing.seeds) - len(busy) - todo
         places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
         parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
         parts += [f"{counted(complete, 'seed')} already there"] * bool(complete) + [
@@ -402,5 +407,5 @@ class RunDisplay:
         name = self.entry.task.name
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
             self.console.print(
-                f"next: {command(*arguments, runs=self.plan.runs)}", markup=False, soft_wrap=True
+                f"next: {command(*arguments, runs=self.missing.runs)}", markup=False, soft_wrap=True
             )

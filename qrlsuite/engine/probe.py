@@ -40,7 +40,7 @@ from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training.advance import pack, unpack
+from qrlsuite.training.remote_task import pack, unpack
 
 if TYPE_CHECKING:
     from qrlsuite.training.trainer import Trainer

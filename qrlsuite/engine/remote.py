@@ -34,7 +34,7 @@ from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.provenance import PACKAGES
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, json_line
-from qrlsuite.training.advance import MOST_BYTES, POLICY, pack, too_large, unpack, versions
+from qrlsuite.training.remote_task import MOST_BYTES, POLICY, pack, too_large, unpack, versions
 from qrlsuite.training.trackers import EventSink, asked
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.engine import execution
+from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.execution import Execution
 from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
 from qrlsuite.results.text import counted, hours_range, hours_text, steps_text
@@ -174,7 +174,7 @@ class StudyOutcome(Shown):
 
 def run(
     study: StudyWithLooks,
-    chosen_execution: Execution,
+    where: Where,
     quiet: bool = False,
     again: Literal["command", "call"] = "command",
     looked: Callable[[StudyOutcome], None] | None = None,
@@ -183,7 +183,7 @@ def run(
 
     Parameters
     ----------
-    chosen_execution:
+    where:
         The engine.
     quiet, again:
         As for `RunDisplay`.
@@ -197,20 +197,16 @@ def run(
     KeyboardInterrupt
         When it was interrupted and every worker has saved and ended.
     """
-    execution.require_same_code(study.folder, list(study.entries.values()), chosen_execution)
+    missing.require_same_code(study.folder, list(study.entries.values()), where)
     study.begin()
     submitted: list[str] = []
     decision = study.look()
     while wanted := study.wanted(decision):
         for name, seeds in wanted.items():
-            work = execution.plan(
-                study.folder, study.entries[name], chosen_execution, seeds, study.file.epochs
-            )
+            work = missing.find(study.folder, study.entries[name], where, seeds, study.file.epochs)
             if not work.groups and not work.busy:
                 continue
-            outcome = execution.train(
-                work, chosen_execution, RunDisplay(work, chosen_execution.workers, quiet, again)
-            )
+            outcome = missing.train(work, where, RunDisplay(work, where.workers, quiet, again))
             submitted += [outcome.submitted] if outcome.submitted is not None else []
         decision = study.look()
         if study.missing(decision) and study.wanted(decision) == wanted:

@@ -14,10 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry
-from qrlsuite.engine.api import EngineOutcome
+from qrlsuite.engine.api import EngineOutcome, Missing
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.execution import Execution, Plan, plan, train
+from qrlsuite.engine.missing import find, train
 from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
@@ -35,48 +36,48 @@ class PendingEntry:
         The study's groups that it belongs to.
     """
 
-    plan: Plan
+    missing: Missing
     groups: tuple[str, ...]
     estimate: Estimate
 
     @property
     def finished(self) -> int:
         """Number of finished seeds."""
-        return len(self.plan.seeds) - len(self.plan.missing) - len(self.plan.busy)
+        return len(self.missing.seeds) - len(self.missing.todo) - len(self.missing.busy)
 
     @property
     def seconds(self) -> float | None:
         """Core-seconds left, None where unknown."""
-        if not self.plan.groups:
+        if not self.missing.groups:
             return 0.0
         if self.estimate.seconds is None:
             return None
-        return self.plan.left * self.estimate.seconds
+        return self.missing.left * self.estimate.seconds
 
     @property
     def complete(self) -> bool:
         """Whether all of its seeds are finished."""
-        return self.finished == len(self.plan.seeds)
+        return self.finished == len(self.missing.seeds)
 
     @property
     def range(self) -> tuple[float, float] | None:
         """The least and the most core-seconds left, None where unknown."""
-        return self.estimate.range(self.plan.left) if self.plan.groups else (0.0, 0.0)
+        return self.estimate.range(self.missing.left) if self.missing.groups else (0.0, 0.0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
-        entry = self.plan.entry
+        entry = self.missing.entry
         return {
             "task": entry.task.name,
             "entry": entry.name,
             "label": entry.label,
             "groups": list(self.groups),
-            "folder": str(self.plan.store.path),
-            "seeds": len(self.plan.seeds),
+            "folder": str(self.missing.store.path),
+            "seeds": len(self.missing.seeds),
             "finished": self.finished,
-            "busy": len(self.plan.busy),
-            "missing": len(self.plan.missing),
-            "epochs": self.plan.epochs,
+            "busy": len(self.missing.busy),
+            "missing": len(self.missing.todo),
+            "epochs": self.missing.epochs,
             "seconds_per_seed_epoch": self.estimate.seconds,
             "basis": self.estimate.basis,
             "core_seconds_left": self.seconds,
@@ -107,7 +108,7 @@ class Overview(Shown):
             **self.study.file.model_dump(mode="json", exclude={"format_version", "entries", "pictures"}),
             "entries": [
                 item.as_dict()
-                | ({} if self.published is None else {"published": self.published[item.plan.entry.name]})
+                | ({} if self.published is None else {"published": self.published[item.missing.entry.name]})
                 for item in self.items
             ],
             "workers": self.workers,
@@ -126,7 +127,7 @@ class Overview(Shown):
         if file.reports:
             yield Text(f"Reported there: {file.reports}")
         yield self._table() if self.items else Text("nothing to train")
-        lacking = [item for item in self.items if item.plan.groups]
+        lacking = [item for item in self.items if item.missing.groups]
         if self.items and not lacking:
             yield Text("everything is there")
         elif self.items:
@@ -145,13 +146,13 @@ class Overview(Shown):
             table.add_column(column, justify="right" if number else "left", overflow="fold")
         for item in self.items:
             cost = item.seconds
-            busy = f" (+{len(item.plan.busy)} at work)" if item.plan.busy else ""
+            busy = f" (+{len(item.missing.busy)} at work)" if item.missing.busy else ""
             cells = (
-                item.plan.entry.task.name,
-                item.plan.entry.label,
-                f"{item.finished}/{len(item.plan.seeds)}{busy}",
-                *([] if self.published is None else [str(self.published[item.plan.entry.name] or "-")]),
-                str(item.plan.epochs),
+                item.missing.entry.task.name,
+                item.missing.entry.label,
+                f"{item.finished}/{len(item.missing.seeds)}{busy}",
+                *([] if self.published is None else [str(self.published[item.missing.entry.name] or "-")]),
+                str(item.missing.epochs),
                 "-" if cost == 0 else "?" if item.range is None else duration_range(*item.range),
                 "" if cost == 0 else item.estimate.basis,
             )
@@ -196,7 +197,7 @@ class Status(Shown):
         """Return how many entries and seeds of a study come with the suite; nothing where that is left out."""
         if self.published is None:
             return {}
-        counts = [self.published[item.plan.entry.name] for item in items]
+        counts = [self.published[item.missing.entry.name] for item in items]
         return {"published": sum(map(bool, counts)), "published_seeds": sum(counts)}
 
     def as_dict(self) -> dict[str, Any]:
@@ -207,7 +208,7 @@ class Status(Shown):
                     "name": study.name,
                     "entries": len(items),
                     "complete": sum(item.complete for item in items),
-                    "seeds": sum(len(item.plan.seeds) for item in items),
+                    "seeds": sum(len(item.missing.seeds) for item in items),
                     "finished": sum(item.finished for item in items),
                     **self._published(items),
                     "pairs": pairs,
@@ -224,7 +225,7 @@ class Status(Shown):
 
     def _once(self) -> list[PendingEntry]:
         """Return the entries of all studies, each once."""
-        return list({item.plan.store.path: item for _, items, _ in self.rows for item in items}.values())
+        return list({item.missing.store.path: item for _, items, _ in self.rows for item in items}.values())
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show a row per study, and the sum, in which an entry of several studies counts once."""
@@ -243,7 +244,7 @@ class Status(Shown):
             table.add_row(
                 study.name,
                 f"{sum(item.complete for item in items)} of {len(items)}" if items else "-",
-                f"{sum(item.finished for item in items)} of {sum(len(item.plan.seeds) for item in items)}"
+                f"{sum(item.finished for item in items)} of {sum(len(item.missing.seeds) for item in items)}"
                 if items
                 else "-",
                 *([] if self.published is None else [_seeds_of_entries(**self._published(items))]),
@@ -262,7 +263,7 @@ def _seeds_of_entries(published: int, published_seeds: int) -> str:
 
 
 def _hours_left(items: Sequence[PendingEntry]) -> str:
-    if not any(item.plan.groups for item in items):
+    if not any(item.missing.groups for item in items):
         return "-"
     low, high = _total(items)
     unknown = sum(item.seconds is None for item in items)
@@ -308,7 +309,7 @@ def _mentions(member: Member, word: str) -> bool:
 def survey(
     members: Sequence[Member],
     runs: Path,
-    execution: Execution,
+    where: Where,
     speeds: Speeds,
     seeds: Sequence[int] | None,
     epochs: int | None,
@@ -331,7 +332,7 @@ def survey(
     items = []
     unique = {(m.entry.task.name, m.entry.name): m.entry for m in members}
     for key, entry in unique.items():
-        work = plan(runs, entry, execution, seeds, epochs)
+        work = find(runs, entry, where, seeds, epochs)
         estimate = speeds.estimate(entry, work.together)
         items.append(PendingEntry(work, tuple(dict.fromkeys(groups[key])), estimate))
     return items
@@ -345,7 +346,7 @@ def work_left(items: Sequence[PendingEntry]) -> tuple[int, float]:
 
 def cheapest_first(items: Sequence[PendingEntry]) -> list[PendingEntry]:
     """Return the items that lack something: the least core-seconds first, then those of unknown cost."""
-    lacking = [item for item in items if item.plan.groups]
+    lacking = [item for item in items if item.missing.groups]
     return sorted(lacking, key=lambda item: (item.seconds is None, item.seconds or 0.0))
 
 
@@ -356,11 +357,11 @@ def fitting(item: PendingEntry, seconds: float, workers: int) -> list[int]:
     rest on a measurement. Where nothing is known at all, one seed per worker.
     """
     if item.estimate.seconds is None:
-        return item.plan.missing[:workers]
+        return item.missing.todo[:workers]
     useful = seconds if item.estimate.basis == "measured" else seconds / 2
     to_go = sorted(
-        ((item.plan.epochs - group.epoch) * item.estimate.seconds, seed)
-        for group in item.plan.groups
+        ((item.missing.epochs - group.epoch) * item.estimate.seconds, seed)
+        for group in item.missing.groups
         for seed in group.seeds
     )
     if to_go and to_go[0][0] <= seconds < 2 * to_go[0][0]:
@@ -385,10 +386,10 @@ def dry_run(items: Sequence[PendingEntry], budget: float | None, workers: int) -
     """
     steps, left = [], budget
     for item in cheapest_first(items):
-        chosen = item.plan.missing if left is None else fitting(item, left, workers)
+        chosen = item.missing.todo if left is None else fitting(item, left, workers)
         steps.append({**item.as_dict(), "would_train": len(chosen)})
         if left is not None and item.seconds is not None:
-            left -= item.seconds * len(chosen) / len(item.plan.missing) / workers
+            left -= item.seconds * len(chosen) / len(item.missing.todo) / workers
     return steps
 
 
@@ -404,16 +405,16 @@ def check_budget(items: Sequence[PendingEntry], budget: float, workers: int) -> 
     if not order or any(fitting(item, budget, workers) for item in order):
         return
     costs = [
-        ((item.plan.epochs - group.epoch) * item.estimate.seconds, item.plan.epochs - group.epoch, item)
+        ((item.missing.epochs - group.epoch) * item.estimate.seconds, item.missing.epochs - group.epoch, item)
         for item in order
-        for group in item.plan.groups
+        for group in item.missing.groups
         if item.estimate.seconds is not None
     ]
     least, epochs, item = min(costs, key=lambda cost: cost[0])
     span = duration_range(*(item.estimate.range(epochs) or (least, least)))
     raise OptionError(
-        f"--budget of {duration(budget)} cannot hold one group: a seed of '{item.plan.entry.label}' to epoch "
-        f"{item.plan.epochs} takes about {duration(least)} ({span}; {BASES[item.estimate.basis]}); "
+        f"--budget of {duration(budget)} cannot hold one group: a seed of '{item.missing.entry.label}' to epoch "
+        f"{item.missing.epochs} takes about {duration(least)} ({span}; {BASES[item.estimate.basis]}); "
         "give a longer budget, or fewer --epochs"
     )
 
@@ -423,7 +424,7 @@ class Session:
     """One run of a study: entries trained one after another, until nothing is missing or the budget is used up."""
 
     runs: Path
-    execution: Execution
+    where: Where
     speeds: Speeds
     budget: float | None = None
     quiet: bool = False
@@ -452,11 +453,11 @@ class Session:
         order = cheapest_first(items)
         for number, first in enumerate(order, start=1):
             item = first
-            while item.plan.groups:
-                chosen = item.plan.missing
+            while item.missing.groups:
+                chosen = item.missing.todo
                 if self.budget is not None:
                     left = self.budget - (self.clock() - self._began) - self._planned
-                    chosen = fitting(item, left, self.execution.workers) if left > 0 else []
+                    chosen = fitting(item, left, self.where.workers) if left > 0 else []
                 if not chosen:
                     left_over.append(item)
                     break
@@ -465,29 +466,29 @@ class Session:
 
     def _batch(self, item: PendingEntry, chosen: list[int], title: str) -> PendingEntry:
         """Train some seeds of an item; returns what is left of it."""
-        work = item.plan
-        complete = sorted(set(work.seeds) - set(work.missing) - set(work.busy))
-        part = plan(self.runs, work.entry, self.execution, sorted([*complete, *chosen]), work.epochs)
-        display = RunDisplay(part, self.execution.workers, self.quiet, self.again)
+        work = item.missing
+        complete = sorted(set(work.seeds) - set(work.todo) - set(work.busy))
+        part = find(self.runs, work.entry, self.where, sorted([*complete, *chosen]), work.epochs)
+        display = RunDisplay(part, self.where.workers, self.quiet, self.again)
         display.console.print(f"\n[bold]{title}[/bold]", end="  ")
-        outcome = train(part, self.execution, display)
+        outcome = train(part, self.where, display)
         return self._after(item, part, outcome)
 
-    def _after(self, item: PendingEntry, part: Plan, outcome: EngineOutcome) -> PendingEntry:
-        work = item.plan
+    def _after(self, item: PendingEntry, part: Missing, outcome: EngineOutcome) -> PendingEntry:
+        work = item.missing
         store = part.store
         if outcome.submitted is not None:
             self.submitted.append(outcome.submitted)
             if item.estimate.seconds is not None:
                 todo = sum(len(group.seeds) * (work.epochs - group.epoch) for group in part.groups)
-                self._planned += todo * item.estimate.seconds / self.execution.workers
-            untouched = sorted(set(work.missing) - set(part.missing))
-            rest = plan(self.runs, work.entry, self.execution, untouched, work.epochs)
+                self._planned += todo * item.estimate.seconds / self.where.workers
+            untouched = sorted(set(work.todo) - set(part.todo))
+            rest = find(self.runs, work.entry, self.where, untouched, work.epochs)
         else:
             self.speeds.note(store)
-            done = store.finished(part.missing, work.epochs)
+            done = store.finished(part.todo, work.epochs)
             self.trained += len(done)
-            stuck = set(part.missing) - done  # another process has them
+            stuck = set(part.todo) - done  # another process has them
             remaining = [seed for seed in work.seeds if seed not in stuck]
-            rest = plan(self.runs, work.entry, self.execution, remaining, work.epochs)
+            rest = find(self.runs, work.entry, self.where, remaining, work.epochs)
         return PendingEntry(rest, item.groups, self.speeds.estimate(work.entry, rest.together))

@@ -27,7 +27,7 @@ TASKS = ("first", "second", "third")
 def check(subject: Subject) -> list[Finding]:
     """Check an engine; nothing is trained, for that may cost a cluster's time.
 
-    An engine that has `connect` is sent three tasks, which `advance` refuses at once.
+    An engine that has `connect` is sent three tasks, which `work_on` refuses at once.
     """
     spec = subject.spec
     assert isinstance(spec, specs.EngineSpec)
@@ -48,7 +48,7 @@ def check(subject: Subject) -> list[Finding]:
         answers: list[tuple[str, Any]] = []
         rules.run(
             "answers",
-            "a task is answered by what `advance` returns",
+            "a task is answered by what `work_on` returns",
             lambda: _answers(engines[0], answers),
             subject.missing(),
         )
@@ -97,7 +97,7 @@ def _queued(engine: Any) -> None:
 def _answers(engine: Any, answers: list[tuple[str, Any]]) -> None:
     """Send tasks for a version that nobody has, and collect key and content of every answer."""
     from qrlsuite.errors import StoreError
-    from qrlsuite.training.advance import pack, unpack
+    from qrlsuite.training.remote_task import pack, unpack
 
     link = engine.connect(1, {})
     try:
@@ -112,12 +112,12 @@ def _answers(engine: Any, answers: list[tuple[str, Any]]) -> None:
             require(isinstance(content, bytes), f"it is {content!r} in the place of bytes")
             header, _ = unpack(content)
         except StoreError as error:
-            require(False, f"the answer to task '{key}' is not what `advance` returned: {error}")
+            require(False, f"the answer to task '{key}' is not what `work_on` returned: {error}")
         refused = "instead of 0" in str(header.get("refused"))
         require(
             refused and header.get("token") == key,
-            f"the answer to task '{key}' is {header}, and `advance` refuses it and names its token: are answers mixed "
-            "up, or not made by qrlsuite.training.advance.advance?",
+            f"the answer to task '{key}' is {header}, and `work_on` refuses it and names its token: are answers mixed "
+            "up, or not made by qrlsuite.training.remote_task.work_on?",
         )
 
 

@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 from rich.console import Console
 
+from qrlsuite.engine.api import Missing
 from qrlsuite.engine.display import Bar
-from qrlsuite.engine.execution import Execution, Plan
+from qrlsuite.engine.where import Where
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
@@ -32,15 +33,15 @@ class TuneDisplay:
     def __init__(
         self,
         searches: Sequence[Search],
-        execution: Execution,
+        where: Where,
         quiet: bool = False,
         again: Literal["command", "call"] = "command",
     ) -> None:
-        self.searches, self.execution, self.again = searches, execution, again
+        self.searches, self.where, self.again = searches, where, again
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
         self._began = time.monotonic()
-        self._plans: Sequence[Plan] = ()
+        self._works: Sequence[Missing] = ()
         self._done = self._trained = 0
         """Trials before those that are trained now; those among them that were trained here."""
 
@@ -60,7 +61,7 @@ class TuneDisplay:
             cost, basis = self._cost(search)
             bases.setdefault(basis)
             total = None if total is None or cost is None else (total[0] + cost[0], total[1] + cost[1])
-        cores = self.execution.workers
+        cores = self.where.workers
         if total is None:
             self.console.print("what it costs will be known after the first trial")
         else:
@@ -72,16 +73,16 @@ class TuneDisplay:
 
     def _cost(self, search: Search) -> tuple[tuple[float, float] | None, str]:
         """Return the least and the most core-seconds of a whole search, None where unknown, and what that rests on."""
-        runs = len(search.request.seeds) * (search.beside if self.execution.room > 1 else 1)
-        together = min(LARGEST_GROUP, math.ceil(runs / self.execution.workers))
+        runs = len(search.request.seeds) * (search.beside if self.where.room > 1 else 1)
+        together = min(LARGEST_GROUP, math.ceil(runs / self.where.workers))
         estimate = speed.known(search.runs, search.results).estimate(search.base, together)
         return estimate.range(search.runs_planned * search.epochs), speed.BASES[estimate.basis]
 
-    def begin_trials(self, plans: Sequence[Plan]) -> None:
+    def begin_trials(self, works: Sequence[Missing]) -> None:
         """Show that trials begin, of which some may have finished before."""
-        self._plans = ()
-        self._done = sum(search.asked for search in self.searches) - sum(bool(work.groups) for work in plans)
-        for work in plans:
+        self._works = ()
+        self._done = sum(search.asked for search in self.searches) - sum(bool(work.groups) for work in works)
+        for work in works:
             if work.busy:
                 self.console.print(
                     f"{work.entry.label}: {len(work.busy)} runs are left to another process or a queue",
@@ -89,19 +90,19 @@ class TuneDisplay:
                 )
         self.bar.start(sum(search.planned for search in self.searches), "tuning")
 
-    def training(self, plans: Sequence[Plan]) -> None:
+    def training(self, works: Sequence[Missing]) -> None:
         """Show that some of these trials are trained now, side by side."""
-        self._done += len(self._plans)
-        self._trained += len(self._plans)
-        self._plans = plans
+        self._done += len(self._works)
+        self._trained += len(self._works)
+        self._works = works
         self.update({})
 
     def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
         """Show where the trials at work stand."""
-        if not self.bar.shown or not self._plans:
+        if not self.bar.shown or not self._works:
             return
-        count, last = len(self._plans), self._plans[0].epochs
-        begun = min(group.epoch for work in self._plans for group in work.groups)
+        count, last = len(self._works), self._works[0].epochs
+        begun = min(group.epoch for work in self._works for group in work.groups)
         epochs = [int(state.get("epoch") or begun) for state in snapshot.values()] or [begun]
         numbers = f"trial {self._done + 1}" if count == 1 else f"trials {self._done + 1}-{self._done + count}"
         parts = [

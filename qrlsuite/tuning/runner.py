@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from qrlsuite.engine import api
-from qrlsuite.engine.execution import Execution, check_memory, plan, require_same_code
+from qrlsuite.engine import api, missing
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
@@ -56,7 +56,7 @@ def build(requests: Sequence[Request], runs: Path) -> list[Search]:
 def run(
     searches: Sequence[Search],
     runs: Path,
-    execution: Execution,
+    where: Where,
     display: TuneDisplay,
     budget: float | None = None,
     out: Path | None = None,
@@ -84,7 +84,7 @@ def run(
         If a trial cannot be run.
     """
     try:
-        complete = _run(searches, runs, execution, display, budget)
+        complete = _run(searches, runs, where, display, budget)
     except KeyboardInterrupt:
         display.interrupted()
         raise
@@ -97,27 +97,27 @@ def run(
 
 
 def _run(
-    searches: Sequence[Search], runs: Path, execution: Execution, display: TuneDisplay, budget: float | None
+    searches: Sequence[Search], runs: Path, where: Where, display: TuneDisplay, budget: float | None
 ) -> bool:
     trained = 0
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
-        for line in require_same_code(runs / FOLDER, entries, execution):
+        for line in missing.require_same_code(runs / FOLDER, entries, where):
             display.console.print(line, markup=False, soft_wrap=True)
-        plans = [plan(runs / FOLDER, entry, execution, seeds, epochs) for entry in entries]
-        for work in plans:
-            check_memory(work, execution)
+        works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
+        for work in works:
+            missing.check_memory(work, where)
             codes.prepare(EntryStore.create(work.runs, work.entry), identity.of(work.entry))
-            trained += len(work.missing)
-        display.begin_trials(plans)
-        for together in execution.divide(plans):
+            trained += len(work.todo)
+        display.begin_trials(works)
+        for together in where.divide(works):
             display.training(together)
-            outcome = execution.run_together(together, display.update)
+            outcome = where.run_together(together, display.update)
             api.raise_failures(outcome)
             if outcome.submitted is not None:
                 display.console.print(outcome.submitted, markup=False)
-        return [work.store for work in plans]
+        return [work.store for work in works]
 
     began = time.monotonic()
     pace: dict[int, float] = {}  # seconds per run of each search
@@ -131,7 +131,7 @@ def _run(
             most = int(left / one_each) if one_each else 1
         for i, search in turn:
             started, before = time.monotonic(), trained
-            room = max(1, execution.room // search.next_seeds)
+            room = max(1, where.room // search.next_seeds)
             for trial in search.step(train, room if most is None else min(room, most)):
                 display.told(search, trial)
             if trained > before:

@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
+from qrlsuite.engine.api import Missing
 from qrlsuite.engine.display import CostEstimate, RunDisplay
-from qrlsuite.engine.execution import Plan, summarize
+from qrlsuite.engine.missing import summarize
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import Progress, ProgressFile
@@ -40,7 +41,7 @@ def test_a_narrow_terminal_shows_fewer_columns_and_says_which(columns: int, left
 
 def test_seeds_of_a_longer_run_take_no_time_in_a_shorter_one(entry: Entry, tmp_path: Path) -> None:
     groups = [SeedGroup((0, 1), 8), SeedGroup((2,), 3)]
-    assert Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 5, groups=groups).left == 2
+    assert Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 5, groups=groups).left == 2
 
 
 def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, monkeypatch) -> None:
@@ -49,7 +50,7 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
     store = EntryStore(path)
     snapshot = {group.id: ProgressFile(store, group.id).read() for group in PAIR}
     monkeypatch.setattr("qrlsuite.engine.display.PLAIN_SECONDS", 0.0)
-    plan = Plan(path.parents[1], entry, store, range(5), 3, groups=PAIR)
+    plan = Missing(path.parents[1], entry, store, range(5), 3, groups=PAIR)
     RunDisplay(plan, 2).update(snapshot)
     shown = re.search(r"median score (\S+)", capsys.readouterr().err)
     expected = summarize(plan)["median_score"]
@@ -66,7 +67,7 @@ def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    plan = Plan(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
+    plan = Missing(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
     RunDisplay(plan, 1, again=again).out_of_time(1.5)
     message = capsys.readouterr().err
     assert "stopped after 1.5 min, at epoch 0 of 3" in message
@@ -92,7 +93,7 @@ def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys,
     """PPO plays all rounds in a second and learns for the rest of the epoch, which tells nothing of a round."""
     clock = [1000.0]
     monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
-    display = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 500, groups=PAIR[:1]), 1)
+    display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 500, groups=PAIR[:1]), 1)
     for _ in range(25):
         display.update({PAIR[0].id: {"phase": "training", "epoch": 0, "done": 200, "total": 200}})
         clock[0] += 1.0
@@ -121,7 +122,7 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
     """Its first update takes 100 seconds: after 20 what that means is said, with what is faster."""
     clock = [1000.0]
     monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
-    display = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10, groups=PAIR[:1]), 1)
+    display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 10, groups=PAIR[:1]), 1)
     state = {"phase": "training", "epoch": 0, "done": 16, "total": 200}
     for _ in range(25):
         display.update({PAIR[0].id: state})
@@ -132,7 +133,7 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
     )
     assert "faster: " in shown
     assert not display.endless
-    late = RunDisplay(Plan(tmp_path, entry, EntryStore(tmp_path), range(3), 10_000, groups=PAIR[:1]), 1)
+    late = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 10_000, groups=PAIR[:1]), 1)
     for _ in range(25):
         late.update({PAIR[0].id: state})
         clock[0] += 1.0
@@ -141,7 +142,7 @@ def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsy
 
 @pytest.mark.parametrize("submits", [False, True])
 def test_what_is_submitted_cannot_be_stopped_by_ctrl_c(entry, tmp_path, capsys, submits) -> None:
-    plan = Plan(tmp_path, entry, EntryStore(tmp_path), range(7), 3, frozenset({5, 6}), PAIR)
+    plan = Missing(tmp_path, entry, EntryStore(tmp_path), range(7), 3, frozenset({5, 6}), PAIR)
     display = RunDisplay(plan, 2)
     display.begin(submits)
     display.close()
@@ -160,7 +161,7 @@ def test_the_end_says_that_no_threshold_was_reached(
     lowered = task.read_text().replace("epsilons = [0.6, 0.8]", f"epsilons = {epsilons}")
     task.write_text(lowered.replace("epsilon = 0.6", f"epsilon = {epsilons[1:].partition(',')[0]}"))
     entry = resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
-    plan = Plan(path.parents[1], entry, EntryStore(path), range(3), 3, groups=PAIR[:1])
+    plan = Missing(path.parents[1], entry, EntryStore(path), range(3), 3, groups=PAIR[:1])
     summary = summarize(plan)
     assert summary["threshold_reached"] is not said
     RunDisplay(plan, 1).finished(summary)

@@ -19,7 +19,7 @@ from qrlsuite import registry
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
-from qrlsuite.engine.execution import Execution
+from qrlsuite.engine.where import Where
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import task
@@ -356,7 +356,7 @@ def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp
 
 def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[PendingEntry]:
     study = parse(Path(widths).read_text(), "widths.toml")
-    return survey(study.members(), tmp_path / "runs", Execution(Here(), 2), speeds, range(4), 10)
+    return survey(study.members(), tmp_path / "runs", Where(Here(), 2), speeds, range(4), 10)
 
 
 def speeds(mlp: float | None, vqc: float | None) -> Speeds:
@@ -366,10 +366,10 @@ def speeds(mlp: float | None, vqc: float | None) -> Speeds:
 
 def test_the_cheapest_entry_is_first_and_the_unknown_last(widths: str, tmp_path: Path) -> None:
     order = cheapest_first(items(widths, tmp_path, speeds(2.0, 1.0)))
-    assert [item.plan.entry.model.name for item in order] == ["vqc-native", "mlp", "mlp"]
+    assert [item.missing.entry.model.name for item in order] == ["vqc-native", "mlp", "mlp"]
     assert [item.seconds for item in order] == [40.0, 80.0, 80.0]
     order = cheapest_first(items(widths, tmp_path, speeds(2.0, None)))
-    assert [item.plan.entry.model.name for item in order] == ["mlp", "mlp", "vqc-native"]
+    assert [item.missing.entry.model.name for item in order] == ["mlp", "mlp", "vqc-native"]
 
 
 def test_what_fits_into_a_budget(widths: str, tmp_path: Path) -> None:
@@ -380,13 +380,13 @@ def test_what_fits_into_a_budget(widths: str, tmp_path: Path) -> None:
     assert fitting(item, 10, 2) == [0, 1], "half of it would hold nothing"
     assert fitting(item, 28, 2) == [0, 1], "half of it is planned for"
     assert fitting(item, 40, 2) == [0, 1, 2, 3]
-    measured = PendingEntry(item.plan, item.groups, speed.Estimate(1.0, "measured"))
+    measured = PendingEntry(item.missing, item.groups, speed.Estimate(1.0, "measured"))
     assert fitting(measured, 10, 2) == [0, 1]
     assert fitting(measured, 15, 2) == [0, 1, 2], (
         "as many core-seconds as two workers have, if no seed is too long"
     )
     assert fitting(measured, 20, 2) == [0, 1, 2, 3]
-    unknown = PendingEntry(item.plan, item.groups, speed.Estimate(None, "unknown"))
+    unknown = PendingEntry(item.missing, item.groups, speed.Estimate(None, "unknown"))
     assert fitting(unknown, 1, 2) == [0, 1], "one seed per worker, to learn what it costs"
 
 
@@ -414,7 +414,7 @@ def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -
     known = speeds(0.1, 0.2)
     session = Session(
         tmp_path / "runs",
-        Execution(Here(), 1),
+        Where(Here(), 1),
         known,
         budget=100,
         quiet=True,
@@ -424,7 +424,7 @@ def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -
     assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))], (
         "the second look at the clock is past the budget"
     )
-    assert [(item.plan.entry.label, len(item.plan.missing)) for item in left] == [
+    assert [(item.missing.entry.label, len(item.missing.todo)) for item in left] == [
         ("ddqn mlp width=4", 4),
         ("ddqn vqc-native qubits=2 layers=1", 4),
     ]
@@ -510,14 +510,14 @@ def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("two_studies")
 def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
     ticks = iter(range(0, 10_000, 60))
-    execution, known = Execution(Here(), 1), speeds(0.1, 0.2)
+    where, known = Where(Here(), 1), speeds(0.1, 0.2)
     session = Session(
-        tmp_path / "runs", execution, known, budget=100, quiet=True, clock=lambda: float(next(ticks))
+        tmp_path / "runs", where, known, budget=100, quiet=True, clock=lambda: float(next(ticks))
     )
     for path in ("without-circuit.toml", "widths.toml"):
         left = session.run(items(str(tmp_path / path), tmp_path, known))
     assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))]
-    assert [item.plan.entry.label for item in left] == [
+    assert [item.missing.entry.label for item in left] == [
         "ddqn mlp width=4",
         "ddqn vqc-native qubits=2 layers=1",
     ]

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from qrlsuite import api
-from qrlsuite.engine import execution
 from qrlsuite.engine.display import Bar
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
 from qrlsuite.results.seeds import read_seeds
 from tests.commands import qrlsuite as command
@@ -138,7 +138,7 @@ def test_running_a_study(tiny_task: str, tmp_path: Path) -> None:
         str(path), only="width=8", seeds=2, epochs=1, workers=1, runs=tmp_path / "runs", progress=False
     )
     assert only.trained == 0
-    assert [item.plan.entry.label for item in only.overview.items] == ["ddqn mlp width=8 depth=1"]
+    assert [item.missing.entry.label for item in only.overview.items] == ["ddqn mlp width=8 depth=1"]
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_bad_input_of_the_others(tiny_task: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="minutes = 0"):
         api.run_study("fig6", minutes=0, runs=tmp_path)
     with pytest.raises(OptionError, match="an engine that is built already"):
-        api.train(tiny_task, "mlp", engine=execution.create(), workers=2, runs=tmp_path)
+        api.train(tiny_task, "mlp", engine=Where.create(), workers=2, runs=tmp_path)
     assert list(tmp_path.iterdir()) == [Path(tiny_task)]
 
 

@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 
 from qrlsuite import registry
-from qrlsuite.engine import execution
+from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment import identity, source
 from qrlsuite.experiment.entry import Entry, resolve
@@ -26,7 +27,7 @@ from qrlsuite.options import parse_setting
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, read_json, write_json
-from qrlsuite.training.advance import advance, pack, unpack
+from qrlsuite.training.remote_task import pack, unpack, work_on
 from tests.commands import qrlsuite, start_worker
 from tests.conftest import TINY, install, installed
 
@@ -525,9 +526,9 @@ def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> 
         "versions": {},
     }
     task |= {"entry": entry.record(), "code": [{**parts[0], "numerics": 2}, *parts[1:]]}
-    answer, _ = unpack(advance(pack(task, {})))
+    answer, _ = unpack(work_on(pack(task, {})))
     assert answer["refused"].endswith("has other code: environment 'beam6g' has numerics 1, and had 2")
-    answer, _ = unpack(advance(pack({**task, "code": parts}, {})))
+    answer, _ = unpack(work_on(pack({**task, "code": parts}, {})))
     assert answer["refused"] is None
     assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
 
@@ -540,12 +541,12 @@ def test_what_somebody_trains_is_not_begun_with_other_code(
     codes.prepare(store, identity.of(entry))
     claim = acquire(store, [0])  # of a seed that is being built, and has no record yet
     with_numerics(monkeypatch, "models", "mlp", 2)
-    here = execution.create(workers=1)
-    work = execution.plan(runs, entry, here, [0, 1], 1)
+    here = Where.create(workers=1)
+    work = missing.find(runs, entry, here, [0, 1], 1)
     with pytest.raises(
         StoreError, match="than the machine that started it: model 'mlp' has numerics 2, and had 1"
     ):
-        execution.train(work, here, RunDisplay(work, 1, quiet=True))
+        missing.train(work, here, RunDisplay(work, 1, quiet=True))
     claim.release()
     assert not store.seeds()
 
@@ -557,8 +558,8 @@ def test_all_entries_are_looked_at_before_one_is_trained(
     with_numerics(monkeypatch, "models", "mlp", 2)
     entries = [tiny(tiny_task, "width=8"), tiny(tiny_task, "width=16")]
     with pytest.raises(StoreError, match="model 'mlp' has numerics 2, and had 1"):
-        execution.require_same_code(tmp_path / "runs", entries, execution.create())
-    moved = execution.require_same_code(tmp_path / "runs", entries, replace(execution.create(), fresh=True))
+        missing.require_same_code(tmp_path / "runs", entries, Where.create())
+    moved = missing.require_same_code(tmp_path / "runs", entries, replace(Where.create(), fresh=True))
     assert len(moved) == 1
 
 

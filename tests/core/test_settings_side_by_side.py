@@ -17,7 +17,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from qrlsuite import population
-from qrlsuite.engine import execution, local, worker
+from qrlsuite.engine import local, missing, where, worker
 from qrlsuite.engine.display import Bar
 from qrlsuite.errors import PluginError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
@@ -194,15 +194,15 @@ def test_options_per_agent_become_tensors() -> None:
         population.joined([Gained(decay=0.5), Gained(decay=2)])
 
 
-def plans(folder: Path, chosen: Sequence[Entry], seeds: Sequence[int], by: execution.Execution) -> Any:
-    return [execution.plan(folder, entry, by, seeds, 1) for entry in chosen]
+def plans(folder: Path, chosen: Sequence[Entry], seeds: Sequence[int], by: where.Where) -> Any:
+    return [missing.find(folder, entry, by, seeds, 1) for entry in chosen]
 
 
 def test_plans_are_divided_among_workers_and_into_memory(
     tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def divided(workers: int) -> list[tuple[int, list[int]]]:
-        by = execution.Execution(local.LocalEngine(), workers)
+        by = where.Where(local.LocalEngine(), workers)
         (alike,) = by.divide(plans(tmp_path, entries(tiny_task), [0, 1, 2, 3], by))
         return [
             (1 + len(work.others), [len(g.seeds) for g in work.groups]) for work in by._populations(alike)
@@ -212,16 +212,16 @@ def test_plans_are_divided_among_workers_and_into_memory(
     assert divided(2) == [(3, [2, 2])]
     assert divided(8) == [(1, [1] * 4), (2, [1] * 4)], "entries are divided where seeds are too few"
     with monkeypatch.context() as patch:
-        patch.setattr(execution, "LARGEST_GROUP", 8)
+        patch.setattr(where, "LARGEST_GROUP", 8)
         assert divided(1) == [(1, [4]), (2, [4])]
-    one = execution.memory.group_bytes(entries(tiny_task)[0], 4)
-    monkeypatch.setattr(execution.memory, "available", lambda: one)
+    one = where.memory.group_bytes(entries(tiny_task)[0], 4)
+    monkeypatch.setattr(where.memory, "available", lambda: one)
     assert divided(1) == [(1, [4])] * 3
 
 
 def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Path) -> None:
     """An option without the mark, an entry that another process trains, and any other engine."""
-    by = execution.Execution(local.LocalEngine(), 1)
+    by = where.Where(local.LocalEngine(), 1)
     alike = entries(tiny_task)
     other = resolve(tiny_task, "mlp", settings=[*map(parse_setting, NETWORK), parse_setting("gamma=.5")])
     stores(tmp_path, alike)
@@ -229,7 +229,7 @@ def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Pa
     lists = by.divide(plans(tmp_path, [*alike, other], [0, 1], by))
     claim.release()
     assert [[plan.entry for plan in each] for each in lists] == [[alike[0], alike[2]], [alike[1]], [other]]
-    elsewhere = execution.create("command", 1, {"template": "{command}"})
+    elsewhere = where.Where.create("command", 1, {"template": "{command}"})
     lists = elsewhere.divide(plans(tmp_path, alike, [0, 1], elsewhere))
     assert (len(lists), elsewhere.room) == (3, 1)
 
@@ -269,7 +269,7 @@ def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -
 
 
 def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp_path: Path) -> None:
-    by = execution.Execution(local.LocalEngine(), 1)
+    by = where.Where(local.LocalEngine(), 1)
     found = halving(tiny_task, tmp_path)
     shown = io.StringIO()
     display = TuneDisplay([found], by)
@@ -277,7 +277,7 @@ def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp
     display.bar = Bar(display.console)
 
     def train(chosen: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
-        begun = [execution.plan(found.runs, entry, by, seeds, epochs) for entry in chosen]
+        begun = [missing.find(found.runs, entry, by, seeds, epochs) for entry in chosen]
         display.begin_trials(begun)
         display.training(begun)
         raise KeyboardInterrupt
@@ -303,7 +303,7 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
     finish(in_turn)
     expected = preset(in_turn)
 
-    by = execution.Execution(local.LocalEngine(), 1)
+    by = where.Where(local.LocalEngine(), 1)
     for name, begun in (("straight", 0), ("begun", 2)):
         if begun:
             with pytest.raises(KeyboardInterrupt):

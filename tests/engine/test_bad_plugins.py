@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.engine.probe import Side, difference
-from qrlsuite.training.advance import unpack
+from qrlsuite.training.remote_task import unpack
 from tests.conftest import HANGS, TINY, install, installed
 
 PLUGIN = """
@@ -75,7 +75,7 @@ from pathlib import Path
 from qrlsuite.engine.probe import train
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.training.advance import pack
+from qrlsuite.training.remote_task import pack
 out, seeds, cases = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 for name, (task, model) in cases.items():
     header, arrays = {"error": None}, {}

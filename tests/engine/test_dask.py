@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import __version__, api
-from qrlsuite.engine import execution
 from qrlsuite.engine.dask import DaskEngine, DaskLink, DaskOptions
 from qrlsuite.engine.status import survey
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
 from tests.commands import Command, qrlsuite, start
@@ -155,7 +155,7 @@ def test_over_tls_from_python(
     with Cluster(tmp_path / "cluster", variables, "tls") as cluster, dask.config.set(tls):
         assert cluster.address.startswith("tls://127.0.0.1:")
         cluster.add(variables)
-        engine = execution.create("dask", 2, {"scheduler": cluster.address})
+        engine = Where.create("dask", 2, {"scheduler": cluster.address})
         done = api.train(
             str(task), "mlp", options={"width": 16}, seeds=2, epochs=2, engine=engine, runs=tmp_path / "runs"
         )

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite.engine import api, execution, remote
+from qrlsuite.engine import api, missing, remote
 from qrlsuite.engine.api import Answer, EngineOutcome, Link
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import collect
@@ -26,8 +27,8 @@ from qrlsuite.results import checkpoint, claims
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, read_lines
-from qrlsuite.training import advance as advancing
-from qrlsuite.training.advance import advance, pack, unpack
+from qrlsuite.training import remote_task
+from qrlsuite.training.remote_task import pack, unpack, work_on
 from tests.conftest import results
 
 EPOCHS = 4
@@ -75,7 +76,7 @@ class Here:
         return self.answers(key, task)
 
     def answers(self, key: str, task: bytes) -> list[Answer]:
-        return [Answer(key, advance(task))]
+        return [Answer(key, work_on(task))]
 
     def close(self) -> None:
         self.closed = True
@@ -136,7 +137,7 @@ class Strange(Here):
         )
 
     def answers(self, key: str, task: bytes) -> list[Answer]:
-        content = advance(task)
+        content = work_on(task)
         changes = next(self.wrong, {})
         came = [*self.old, Answer(key, edited(content, **changes)), Answer(key, content)]
         self.old = [Answer(key, content), Answer("nobody's", content)]
@@ -278,7 +279,7 @@ def test_an_altered_answer_costs_its_group_and_the_entry_stays_readable(
 ) -> None:
     class Altering(Here):
         def answers(self, key: str, task: bytes) -> list[Answer]:
-            content = advance(task)
+            content = work_on(task)
             return [Answer(key, alter(content) if unpack(task)[0]["seeds"] == [0] else content)]
 
     (message,) = train(Altering(), store, [(0,), (1,)], 1).failed.values()
@@ -307,7 +308,7 @@ class Pair(Here):
         self.send(key, task, priority)
 
     def answers(self, key: str, task: bytes) -> list[Answer]:
-        content = advance(task)
+        content = work_on(task)
         return [Answer(key, self.change(content) if key in self.apart else content)]
 
 
@@ -409,7 +410,7 @@ def test_the_same_task_has_the_same_answer_times_aside(store: EntryStore) -> Non
 
     train(Watched(), store, [(0, 1)], 2)
     for task in tasks:
-        (first, one), (second, two) = (unpack(advance(task)) for _ in range(2))
+        (first, one), (second, two) = (unpack(work_on(task)) for _ in range(2))
         assert {**first, "timings": None} == {**second, "timings": None}
         assert one.keys() == two.keys()
         for name in one:
@@ -418,13 +419,13 @@ def test_the_same_task_has_the_same_answer_times_aside(store: EntryStore) -> Non
 
 def test_a_worker_of_other_versions_refuses_by_name() -> None:
     header, arrays = unpack(
-        advance(pack({"token": "t", "seeds": [0], "versions": {"torch": "1.0", "no-such": "2"}}, {}))
+        work_on(pack({"token": "t", "seeds": [0], "versions": {"torch": "1.0", "no-such": "2"}}, {}))
     )
     assert header["token"] == "t"
     assert header["refused"].startswith(f"{os.uname().nodename} has torch ")
     assert header["refused"].endswith(" instead of 1.0, no no-such")
     assert arrays == {}
-    assert unpack(advance(b"\x08\0\0\0\0\0\0\0{}"))[0]["refused"].startswith("this is no task: ")
+    assert unpack(work_on(b"\x08\0\0\0\0\0\0\0{}"))[0]["refused"].startswith("this is no task: ")
 
 
 def test_what_an_environment_raises_is_said_and_what_was_finished_before_stays(
@@ -455,13 +456,13 @@ def test_groups_are_small_enough_to_be_sent(
 ) -> None:
     fits = remote.seeds_per_task(entry)
     size = checkpoint_bytes(store)
-    assert fits == (advancing.MOST_BYTES - remote.HEADER_BYTES) // size
+    assert fits == (remote_task.MOST_BYTES - remote.HEADER_BYTES) // size
     limit = 2 * size + remote.HEADER_BYTES
-    for module in (advancing, remote):
+    for module in (remote_task, remote):
         monkeypatch.setattr(module, "MOST_BYTES", limit)
-    plan = execution.plan(tmp_path / "more", entry, execution.Execution(Here(), 1), list(range(5)), 2)
+    plan = missing.find(tmp_path / "more", entry, Where(Here(), 1), list(range(5)), 2)
     assert [group.seeds for group in plan.groups] == [(0,), (1, 2), (3, 4)]
-    for module in (advancing, remote):
+    for module in (remote_task, remote):
         monkeypatch.setattr(module, "MOST_BYTES", size + 10)
     with pytest.raises(OptionError, match=r"too large to be sent: \d+ MB for 1 seed, .*--engine local"):
         remote.seeds_per_task(entry)
@@ -485,7 +486,7 @@ def advance_error(store: EntryStore) -> str:
         "epochs": 1,
         "seconds": 0,
     }
-    answer, arrays = unpack(advance(pack({**header, "device": "cpu", "versions": {}}, {})))
+    answer, arrays = unpack(work_on(pack({**header, "device": "cpu", "versions": {}}, {})))
     assert (answer["epoch"], answer["lines"], arrays) == (0, [], {})
     return str(answer["error"])
 
@@ -555,7 +556,7 @@ def test_a_worker_keeps_freed_memory() -> None:
     program = """if True:
         import resource, sys, threading
         import numpy as np
-        from qrlsuite.training.advance import keep_freed_memory
+        from qrlsuite.training.remote_task import keep_freed_memory
         faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         def work():
             keep_freed_memory()

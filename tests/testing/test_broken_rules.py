@@ -14,7 +14,7 @@ from qrlsuite import hookimpl
 from qrlsuite.engine.api import Answer
 from qrlsuite.specs import EngineSpec, RuleSpec, Spec, TrackerSpec
 from qrlsuite.testing import check
-from qrlsuite.training.advance import advance
+from qrlsuite.training.remote_task import work_on
 from tests.testing.broken import Broken, assert_breaks, own_rules
 
 HERE = __name__
@@ -142,7 +142,7 @@ class GoodLink:
         self.tasks.append((key, task))
 
     def receive(self, seconds: float) -> list[Answer]:
-        answers = [Answer(key, advance(task)) for key, task in self.tasks]
+        answers = [Answer(key, work_on(task)) for key, task in self.tasks]
         self.tasks.clear()
         return answers
 
@@ -276,7 +276,7 @@ BROKEN = [
     ("engines", "workers", Broken(engine("Idle"), r"workers\(None\) returned 0, and must return how many")),
     ("engines", "methods", Broken(engine("ShortConnect"), r"connect\(workers, versions\) cannot be called")),
     ("engines", "answers", Broken(engine("TextRemote"), r"in the place of bytes")),
-    ("engines", "answers", Broken(engine("CutRemote"), r"answer to task 'first' is not what `advance` returned")),
+    ("engines", "answers", Broken(engine("CutRemote"), r"answer to task 'first' is not what `work_on` returned")),
     ("engines", "answers", Broken(engine("EchoRemote"), r"are answers mixed up, or not made by qrlsuite.training")),
     ("engines", "answers", Broken(engine("MixingRemote"), r"answer to task 'first' is .*'token': 'third'")),
     ("engines", "once", Broken(engine("RepeatingRemote"), r"answers came to first, first, second, second, third")),

@@ -20,7 +20,7 @@ from qrlsuite.cli.training import (
     SameOption,
     TimeOption,
     WorkersOption,
-    execution_of,
+    where_of,
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
@@ -173,11 +173,11 @@ def run(
     Example: qrlsuite decide run width.toml --workers 8
     """
     study = _study(path, runs)
-    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device, same=same)
+    where = where_of(engine, workers, partition, time, engine_options, device, same=same)
     console = Console(stderr=True, quiet=json_output, highlight=False)
     try:
         outcome = outcomes.run(
-            study, chosen_execution, json_output, looked=lambda so_far: _say_look(so_far.decision, console)
+            study, where, json_output, looked=lambda so_far: _say_look(so_far.decision, console)
         )
     except KeyboardInterrupt:
         raise typer.Exit(130) from None

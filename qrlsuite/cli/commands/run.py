@@ -21,9 +21,9 @@ from qrlsuite.cli.training import (
     TimeOption,
     TrackOption,
     WorkersOption,
-    execution_of,
+    where_of,
 )
-from qrlsuite.engine import execution
+from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.experiment import entry as entries
 from qrlsuite.results.seeds import parse_seeds
@@ -114,22 +114,22 @@ def run(
         trackers.ask(track)
     seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
     last = epochs or (QUICK_EPOCHS if quick else None)
-    chosen_execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
-    execution.check_minutes(minutes, chosen_execution)
-    for line in execution.require_same_code(runs, [entry], chosen_execution):
+    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
+    missing.check_minutes(minutes, where)
+    for line in missing.require_same_code(runs, [entry], where):
         typer.echo(line, err=True)
-    work = execution.plan(runs, entry, chosen_execution, seed_numbers, last)
-    display = RunDisplay(work, chosen_execution.workers, quiet=json_output)
+    work = missing.find(runs, entry, where, seed_numbers, last)
+    display = RunDisplay(work, where.workers, quiet=json_output)
     if not json_output:
-        display.expected = execution.expected(work, chosen_execution)
+        display.expected = missing.expected(work, where)
     try:
-        outcome = execution.train(work, chosen_execution, display, minutes, confirmed=yes)
+        outcome = missing.train(work, where, display, minutes, confirmed=yes)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     if outcome.submitted is not None:
         typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
         return
-    summary = execution.summarize(work)
+    summary = missing.summarize(work)
     if json_output:
         typer.echo(json.dumps(summary))
     else:

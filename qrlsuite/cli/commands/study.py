@@ -20,10 +20,10 @@ from qrlsuite.cli.training import (
     SameOption,
     TimeOption,
     WorkersOption,
-    execution_of,
     seconds,
+    where_of,
 )
-from qrlsuite.engine.execution import require_same_code
+from qrlsuite.engine.missing import require_same_code
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
@@ -131,12 +131,12 @@ def show(
 
     Example: qrlsuite study show fig7 --published
     """
-    execution = execution_of(engine, workers)
+    where = where_of(engine, workers)
     study, members = _members(name, settings, models, only)
     seed_numbers = None if seeds is None else parse_seeds(seeds)
-    items = runner.survey(members, runs, execution, speed.known(runs), seed_numbers, epochs)
+    items = runner.survey(members, runs, where, speed.known(runs), seed_numbers, epochs)
     counts = studies.published_seeds(items) if published else None
-    overview = runner.Overview(study, items, execution.workers, counts)
+    overview = runner.Overview(study, items, where.workers, counts)
     if json_output:
         typer.echo(json.dumps(overview.as_dict()))
     else:
@@ -160,18 +160,18 @@ def status(
 
     Example: qrlsuite study status --published
     """
-    execution = execution_of(engine, workers)
+    where = where_of(engine, workers)
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
     rows = []
     for name in names or registry.load().names("studies"):
         study = _load(name)
         members = study.members()
-        items = runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
+        items = runner.survey(members, runs, where, speeds, seed_numbers, epochs)
         rows.append((study, items, studies.decided_pairs(studies.read(runs, members, published).values())))
     every = [item for _, items, _ in rows for item in items]
     counts = studies.published_seeds(every) if published else None
-    overview = runner.Status(rows, execution.workers, counts)
+    overview = runner.Status(rows, where.workers, counts)
     if json_output:
         typer.echo(json.dumps(overview.as_dict()))
     else:
@@ -216,27 +216,27 @@ def run(
     Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run all --budget 8h
     """
     _check_format(format_)
-    execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
+    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
     limit = seconds(budget) if budget is not None else None
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
     chosen = _chosen(name, settings, models, only)
 
     def items_of(members: Sequence[Member]) -> list[runner.PendingEntry]:
-        return runner.survey(members, runs, execution, speeds, seed_numbers, epochs)
+        return runner.survey(members, runs, where, speeds, seed_numbers, epochs)
 
     if len(chosen) > 1:
         chosen.sort(key=lambda pair: runner.work_left(items_of(pair[1])))
     everyone = [member for _, members in chosen for member in members]
     every = items_of(everyone)
     if limit is not None:
-        runner.check_budget(every, limit, execution.workers)
+        runner.check_budget(every, limit, where.workers)
     if dry_run:
-        _dry_run(name, runner.dry_run(every, limit, execution.workers), json_output)
+        _dry_run(name, runner.dry_run(every, limit, where.workers), json_output)
         return
-    for line in require_same_code(runs, [member.entry for member in everyone], execution):
+    for line in require_same_code(runs, [member.entry for member in everyone], where):
         typer.echo(line, err=True)
-    session = runner.Session(runs, execution, speeds, limit, quiet=json_output)
+    session = runner.Session(runs, where, speeds, limit, quiet=json_output)
     results = []
     for study, members in chosen:
         if len(chosen) > 1 and not json_output:
@@ -252,7 +252,7 @@ def run(
         if not json_output:
             _say(drawn)
             continue
-        content = runner.Overview(study, items_of(members), execution.workers).as_dict()
+        content = runner.Overview(study, items_of(members), where.workers).as_dict()
         content |= {"trained": session.trained - trained, "submitted": session.submitted[submitted:]}
         results.append(content | {"pictures": [each.as_dict() for each in drawn]})
     if json_output:
@@ -263,7 +263,8 @@ def run(
     left_over = runner.cheapest_first(items_of(everyone)) if limit is not None else []
     if left_over and not session.submitted:
         unfinished = ", ".join(
-            f"{item.plan.entry.label} ({counted(len(item.plan.missing), 'seed')})" for item in left_over[:4]
+            f"{item.missing.entry.label} ({counted(len(item.missing.todo), 'seed')})"
+            for item in left_over[:4]
         )
         more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
         typer.echo(f"the budget is used up; left: {unfinished}{more}. The same command continues.")

@@ -21,8 +21,8 @@ from qrlsuite.cli.training import (
     SameOption,
     TimeOption,
     WorkersOption,
-    execution_of,
     seconds,
+    where_of,
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
@@ -184,8 +184,8 @@ def tune(
         objective=objective.value,
     )
     searches = runner.build(search.for_each_model(shared, models), runs)
-    execution = execution_of(engine, workers, partition, time, engine_options, device, fresh, same)
-    display = TuneDisplay(searches, execution, quiet=json_output)
+    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
+    display = TuneDisplay(searches, where, quiet=json_output)
     display.begin()
     if dry_run:
         if json_output:
@@ -195,7 +195,7 @@ def tune(
     if not yes and limit is None:
         _require_few(searches)
     try:
-        complete = runner.run(searches, runs, execution, display, limit, out)
+        complete = runner.run(searches, runs, where, display, limit, out)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     if json_output:

@@ -1,4 +1,4 @@
-"""Advances a group of seeds by a minute of training, from bytes to bytes: the work of engines without a shared folder.
+"""Trains a group of seeds for a minute, from bytes to bytes: the work of engines without a shared folder.
 
 A *task* and its *answer* are bytes: a safetensors file with the checkpoint, in whose metadata the rest stands as JSON.
 Nothing is read from or written to a disk, and the same task gives the same answer, times aside, however often and
@@ -103,7 +103,7 @@ def differing(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
     )
 
 
-def advance(task: bytes) -> bytes:
+def work_on(task: bytes) -> bytes:
     """Work on a task; returns the answer, and never raises what the training raises."""
     try:
         header, arrays = unpack(task)

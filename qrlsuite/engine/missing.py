@@ -1,0 +1,275 @@
+"""Finds the missing seeds of an entry, has them trained, reports the outcome.
+
+Everything that trains goes through here: `run`, `tune` and `study` on the command line, and `qrlsuite.api`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.engine import api, remote
+from qrlsuite.engine.api import EngineOutcome, Missing
+from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.terminal import printable
+from qrlsuite.engine.where import Where
+from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
+from qrlsuite.experiment import identity
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results import codes, probes, speed
+from qrlsuite.results.claims import certain, living
+from qrlsuite.results.progress import ProgressFile
+from qrlsuite.results.seeds import SeedGroup, plan_groups
+from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import duration_range
+from qrlsuite.statistics.curves import reached
+from qrlsuite.training import device as devices
+from qrlsuite.training import memory
+
+
+def find(
+    runs: Path,
+    entry: Entry,
+    where: Where,
+    seeds: Sequence[int] | None = None,
+    epochs: int | None = None,
+) -> Missing:
+    """Find out what of an entry is missing in a results folder; writes nothing.
+
+    Parameters
+    ----------
+    seeds, epochs:
+        None takes those of the task's protocol.
+
+    Raises
+    ------
+    StoreError
+        If the entry's folder is damaged, or belongs to another entry.
+    """
+    requested = list(range(entry.task.file.protocol.seeds)) if seeds is None else seeds
+    last = entry.task.epochs(entry.algorithm.name) if epochs is None else epochs
+    store = EntryStore.find(runs, entry)
+    busy = {seed for claim in certain(store) for seed in claim.seeds} | where.engine.queued(store)
+    busy &= set(requested)
+    left = sorted(set(requested) - busy)
+    missing = plan_groups(store, left, last, where.workers)
+    if missing and isinstance(where.engine, api.RemoteEngine):
+        missing = plan_groups(store, left, last, where.workers, remote.seeds_per_task(entry))
+    return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
+
+
+def require_same_code(runs: Path, entries: Sequence[Entry], where: Where) -> list[str]:
+    """Refuse entries of which another code has begun seeds: before they are planned, and anything is trained.
+
+    With `where.fresh`, such seeds are set aside; with `where.same`, the codes are declared to be the same.
+
+    Returns
+    -------
+    list of str
+        What was moved, one line each.
+
+    Raises
+    ------
+    StoreError
+        Saying what changed and the ways on, or why seeds cannot be set aside.
+    OptionError
+        If both ways are asked for, or the reason is none.
+    """
+    if where.fresh and where.same is not None:
+        raise OptionError(
+            "--fresh and --same: the old seeds are either set aside or continued; give one of them"
+        )
+    moved: list[str] = []
+    for entry in entries:
+        store, code = EntryStore.find(runs, entry), identity.of(entry)
+        if where.same is not None:
+            codes.declare_same(store, code, where.same)
+        elif where.fresh:
+            old, earlier = codes.set_aside(runs, store, code, where.engine.queued(store))
+            moved += [] if old is None else [f"the seeds of another code are now in {old}"]
+            moved += [] if earlier is None else [f"{earlier} has seeds of this code: they are continued"]
+        else:
+            codes.require(store, code)
+    return moved
+
+
+class _TimeIsUp(Exception):
+    """Ends an engine's work as Ctrl-C does."""
+
+
+def check_minutes(minutes: float | None, where: Where) -> None:
+    """Refuse a time limit that cannot be kept.
+
+    Raises
+    ------
+    OptionError
+        If it is no positive, finite number, or the engine hands its work to a queue.
+    """
+    if minutes is None:
+        return
+    if not 0 < minutes < float("inf"):
+        raise OptionError(f"--minutes {minutes:g}: give a time, for example --minutes 2 or --minutes 0.5")
+    if where.submits:
+        raise OptionError(
+            f"--minutes: engine '{where.name}' leaves its tasks in a queue; give --time instead"
+        )
+
+
+def train(
+    work: Missing,
+    where: Where,
+    display: RunDisplay,
+    minutes: float | None = None,
+    confirmed: bool = True,
+) -> EngineOutcome:
+    """Train what is planned, showing progress; returns how it ended.
+
+    Parameters
+    ----------
+    minutes:
+        After which training stops, with every finished epoch saved. None for no limit.
+    confirmed:
+        Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, when every worker has saved and ended.
+    QrlSuiteError
+        If a group failed; finished epochs are kept.
+    """
+    began = time.monotonic()
+
+    def show(snapshot: api.Snapshot) -> None:
+        display.update(snapshot)
+        if display.endless and not confirmed and minutes is None and display.console.is_terminal:
+            raise QrlSuiteError("stopped: this takes more than a day; --yes starts it anyway")
+        if minutes is not None and time.monotonic() - began >= 60 * minutes:
+            raise _TimeIsUp
+
+    display.deadline = None if minutes is None else began + 60 * minutes
+    code = identity.of(work.entry)
+    codes.require(work.store, code)
+    if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
+        codes.require_sent(work.store, code, socket.gethostname())
+    if not where.remote and work.groups:
+        _check_device(where.device)
+        check_memory(work, where)
+    fresh = not work.store.path.exists()
+    EntryStore.create(work.runs, work.entry)
+    if work.groups:
+        codes.prepare(work.store, code)
+    holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
+    display.begin(where.submits, holders)
+    if not work.groups:
+        return EngineOutcome()
+    try:
+        outcome = where.run(work, show)
+    except _TimeIsUp:
+        display.out_of_time(minutes or 0.0)
+        return EngineOutcome()
+    except KeyboardInterrupt:
+        display.interrupted()
+        raise
+    finally:
+        display.close()
+    if display.probing and (probe := _newest_probe(work)):
+        display.console.print(probe, markup=False, soft_wrap=True)
+    for message in sorted({m for group in work.groups for m in _warnings(work.store, group)}):
+        display.console.print(f"warning: {printable(message)}", markup=False, emoji=False, soft_wrap=True)
+    if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
+        _remove(work.store.path)
+        raise QrlSuiteError("; ".join(sorted(set(outcome.failed.values()))))
+    api.raise_failures(outcome)
+    for message in outcome.taken.values():
+        display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
+    return outcome
+
+
+def expected(work: Missing, where: Where) -> str | None:
+    """Say how long training should take, None where nothing is known before the first epoch."""
+    if not work.groups or where.remote or where.device != "cpu":
+        return None
+    try:
+        estimate = speed.known(work.runs).estimate(work.entry, work.together)
+    except TaskError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
+        return None
+    seconds = estimate.range(work.left / min(where.workers, len(work.groups)))
+    return seconds and f"it should take {duration_range(*seconds)} ({speed.BASES[estimate.basis]})"
+
+
+def check_memory(work: Missing, where: Where) -> None:
+    """Refuse what does not fit into this machine's memory; a GPU's and a cluster's are not known.
+
+    Raises
+    ------
+    OptionError
+        Saying how many seeds would fit.
+    """
+    if where.device == "cpu" and not where.remote:
+        groups = [group.seeds for group in work.groups]
+        memory.require(work.entry, groups, where.workers, memory.available())
+
+
+def summarize(work: Missing) -> dict[str, Any]:
+    """Return what a (partly) finished training amounts to by now, as plain values."""
+    store, epochs = work.store, work.epochs
+    curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
+    runs = [run for run in curves.values() if len(run.scores) >= epochs]
+    complete = [run.curve[:epochs] for run in runs]
+    grid = work.entry.task.file.ranking.grid
+    return {
+        "task": work.entry.task.name,
+        "entry": work.entry.name,
+        "label": work.entry.label,
+        "folder": str(store.path),
+        "seeds": len(complete),
+        "epochs": epochs,
+        "median_score": float(np.median([curve[-1] for curve in complete])) if complete else None,
+        "best_score": float(np.max(complete)) if complete else None,
+        "lowest_threshold": min(grid.thresholds),
+        "threshold_reached": bool(reached(np.stack(complete), grid).any()) if complete else None,
+        "diverged": sum(run.diverged is not None and run.diverged <= epochs for run in runs),
+    }
+
+
+def _check_device(name: str) -> None:
+    """Look whether there is such a device; torch is imported for a GPU only.
+
+    Raises
+    ------
+    OptionError
+        If this machine or this build of torch has none.
+    """
+    if name != "cpu":
+        devices.find(name)
+
+
+def _remove(folder: Path) -> None:
+    """Remove the folder of an entry of which nothing could be built, and those above it that are then empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
+
+
+def _newest_probe(work: Missing) -> str | None:
+    """Say what the probe of these seeds has found, and what it took; None where there is none."""
+    for seed in work.todo:
+        probe = probes.of_record(work.store.seed(seed).record() or {})
+        if probe and probe["result"] != probes.DIFFERS:
+            return probes.sentence(probe)
+    return None
+
+
+def _warnings(store: EntryStore, group: SeedGroup) -> list[str]:
+    """Return what a group's worker left for the user to know."""
+    left = ProgressFile(store, group.id).read().get("warnings")
+    return [str(message) for message in left] if isinstance(left, list) else []
