@@ -4,7 +4,7 @@
 
 What `qrlsuite calibrate` measures on one's own entries, here on the two networks whose curves the tests keep (30
 runs each of an MLP of width 64 and one of width 16), on the 49 cells of the surface grid; and besides, what few
-runs do to S_hat, what intervals of unequal numbers of runs would do, and a rule for a whole board. The tables of
+runs do to S_hat, what intervals of unequal numbers of runs would do. The tables of
 docs/statistics.md are its output.
 """
 
@@ -20,19 +20,16 @@ import numpy as np
 from qrlsuite.leaderboard import calibration
 from qrlsuite.leaderboard.findings import tables
 from qrlsuite.statistics import (
-    DifferenceRule,
     Grid,
     IntervalRule,
     LearningCurves,
     SmoothedRuns,
-    board_false_winners,
     bootstrap_interval,
     sample_complexity,
 )
 
 CURVES = Path(__file__).parents[1] / "tests" / "golden" / "statistics.json.gz"
-RULES = (IntervalRule(), DifferenceRule(n_resamples=1000))
-"""With 1000 resamples instead of 10,000: the rates are averages over pairs, and it is done in a tenth of the time."""
+RULES = (IntervalRule(),)
 
 
 def own_intervals(model: SmoothedRuns, n_first: int, n_second: int, grid: Grid, pairs: int) -> float:
@@ -109,13 +106,6 @@ def main() -> None:
             grid.size,
             board,
         )
-    print("\nrule difference with alpha = .05 / 45 pairs, 10,000 resamples, 40 boards of ten:")
-    for entry in entries:
-        strict = DifferenceRule(alpha=0.05 / 45)
-        model = SmoothedRuns(entry)
-        rate = board_false_winners(model, [100] * 10, grid, strict, 40)
-        print(f"{entry.name}: {rate:.1%}", flush=True)
-
     for n_runs in (20, 50, 100):
         jobs = calibration.plan(entries, grid, RULES, draws // 5, ["power"], [(n_runs, n_runs)])
         print_tables(jobs, grid.size, 0)

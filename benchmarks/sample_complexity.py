@@ -17,11 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from qrlsuite.statistics import (
-    DifferenceRule,
     Grid,
     IntervalRule,
     LearningCurves,
-    SignificanceRule,
     bootstrap_interval,
     outperformance,
 )
@@ -65,9 +63,9 @@ def median_seconds(repeats: int, *functions: Callable[[], object]) -> list[float
     return [statistics.median(taken) for taken in times]
 
 
-def board_seconds(entries: Sequence[LearningCurves], rule: SignificanceRule, repeats: int) -> float:
+def board_seconds(entries: Sequence[LearningCurves]) -> float:
     """Return the median time from curves to tiers."""
-    return median_seconds(repeats, lambda: outperformance(entries, GRID, rule).ranking)[0]
+    return median_seconds(3, lambda: outperformance(entries, GRID, IntervalRule()).ranking)[0]
 
 
 def main() -> None:
@@ -93,14 +91,12 @@ def main() -> None:
         LearningCurves(learning_curves(numbers[k % len(numbers)], k), STEPS, f"entry {k}")
         for k in range(size)
     ]
-    few = equal[: max(2, size // 10)]
     print("from curves to tiers")
-    for label, entries, rule, repeats in (
-        (f"{size} entries of 100 runs, intervals", equal, IntervalRule(), 3),
-        (f"{size} entries of 20 to 100 runs, intervals", mixed, IntervalRule(), 3),
-        (f"{len(few)} entries of 100 runs, difference", few, DifferenceRule(), 1),
+    for label, entries in (
+        (f"{size} entries of 100 runs, intervals", equal),
+        (f"{size} entries of 20 to 100 runs, intervals", mixed),
     ):
-        print(f"  {label:45} {board_seconds(entries, rule, repeats):8.2f} s")
+        print(f"  {label:45} {board_seconds(entries):8.2f} s")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
+from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard import rules, tables
 from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
@@ -407,8 +407,6 @@ def _section(
     shown: Callable[[EntryResults], bool] | None,
 ) -> Section:
     ranking = ranking_of(entries)
-    if getattr(rule, "paired", False):
-        _require_equal_seeds(entries, rule.name)
     board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
     by_name = {entry.name: entry for entry in entries}
     labels = {entry.name: entry.label for entry in entries}
@@ -490,17 +488,6 @@ def complexity_at(
     return Complexity(int(steps[0, 0]), low, high, bool(capped), bool(open_end))
 
 
-def _require_equal_seeds(entries: Sequence[EntryResults], rule: str) -> None:
-    """Raise OptionError unless all entries have the same seeds, as a paired rule presupposes."""
-    for entry in entries[1:]:
-        if entry.seeds != entries[0].seeds:
-            raise OptionError(
-                f"rule '{rule}' pairs runs of the same seed: '{entries[0].label}' ({len(entries[0].seeds)}) and "
-                f"'{entry.label}' ({len(entry.seeds)}) have different seeds; `qrlsuite compare` pairs those that "
-                "two entries share"
-            )
-
-
 def compare_entries(
     first: EntryResults, second: EntryResults, rule: SignificanceRule | None = None
 ) -> EntryComparison:
@@ -511,14 +498,12 @@ def compare_entries(
     first, second:
         The entries.
     rule:
-        What counts as significant in a cell; None means the task's own, the paper's where it names none. For a paired
-        rule both are reduced to the seeds that they share, in the cells.
+        What counts as significant in a cell; None means the task's own, the paper's where it names none.
 
     Raises
     ------
     QrlSuiteError
-        If they belong to different tasks, one was trained by a decision plan, their lengths have no common horizon,
-        or a paired rule finds no common seed.
+        If they belong to different tasks, one was trained by a decision plan, or their lengths have no common horizon.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
@@ -535,8 +520,6 @@ def compare_entries(
     grid, asked = ranking_of([first, second]).grid, rule is not None
     pair = judge_pair(first, second, grid, ALPHA)
     rule = rule or rule_of([first, second])
-    if getattr(rule, "paired", False):
-        first, second = _common_seeds(first, second)
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
     remarks = tables.changed_thresholds([first, second]) + [
@@ -545,18 +528,6 @@ def compare_entries(
         if entry.on_protocol_seeds
     ]
     return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
-
-
-def _common_seeds(first: EntryResults, second: EntryResults) -> tuple[EntryResults, EntryResults]:
-    """Return both entries with the runs of the seeds that they share, in one order."""
-    shared = sorted(set(first.seeds) & set(second.seeds))
-    if not shared:
-        raise OptionError(f"'{first.label}' and '{second.label}' share no seed: their runs cannot be paired")
-    one, other = (
-        replace(entry, curves=entry.curves[[entry.seeds.index(seed) for seed in shared]], seeds=tuple(shared))
-        for entry in (first, second)
-    )
-    return one, other
 
 
 def untiered_reason(row: Row) -> str:

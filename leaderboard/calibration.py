@@ -35,7 +35,7 @@ from qrlsuite.statistics import (
 
 Part = Literal["halves", "pairs", "boards", "power", "decisions"]
 PARTS: tuple[Part, ...] = ("halves", "pairs", "boards", "power", "decisions")
-RULES = ("intervals", "difference", "permutation", "times")
+RULES = ("intervals", "times")
 """The rules that are measured by default."""
 NUMBERS = ((100, 100), (20, 20), (30, 100))
 """Seeds of the two entries of a simulated pair."""
@@ -243,7 +243,7 @@ def plan(
     grid:
         The task's ranking grid.
     rules:
-        The rules that judge. A paired rule is not asked at unequal numbers of seeds.
+        The rules that judge.
     draws:
         Splits, simulated pairs and plans per line; a quarter of that for boards and plans of `board` entries.
     parts:
@@ -264,11 +264,7 @@ def plan(
         jobs += [_halves(entry, grid, rule, draws) for entry in real for rule in rules]
     if "pairs" in parts:
         jobs += [
-            _pairs(model, pair, grid, rule, draws)
-            for model in models
-            for pair in numbers
-            for rule in rules
-            if pair[0] == pair[1] or not getattr(rule, "paired", False)
+            _pairs(model, pair, grid, rule, draws) for model in models for pair in numbers for rule in rules
         ]
     if "boards" in parts:
         jobs += [

@@ -23,6 +23,8 @@ PAPER = "paper"
 """Another name for it."""
 TIMES = "times"
 """The rule by which boards rank, with Holm's correction over all pairs of a board."""
+GONE = ("difference", "difference-paired", "permutation")
+"""Rules of version 0.1."""
 
 _HERE = "qrlsuite.statistics.significance"
 _PERMUTATION = "qrlsuite.statistics.permutation"
@@ -30,33 +32,12 @@ _PERMUTATION = "qrlsuite.statistics.permutation"
 
 @hookimpl
 def register_rules(register: Callable[[RuleSpec], None]) -> None:
-    """Register the paper's rule, the bootstrap of the difference, and three permutation tests."""
+    """Register the paper's rule and two permutation tests."""
     register(
         RuleSpec(
             name=DEFAULT,
             summary="the paper's (`--rule paper`): 5th to 95th percentile intervals do not overlap; per cell",
             factory=f"{_HERE}:IntervalRule",
-        )
-    )
-    register(
-        RuleSpec(
-            name="difference",
-            summary="bootstrap of the difference; error probability 5 percent over a pair's whole grid",
-            factory=f"{_HERE}:DifferenceRule",
-        )
-    )
-    register(
-        RuleSpec(
-            name="difference-paired",
-            summary="the same, run by run of the same seed: sharper where equal seeds do similarly",
-            factory=f"{_HERE}:paired_difference_rule",
-        )
-    )
-    register(
-        RuleSpec(
-            name="permutation",
-            summary="labels of runs permuted, per cell; error probability 5 percent over a pair's whole grid",
-            factory=f"{_PERMUTATION}:PermutationRule",
         )
     )
     register(
@@ -91,6 +72,8 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     try:
         registered = known.get("rules", name)
     except UnknownNameError:
+        if name in GONE:
+            raise UnknownNameError(f"rule '{name}' is gone: take '{TIMES}'") from None
         choices = [PAPER, *known.names("rules")]
         raise UnknownNameError(f"unknown rule '{name}'{nearest(name, choices)}") from None
     spec = cast(RuleSpec, registered.spec)
@@ -131,7 +114,6 @@ class _Fenced:
         self._rule, self._origin = rule, origin
         self.name = name
         self.promise = promise
-        self.paired = bool(getattr(rule, "paired", False))
         if hasattr(rule, "against"):  # boards ask for it where it exists
             self.against = self._against
 

@@ -159,8 +159,7 @@ def board(
     UnknownNameError
         If a task, an entry or the rule is unknown, or no entry is left.
     OptionError
-        If the horizon is no whole number of epochs, a paired rule meets entries of different seeds, or both `entries`
-        and `study` are given.
+        If the horizon is no whole number of epochs, or both `entries` and `study` are given.
     StoreError
         If there is no results folder, and `published` is false.
     PluginError
@@ -273,8 +272,7 @@ def compare(
     UnknownNameError
         If an entry, the task or the rule is unknown.
     QrlSuiteError
-        If the entries belong to different tasks, their lengths have no common horizon, or a paired rule finds no
-        common seed.
+        If the entries belong to different tasks, or their lengths have no common horizon.
 
     Examples
     --------

@@ -219,8 +219,7 @@ def register_rules(register: Callable[[specs.RuleSpec], None]) -> None:
         def register_rules(register):
             register(RuleSpec(name="half", summary="...", factory="my_package:Half"))
 
-    Equal numbers, the limit of 20 runs, outperformance and ranking hold for every rule. A rule whose attribute
-    `paired` is true is given entries with the same seeds in the same order.
+    Equal numbers, the limit of 20 runs, outperformance and ranking hold for every rule.
     """
 
 

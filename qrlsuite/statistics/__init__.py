@@ -47,7 +47,7 @@ from qrlsuite.statistics.estimator import (
 from qrlsuite.statistics.final import ScoreBoard, areas, compare_scores, final_scores, last_epochs
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.pair import TimesPair, times_pair
-from qrlsuite.statistics.permutation import MaxT, PermutationRule, SkewedTimesRule, TimesRule
+from qrlsuite.statistics.permutation import MaxT, SkewedTimesRule, TimesRule
 from qrlsuite.statistics.planning import Need, runs_needed, runs_to_detect
 from qrlsuite.statistics.ranking import Ranked, Ranking, rank
 from qrlsuite.statistics.sequential import (
@@ -60,12 +60,10 @@ from qrlsuite.statistics.sequential import (
     nominal_levels,
 )
 from qrlsuite.statistics.significance import (
-    DifferenceRule,
     Evidence,
     IntervalRule,
     Resampling,
     SignificanceRule,
-    paired_difference_rule,
 )
 from qrlsuite.statistics.times import MeanTime, mean_time, times_below
 from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board
@@ -79,7 +77,6 @@ __all__ = [
     "Decision",
     "DecisionPlan",
     "DecisionRates",
-    "DifferenceRule",
     "Direction",
     "Evidence",
     "Grid",
@@ -90,7 +87,6 @@ __all__ = [
     "Need",
     "Outcome",
     "PairDecision",
-    "PermutationRule",
     "Ranked",
     "Ranking",
     "Rates",
@@ -125,7 +121,6 @@ __all__ = [
     "mean_time",
     "nominal_levels",
     "outperformance",
-    "paired_difference_rule",
     "power",
     "probability_of_improvement",
     "rank",

@@ -185,7 +185,7 @@ def weighted_epochs(curves: Curve, grid: Grid, weights: Weights, n_runs: int) ->
     result = np.empty((*grid.shape, weights.shape[1]), dtype=np.int32)
     for start in range(0, weights.shape[1], BLOCK):
         block = slice(start, start + BLOCK)
-        (result[..., block],) = counted.epochs_below(required, weights[:, block], n_runs)
+        result[..., block] = counted.epochs_below(required, weights[:, block], n_runs)
     return result
 
 
@@ -209,13 +209,10 @@ class Indicators:
         self._rows: NDArray[np.float32] = np.concatenate(
             [each[rows] for each, rows in zip(indicators, mixed)]
         ).astype(np.float32)
-        self._totals = np.concatenate([each[rows] for each, rows in zip(totals, mixed)])
         self._ends = np.cumsum([len(rows) for rows in mixed]).tolist()
 
-    def epochs_below(
-        self, levels: IntArray, weights: Weights, most: int, complement: bool = False
-    ) -> NDArray[np.int32]:
-        """Return the number of epochs with fewer weighted runs than each level, shape (1, E, L, R).
+    def epochs_below(self, levels: IntArray, weights: Weights, most: int) -> NDArray[np.int32]:
+        """Return the number of epochs with fewer weighted runs than each level, shape (E, L, R).
 
         Parameters
         ----------
@@ -225,23 +222,16 @@ class Indicators:
             Shape (N, R), whole numbers.
         most:
             No column of the weights sums to more.
-        complement:
-            Count also under the weights 1 - w: the result then has shape (2, E, L, R).
         """
-        result = np.empty((1 + complement, self.n_thresholds, len(levels), weights.shape[1]), dtype=np.int32)
+        result = np.empty((self.n_thresholds, len(levels), weights.shape[1]), dtype=np.int32)
         result[:] = self.never[:, None, None]
         for top in range(0, len(self._rows), _ROWS):
             part = slice(top, top + _ROWS)
             counts = whole_product(self._rows[part], weights, most)
-            sides = [counts]
-            if complement:
-                sides.append(self._totals[part, None].astype(counts.dtype) - counts)
-            for side, total in zip(sides, result):
-                begin = 0
-                for threshold, end in enumerate(self._ends):
-                    rows = side[max(begin - top, 0) : max(end - top, 0)]
-                    _add_below(rows, levels, total[threshold])
-                    begin = end
+            begin = 0
+            for total, end in zip(result, self._ends):
+                _add_below(counts[max(begin - top, 0) : max(end - top, 0)], levels, total)
+                begin = end
         return result
 
 

@@ -12,7 +12,7 @@ where the maxima rarely reach its own |t|. The t are studentized: with equal mea
 is still valid for many runs (Janssen 1997, Statistics & Probability Letters 36; Chung and Romano 2013, Annals of
 Statistics 41).
 
-Two rules are built on it, `TimesRule` (tolerances) and `PermutationRule` (cells).
+Two rules are built on it: `TimesRule`, and `SkewedTimesRule` for entries of which some runs fail.
 """
 
 from __future__ import annotations
@@ -27,18 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.bootstrap import Indicators, Weights, small_product
-from qrlsuite.statistics.curves import Curve, reached
-from qrlsuite.statistics.grid import BoolArray, FloatArray, Grid, IntArray
+from qrlsuite.statistics.bootstrap import Weights, small_product
+from qrlsuite.statistics.grid import BoolArray, FloatArray, IntArray
 from qrlsuite.statistics.significance import Evidence, Signs
 from qrlsuite.statistics.times import check_probability, times_below
 
 CHUNK = 10_000
 """Relabelings that are made at a time, and the least that decide."""
-_BLOCK = 2_000  # relabelings of the cells at a time: the first suffice where no cell is near the boundary
 _EXACT = 2**24  # float32 counts so far without error
 _TOGETHER = 64  # pairs whose relabelings are in memory at the same time
-_FINEST = 20_000  # epochs to which two entries of different steps per epoch are cut at most
 
 Blocks = tuple[tuple[int, int], ...]
 """Runs of the first and the second entry in each block within which labels are exchanged."""
@@ -454,141 +451,3 @@ class SkewedTimesRule(TimesRule):
 def times_of(evidence: Evidence) -> IntArray:
     """Return the times below threshold in steps of all runs of an entry, shape (N, E)."""
     return times_below(evidence.entry.values, evidence.grid, evidence.steps_per_epoch)
-
-
-@dataclass(frozen=True, slots=True)
-class PermutationRule:
-    """Significant where S_hat differs by more than relabeled runs make it differ, anywhere on the grid.
-
-    The difference of S_hat in a cell is divided by its standard error within both groups, for the observed and
-    for every relabeling, and |t| compared with the largest of each relabeling: single-step max-T over the cells
-    (Westfall and Young 1993), exact for independent runs of equal laws. The standard error is read off the
-    surface itself: S_hat rises with delta like a quantile, so a quarter of S_hat(delta + 2h) - S_hat(delta - 2h),
-    with h = sqrt(delta (1 - delta) / n) the standard error of P_hat, is that of S_hat (Woodruff 1952, Journal of
-    the American Statistical Association 47); 1/12 of the coarser epoch squared is added for the rounding to whole
-    epochs. Without it, two groups that both mix quick and slow runs would differ as much as the quick from the
-    slow. S_hat depends on the number of runs; of the larger entry the first n runs are taken.
-
-    Attributes
-    ----------
-    alpha:
-        Probability, for two entries of equal law, that any cell of the grid is declared different.
-    """
-
-    alpha: float = 0.05
-
-    def __post_init__(self) -> None:
-        check_probability(self.alpha, "alpha")
-
-    @property
-    def name(self) -> str:
-        """The rule's name."""
-        return "permutation"
-
-    @property
-    def promise(self) -> str:
-        """What the rule controls."""
-        return (
-            f"the whole grid of one pair: two entries of equal law differ significantly in any cell with "
-            f"probability {self.alpha:g} at most; not unequal laws with equal sample complexity, not the "
-            "direction, and not the whole board of many pairs"
-        )
-
-    def __call__(self, first: Evidence, second: Evidence) -> Signs:
-        """Return the sign of every cell, shape (E, D).
-
-        Raises
-        ------
-        OptionError
-            If the epochs of both entries have no common measure that is fine enough to lay them side by side.
-        """
-        pair, resolution = _side_by_side(first, second)
-        if pair[0].tobytes() > pair[1].tobytes():
-            return -self._signs(pair[::-1], first.grid, resolution, first.resampling.seed)
-        return self._signs(pair, first.grid, resolution, first.resampling.seed)
-
-    def _signs(self, pair: Sequence[Curve], grid: Grid, resolution: int, seed: int) -> Signs:
-        ratios = _CellRatios(pair, grid, resolution)
-        t, full = ratios.observed(), relabelings_for(self.alpha)
-        exceeded = np.zeros(grid.shape, dtype=np.int64)
-        for begin in range(0, full, _BLOCK):
-            chunk, offset = divmod(begin, CHUNK)
-            labels = relabelings(ratios.n_runs, ratios.n_runs, chunk, seed)[:, offset : offset + _BLOCK]
-            largest = np.sort(np.abs(ratios(labels)).max(axis=(0, 1)))
-            exceeded += len(largest) - np.searchsorted(largest, np.abs(t))
-            count = begin + _BLOCK
-            p = (1 + exceeded) / (count + 1)
-            doubt = 3 * np.sqrt(self.alpha * (1 - self.alpha) / count)
-            if begin == 0 and (np.abs(p - self.alpha) > doubt).all():
-                break
-        signs: Signs = np.where((p <= self.alpha) & (t != 0), -np.sign(t), 0).astype(np.int8)
-        return signs
-
-
-def _side_by_side(first: Evidence, second: Evidence) -> tuple[list[Curve], int]:
-    """Return the first n runs of both in epochs of equal length, and the coarser epoch in these."""
-    common = math.gcd(first.steps_per_epoch, second.steps_per_epoch)
-    epochs = first.entry.horizon // common
-    if epochs > _FINEST:
-        raise OptionError(
-            f"'{first.entry.name}' ({first.steps_per_epoch} steps per epoch) and '{second.entry.name}' "
-            f"({second.steps_per_epoch}) cannot be laid side by side: take rule 'times'"
-        )
-    kind = np.result_type(first.entry.values.dtype, second.entry.values.dtype)
-    pair = [
-        np.repeat(each.entry.values[: each.n_runs], each.steps_per_epoch // common, axis=1).astype(kind)
-        for each in (first, second)
-    ]
-    return pair, max(first.steps_per_epoch, second.steps_per_epoch) // common
-
-
-class _CellRatios:
-    """(S_hat of the runs labeled "first" - S_hat of the others) / standard error, for many labelings of a pair."""
-
-    def __init__(self, pair: Sequence[Curve], grid: Grid, resolution: int) -> None:
-        self.n_runs, self.resolution = len(pair[0]), resolution
-        self.levels, self.inverse, self.scale = _levels(grid, self.n_runs)
-        self.both = Indicators(np.concatenate([reached(each, grid) for each in pair], axis=2))
-
-    def __call__(self, labels: Weights) -> NDArray[np.float32]:
-        """Return, shape (E, D, R), the ratio in every cell, for labels (2 n_runs, R): 1 means first."""
-        sides = self.both.epochs_below(self.levels, labels, self.n_runs, complement=True)
-        rows = [
-            _ratios(first, second, self.inverse, self.scale, self.resolution) for first, second in zip(*sides)
-        ]
-        return np.stack(rows)
-
-    def observed(self) -> NDArray[np.float32]:
-        """Return, shape (E, D), the ratio under the labels as they are."""
-        return self(np.repeat(np.array([[1], [0]], dtype=np.float32), self.n_runs, axis=0))[..., 0]
-
-
-def _levels(grid: Grid, n_runs: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the counts at which S_hat is needed, where they stand for each delta, and a factor.
-
-    For each of D deltas three counts are needed, (3, D): the required one, and those two standard errors of P_hat
-    below and above, within 1 and n; their distance in S_hat times the factor (D,) is the standard error.
-    """
-    required = grid.required_counts(n_runs)
-    deltas = np.array([float(delta) for delta in grid.deltas])
-    step = np.maximum(1, np.rint(2 * np.sqrt(deltas * (1 - deltas) * n_runs))).astype(np.int64)
-    below, above = np.maximum(required - step, 1), np.minimum(required + step, n_runs)
-    levels, inverse = np.unique(np.stack([required, below, above]), return_inverse=True)
-    return levels, inverse.reshape(3, -1), step / np.maximum(above - below, 1) / 2
-
-
-def _ratios(
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    inverse: IntArray,
-    scale: FloatArray,
-    resolution: int,
-) -> NDArray[np.float32]:
-    """Return the studentized differences, (D, R), for the epochs of both entries below each level, (L, R)."""
-    difference = (first[inverse[0]] - second[inverse[0]]).astype(np.float32)
-    factor = scale.astype(np.float32)[:, None]
-    variance = np.full(difference.shape, resolution**2 / 12, dtype=np.float32)
-    for side in (first, second):
-        variance += ((side[inverse[2]] - side[inverse[1]]).astype(np.float32) * factor) ** 2
-    ratios: NDArray[np.float32] = difference / np.sqrt(variance)
-    return ratios

@@ -151,16 +151,16 @@ def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[E
 
 
 def test_compare_shows_cells_by_the_rule_that_is_named(entries: list[EntryResults]) -> None:
-    output = call("compare", "width=64", "width=16", "--rule", "difference")
+    output = call("compare", "width=64", "width=16", "--rule", "times")
     assert all(len(line) <= 80 for line in output.splitlines())
-    assert "rule 'difference':" in " ".join(output.split())
+    assert "rule 'times':" in " ".join(output.split())
     assert output.strip().endswith("+ significantly fewer samples")
 
 
 def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryResults]) -> None:
-    assert "difference-paired" in call("list", "rules")
-    assert "promises: the whole grid of one pair" in call("show", "difference")
-    assert "rule 'difference': the whole grid" in call("leaderboard", "--rule", "difference")
+    assert "times-skewed" in call("list", "rules")
+    assert "promises: all tolerances of one pair" in call("show", "times-skewed")
+    assert "rule 'times-skewed': all tolerances" in call("leaderboard", "--rule", "times-skewed")
     assert json.loads(call("leaderboard", "--format", "json"))["rule"] == "intervals"
 
 
@@ -176,8 +176,8 @@ def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryResults]) 
         call("calibrate", "--seeds", "20;30")
     with pytest.raises(OptionError, match="--seeds 1,30: both numbers must be between 2 and 10000"):
         call("calibrate", "--seeds", "1,30")
-    halves = call("calibrate", "qubits=6", "--draws", "4", "--part", "halves", "--rule", "difference")
-    assert "'difference' declares a false winner between halves of one entry in" in halves
+    halves = call("calibrate", "qubits=6", "--draws", "4", "--part", "halves", "--rule", "times")
+    assert "'times' declares a false winner between halves of one entry in" in halves
     object.__setattr__(entries[0], "curves", entries[0].curves[:, :10])
     cut = json.loads(call("calibrate", "--draws", "4", "--part", "halves", "--json").splitlines()[-1])
     assert len(cut["entries"]) == 2, "an entry at epoch 10 of 100 would cut the others' curves to 10 epochs"

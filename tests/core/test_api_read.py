@@ -151,8 +151,8 @@ def test_names_and_entries_are_compared_alike(small: EntryResults, large: EntryR
     assert api.compare(large, small).as_dict() == {**by_name.as_dict(), "board": None}
     assert str(by_name.outcome) == "outperforms"
     assert by_name.points.shape == (2, *by_name.grid.shape)
-    strict = api.compare(large, small, rule="difference")
-    assert strict.headline.endswith("rule 'difference'")
+    strict = api.compare(large, small, rule="times")
+    assert strict.headline.endswith("rule 'times'")
     assert "+ significantly fewer samples" in printed(strict)
     assert "+ significantly fewer samples" in strict._repr_html_()
 

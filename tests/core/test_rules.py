@@ -56,10 +56,6 @@ class Promiseless(Half):
     promise = ""
 
 
-class Paired(Half):
-    paired = True
-
-
 @pytest.fixture
 def third_party(monkeypatch: pytest.MonkeyPatch) -> Callable[[type], Any]:
     """Register a rule class as `acme`'s, and load it by name as the commands do."""
@@ -89,13 +85,15 @@ def curves(first_good: int, name: str) -> LearningCurves:
 
 def test_built_in_rules_are_registered_like_anyones() -> None:
     known = registry.load()
-    assert {"intervals", "difference", "difference-paired"} <= set(known.names("rules"))
-    for name in ("intervals", "difference", "difference-paired"):
+    assert set(known.names("rules")) == {"intervals", "times", "times-skewed"}
+    for name in known.names("rules"):
         assert known.get("rules", name).distribution == "qrlsuite"
         assert rules.load(name).name == name
     assert isinstance(rules.load(), IntervalRule), "the paper's rule is the default"
     with pytest.raises(UnknownNameError, match="did you mean 'intervals'"):
         rules.load("intervalls")
+    with pytest.raises(UnknownNameError, match="rule 'difference' is gone: take 'times'"):
+        rules.load("difference")
 
 
 def test_a_third_partys_rule_judges_pairs_and_boards(third_party: Callable[[type], Any]) -> None:
@@ -145,21 +143,6 @@ def test_an_answer_for_many_is_checked_too(third_party: Callable[[type], Any]) -
 def test_what_is_no_rule_is_refused_by_name(rule: Any, message: str, third_party: Any) -> None:
     with pytest.raises(PluginError, match=f"'half' of distribution 'acme'.*{message}"):
         third_party(rule)
-
-
-def test_a_paired_rule_sees_the_seeds_that_entries_share(third_party: Callable[[type], Any]) -> None:
-    loaded = third_party(Paired)
-    many, few = learner("ddqn a", 10, seeds=40), learner("ddqn b", 31, seeds=25)
-    object.__setattr__(few, "seeds", tuple(range(5, 30)))
-    assert board.compare_entries(many, few, loaded).n_runs == 25
-    (line,) = board.build([many, few], rule=loaded).refused
-    assert (
-        "rule 'half' pairs runs of the same seed: 'ddqn a' (40) and 'ddqn b' (25) have different seeds"
-        in line
-    )
-    object.__setattr__(few, "seeds", tuple(range(100, 125)))
-    with pytest.raises(Exception, match="share no seed"):
-        board.compare_entries(many, few, loaded)
 
 
 def test_the_papers_rule_is_named_among_the_choices() -> None:

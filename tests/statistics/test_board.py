@@ -7,7 +7,6 @@ import pytest
 
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
-    DifferenceRule,
     Evidence,
     Grid,
     IntervalRule,
@@ -15,6 +14,7 @@ from qrlsuite.statistics import (
     Outcome,
     Resampling,
     SignificanceRule,
+    TimesRule,
     Verdict,
     compare,
     outperformance,
@@ -45,7 +45,7 @@ def mixed_board() -> list[LearningCurves]:
     ]
 
 
-@pytest.mark.parametrize("rule", [IntervalRule(), DifferenceRule(), Faster()], ids=lambda rule: rule.name)
+@pytest.mark.parametrize("rule", [IntervalRule(), TimesRule(), Faster()], ids=lambda rule: rule.name)
 @pytest.mark.parametrize("horizon", [None, 80_000])
 def test_a_board_is_all_its_comparisons(rule: SignificanceRule, horizon: int | None) -> None:
     entries = mixed_board()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import doctest
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,36 +13,27 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import rules
 from qrlsuite.statistics import (
     MIN_RUNS,
-    DifferenceRule,
     Evidence,
     Grid,
     IntervalRule,
     LearningCurves,
     Outcome,
-    PermutationRule,
     Resampling,
     SignificanceRule,
+    SkewedTimesRule,
     TimesRule,
     Verdict,
     bootstrap_interval,
     common_horizon,
     compare,
     estimator,
-    paired_difference_rule,
     sample_complexity,
     significance,
 )
-from qrlsuite.statistics.significance import Draws
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE
 
 CELL = Grid.relative([0.1], [0.5])
-RULES: list[SignificanceRule] = [
-    IntervalRule(),
-    DifferenceRule(),
-    paired_difference_rule(),
-    PermutationRule(),
-    TimesRule(),
-]
+RULES: list[SignificanceRule] = [IntervalRule(), TimesRule(), SkewedTimesRule()]
 
 
 def learner(
@@ -198,96 +188,12 @@ def test_a_horizon_that_is_not_whole_epochs_of_both_is_refused() -> None:
 def test_swapping_the_entries_swaps_the_verdicts(
     rule: SignificanceRule, n_resamples: int, wide: LearningCurves, narrow: LearningCurves
 ) -> None:
-    if isinstance(rule, DifferenceRule):
-        rule = replace(rule, n_resamples=n_resamples)
     # closer together than the originals, so that the answer hangs on the draws
     mixed = LearningCurves(np.concatenate([narrow.values[:18], wide.values[:12]]), 2000, "mixed")
     pair = [Evidence(entry, SURFACE, 30, Resampling(n_resamples)) for entry in (mixed, narrow)]
     signs = rule(*pair)
     assert 0 < np.count_nonzero(signs) < signs.size
     assert (signs == -rule(*pair[::-1])).all()
-
-
-def test_the_difference_rule_judges_an_entry_equal_to_itself(wide: LearningCurves) -> None:
-    itself = Evidence(wide, SURFACE, 30)
-    assert not DifferenceRule()(itself, itself).any()
-    assert not DifferenceRule(paired=True)(itself, itself).any()
-
-
-def test_the_difference_rule_draws_both_entries_independently() -> None:
-    # Run i learns at epoch i of the first entry, at epoch i + 2 of the second. Drawn together, the difference
-    # is 2 in every resample; drawn apart, it has the spread of two medians of 40 numbers.
-    curves = (np.arange(50) >= np.arange(40)[:, None]).astype(float)
-    late = np.concatenate([np.zeros((40, 2)), curves[:, :-2]], axis=1)
-    pair = [Evidence(LearningCurves(values, 1), CELL, 40) for values in (curves, late)]
-    assert (pair[0].point - pair[1].point).tolist() == [[-2]]
-    assert DifferenceRule(paired=True)(*pair).tolist() == [[1]]
-    assert DifferenceRule()(*pair).tolist() == [[0]]
-
-
-def test_the_difference_rule_gets_stricter_with_alpha(wide: LearningCurves, narrow: LearningCurves) -> None:
-    pair = [Evidence(entry, SURFACE, 30) for entry in (wide, narrow)]
-    found = [np.count_nonzero(DifferenceRule(alpha)(*pair)) for alpha in (0.5, 0.05, 0.002)]
-    assert found[0] > found[1] > found[2]
-
-
-def test_the_difference_rule_pays_for_a_larger_grid(wide: LearningCurves, narrow: LearningCurves) -> None:
-    mixed = LearningCurves(np.concatenate([narrow.values[:18], wide.values[:12]]), 2000, "mixed")
-    alone = sum(
-        int(
-            np.count_nonzero(
-                DifferenceRule()(*[Evidence(e, Grid.relative([eps], [d]), 30) for e in (mixed, narrow)])
-            )
-        )
-        for eps in EPSILONS[::2]
-        for d in DELTAS[::2]
-    )
-    grid = Grid.relative(EPSILONS[::2], DELTAS[::2])
-    together = np.count_nonzero(DifferenceRule()(*[Evidence(e, grid, 30) for e in (mixed, narrow)]))
-    assert together < alone
-
-
-def test_less_than_an_epoch_of_the_coarser_entry_is_no_difference() -> None:
-    coarse = Evidence(learner(1, epochs=2, steps=500), CELL, 30)
-    for first_good, sign in ((3, 0), (0, 1), (9, 0), (10, -1)):
-        fine = Evidence(learner(first_good), CELL, 30)
-        assert (fine.point - coarse.point).tolist() == [[100 * first_good - 500]]
-        assert DifferenceRule()(fine, coarse).tolist() == [[sign]]
-
-
-def test_pairing_needs_the_same_runs(wide: LearningCurves) -> None:
-    fewer = LearningCurves(wide.values[:25], 2000, "fewer")
-    with pytest.raises(OptionError, match=r"'width64' \(30 runs\) and 'fewer' \(25 runs\) cannot be paired"):
-        compare(wide, fewer, SURFACE, DifferenceRule(paired=True))
-
-
-@pytest.mark.parametrize("alpha", [0, 1, -0.1, float("nan")])
-def test_alpha_is_a_probability(alpha: float) -> None:
-    with pytest.raises(OptionError, match="alpha"):
-        DifferenceRule(alpha)
-
-
-def test_one_resample_has_no_spread_of_differences() -> None:
-    with pytest.raises(OptionError, match="n_resamples = 1"):
-        DifferenceRule(n_resamples=1)
-
-
-def test_the_difference_rule_draws_ten_thousand_times_whatever_the_interval_draws(
-    wide: LearningCurves, narrow: LearningCurves
-) -> None:
-    mixed = LearningCurves(np.concatenate([narrow.values[:18], wide.values[:12]]), 2000, "mixed")
-    asked: list[int] = []
-
-    class Watched(Evidence):
-        def draws(self, n_resamples: int) -> Draws:
-            asked.append(n_resamples)
-            return super().draws(n_resamples)
-
-    signs = [
-        DifferenceRule()(*[Watched(e, SURFACE, 30, Resampling(n)) for e in (mixed, narrow)]) for n in (2, 50)
-    ]
-    assert set(asked) == {10_000}
-    assert (signs[0] == signs[1]).all()
 
 
 @pytest.mark.parametrize("answer", [np.zeros(3), np.full((1, 1), 2), np.full((1, 1), np.nan)])

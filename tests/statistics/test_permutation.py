@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
@@ -16,25 +14,23 @@ from qrlsuite.statistics import (
     Grid,
     LearningCurves,
     MaxT,
-    PermutationRule,
     Resampling,
+    SkewedTimesRule,
     SmoothedRuns,
     TimesRule,
     compare,
     false_winners,
     power,
 )
-from qrlsuite.statistics.estimator import complexity
 from qrlsuite.statistics.permutation import (
     CHUNK,
-    _CellRatios,
     relabelings,
     relabelings_for,
     skewed_t,
     smallest,
     welch_t,
 )
-from tests.statistics.conftest import DELTAS, SURFACE, entry
+from tests.statistics.conftest import SURFACE, entry
 
 
 def column(*values: int) -> np.ndarray:
@@ -166,47 +162,6 @@ def test_twenty_over_the_level_and_ten_thousand_or_more() -> None:
     ]
 
 
-@pytest.mark.parametrize("copies", [1, 5], ids=["counts in bytes", "more than a byte"])
-def test_differences_of_cells_are_those_of_the_surface(copies: int) -> None:
-    """Each relabeling by itself: S_hat at delta, and two standard errors of P_hat below and above."""
-    first, second = (np.repeat(entry(index).values, copies, axis=0) for index in (0, 1))
-    n_runs = len(first)
-    pooled, labels = np.concatenate([first, second]), relabelings(n_runs, n_runs)
-    ratios = _CellRatios([first, second], SURFACE, 1)
-    found, drawn = ratios.observed(), ratios(labels[:, :200])
-
-    def expected(chosen: np.ndarray) -> np.ndarray:
-        counts = [round(delta * n_runs) for delta in DELTAS]
-        steps = [round(2 * (delta * (1 - delta) * n_runs) ** 0.5) for delta in DELTAS]
-        rows = []
-        for shift in (0, -1, 1):
-            deltas = [
-                Fraction(min(count + shift * step, n_runs), n_runs) for count, step in zip(counts, steps)
-            ]
-            cells = dataclasses.replace(SURFACE, deltas=tuple(deltas))
-            surfaces = [complexity(pooled[side], cells, 1) for side in (chosen, ~chosen)]
-            rows.append(np.stack(surfaces).astype(float))
-        reach = [min(count + step, n_runs) - count + step for count, step in zip(counts, steps)]
-        errors = (rows[2] - rows[1]) * np.array(steps) / np.array(reach) / 2
-        return (rows[0][0] - rows[0][1]) / np.sqrt(1 / 12 + (errors**2).sum(axis=0))
-
-    assert found == pytest.approx(expected(np.arange(2 * n_runs) < n_runs), rel=1e-5)
-    for index in (0, 199):
-        assert drawn[..., index] == pytest.approx(expected(labels[:, index] > 0), rel=1e-5)
-
-
-def test_epochs_of_different_length_are_laid_side_by_side() -> None:
-    fine = LearningCurves(np.repeat(entry(0).values, 2, axis=1), 1000, "fine")
-    coarse = entry(1)
-    expected = compare(entry(0), coarse, SURFACE, PermutationRule()).verdicts
-    assert compare(fine, coarse, SURFACE, PermutationRule()).verdicts == expected
-    many, few = (LearningCurves(np.ones((20, 101 - n)), 1000 + n, f"{n}") for n in (0, 1))
-    with pytest.raises(
-        OptionError, match=r"'0' .1000 steps per epoch. and '1' .1001. cannot.*take rule 'times'"
-    ):
-        PermutationRule()(*(Evidence(each, SURFACE, 20) for each in (many, few)))
-
-
 def test_times_takes_all_runs_of_both() -> None:
     """Runs beyond the smaller number count: here 80 that never learn, behind 20 equal ones."""
     few = SmoothedRuns(entry(0)).draw(20, np.random.default_rng(0))
@@ -214,9 +169,6 @@ def test_times_takes_all_runs_of_both() -> None:
     won = np.array(compare(few, many, SURFACE, TimesRule()).verdicts) == "win"
     assert won.all()
     assert (np.array(compare(many, few, SURFACE, TimesRule()).verdicts) == "loss").all()
-    assert not PermutationRule()(*(Evidence(each, SURFACE, 20) for each in (few, many))).any(), (
-        "equal numbers"
-    )
 
 
 def test_all_deltas_of_a_tolerance_have_its_sign() -> None:
@@ -225,7 +177,7 @@ def test_all_deltas_of_a_tolerance_have_its_sign() -> None:
     assert (signs > 0).all()
 
 
-@pytest.mark.parametrize("rule", [TimesRule, PermutationRule])
+@pytest.mark.parametrize("rule", [TimesRule, SkewedTimesRule])
 def test_alpha_and_seed_decide(rule: type) -> None:
     with pytest.raises(OptionError, match="alpha"):
         rule(0)
@@ -245,11 +197,9 @@ def test_alpha_and_seed_decide(rule: type) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rule", "index"), [(TimesRule(), 0), (PermutationRule(), 1)], ids=["times", "permutation"]
+    ("rule", "index"), [(TimesRule(), 0), (SkewedTimesRule(), 1)], ids=["times", "times-skewed"]
 )
-def test_equal_entries_rarely_differ_and_slow_ones_are_found(
-    rule: TimesRule | PermutationRule, index: int
-) -> None:
+def test_equal_entries_rarely_differ_and_slow_ones_are_found(rule: TimesRule, index: int) -> None:
     model = SmoothedRuns(entry(index))
     rates = false_winners(model, 30, 30, SURFACE, rule, n_pairs=60)
     assert rates.any_cell <= 0.1
@@ -262,7 +212,7 @@ def test_equal_entries_rarely_differ_and_slow_ones_are_found(
 def test_a_grid_of_one_cell() -> None:
     grid = Grid.relative([0.1], [0.5])
     pair = [Evidence(each, grid, 30) for each in (entry(0), entry(1))]
-    assert PermutationRule()(*pair).tolist() == TimesRule()(*pair).tolist() == [[1]]
+    assert TimesRule()(*pair).tolist() == [[1]]
 
 
 def test_the_correction_for_skewness_by_hand() -> None:

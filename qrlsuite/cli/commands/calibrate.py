@@ -38,7 +38,7 @@ def calibrate(
     ] = None,
     rule: Annotated[
         list[str] | None,
-        typer.Option("--rule", metavar="NAME", help="The rules; by default four built-in ones."),
+        typer.Option("--rule", metavar="NAME", help="The rules; by default the paper's and times."),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="The task, if the folder holds several.")] = None,
     draws: Annotated[
@@ -69,7 +69,7 @@ def calibrate(
     and against slower entries (with rule times). The rates hold for these curves on this task, and are no guarantee
     for others.
 
-    Example: qrlsuite calibrate --task beam6g --rule difference --draws 1000
+    Example: qrlsuite calibrate --task beam6g --rule paper --draws 1000
     """
     chosen, left_out = calibration.choose(runs, entries or [], task, published)
     for line in left_out:
