@@ -27,13 +27,15 @@ if TYPE_CHECKING:
     from qrlsuite.api import run_study as run_study
     from qrlsuite.api import train as train
     from qrlsuite.api import tune as tune
+    from qrlsuite.circuit.layer import layer as layer
     from qrlsuite.hookspecs import hookimpl as hookimpl
     from qrlsuite.registry import Registry
 
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "costs", "decide", "evaluate", "hookimpl", "load", "plot",
+    "__version__", "api", "board", "compare", "costs", "decide", "evaluate", "hookimpl", "layer", "load",
+    "plot",
     "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 
@@ -57,6 +59,10 @@ def __getattr__(name: str) -> object:
         from qrlsuite.hookspecs import hookimpl
 
         return hookimpl
+    if name == "layer":
+        from qrlsuite.circuit.layer import layer
+
+        return layer
     if name == "api" or name in _FROM_API:
         import importlib
 

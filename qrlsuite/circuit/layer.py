@@ -1,0 +1,162 @@
+"""A circuit as an ordinary PyTorch layer, for training loops that are not the suite's.
+
+>>> import torch
+>>> from qrlsuite import layer
+>>> model = torch.nn.Sequential(torch.nn.Linear(4, 6), layer("cz", qubits=6, layers=2), torch.nn.Linear(6, 2))
+>>> model(torch.zeros(32, 4)).shape
+torch.Size([32, 2])
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend
+from qrlsuite.circuit.description import Circuit
+from qrlsuite.errors import OptionError
+
+DTYPES = (torch.float32, torch.float64)
+
+
+def layer(
+    circuit: str | Circuit,
+    qubits: int | None = None,
+    layers: int = 1,
+    *,
+    backend: str = "native",
+    backend_options: Mapping[str, Any] | None = None,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype | None = None,
+    **options: Any,
+) -> CircuitLayer:
+    """Return a circuit as a PyTorch layer: (..., inputs) to (..., expectation values).
+
+    Parameters
+    ----------
+    circuit:
+        Name of an ansatz (`qrlsuite list ansatzes`), or a circuit of your own.
+    qubits, layers:
+        Size of the circuit, where a name is given.
+    backend:
+        What computes it (`qrlsuite list circuit_backends`); `native` is the fast simulator.
+    backend_options:
+        Options of the backend, such as `{"shots": 1000}`.
+    generator:
+        Source of the initial parameters; by default PyTorch's, as for any layer. Shots always draw from PyTorch's.
+    dtype:
+        float32 or float64; by default PyTorch's default type.
+    options:
+        Options of the ansatz, such as `gate="xyz"`.
+
+    Raises
+    ------
+    UnknownNameError
+        If no ansatz or backend has that name.
+    OptionError
+        For a size or an option that circuit or backend cannot have.
+    """
+    if isinstance(circuit, str):
+        if qubits is None:
+            raise OptionError(f"say how many qubits: layer('{circuit}', qubits=6)")
+        circuit = ansatz(circuit, qubits, layers, **options)
+    elif qubits is not None or layers != 1 or options:
+        raise OptionError(
+            "a circuit of your own has its size and options already: leave out qubits, layers and others"
+        )
+    return CircuitLayer(
+        circuit, backend, backend_options or {}, generator, dtype or torch.get_default_dtype()
+    )
+
+
+class CircuitLayer(nn.Module):
+    """A circuit's expectation values as a layer, made by `layer`.
+
+    It can be copied, saved, moved and trained as any other layer. Inputs are angles in radians, before the scaling that
+    the circuit has. Every parameter of the circuit is a parameter of the layer, under its own name in `circuit`.
+
+    Attributes
+    ----------
+    in_features, out_features:
+        Numbers of inputs and of expectation values.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit,
+        backend: str,
+        backend_options: Mapping[str, Any],
+        generator: torch.Generator | None,
+        dtype: torch.dtype,
+    ) -> None:
+        super().__init__()
+        if dtype not in DTYPES:
+            raise OptionError(f"dtype = {dtype}: circuits are computed in float32 or float64")
+        self.description = copy.deepcopy(circuit)
+        self.backend_name = backend
+        self.backend_options = dict(backend_options)
+        self._backend: CircuitBackend | None = create_backend(
+            backend, self.description, **self.backend_options
+        )
+        self.in_features, self.out_features = circuit.inputs, len(circuit.observables)
+        self.circuit = nn.ParameterDict(
+            {
+                name: nn.Parameter(
+                    parameter.low
+                    + (parameter.high - parameter.low)
+                    * torch.rand(parameter.shape, generator=generator, dtype=dtype)
+                )
+                for name, parameter in circuit.parameters.items()
+            }
+        )
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map (..., in_features) to (..., out_features), each in [-1, 1], in the type of the inputs.
+
+        Raises
+        ------
+        OptionError
+            If the last axis is not `in_features`, or a number is not finite.
+        """
+        if inputs.dim() < 1 or inputs.shape[-1] != self.in_features:
+            raise OptionError(
+                f"inputs have shape {tuple(inputs.shape)}: the last axis must be {self.in_features}, "
+                "the circuit's number of inputs"
+            )
+        shape = (*inputs.shape[:-1], self.out_features)
+        if math.prod(shape) == 0:
+            return inputs.new_zeros(shape)
+        first = next(iter(self.circuit.values()), None)
+        dtype = first.dtype if first is not None else inputs.dtype
+        flat = inputs.reshape(1, -1, self.in_features).to(dtype)
+        parameters = {name: value[None] for name, value in self.circuit.items()}
+        values: Tensor = self._prepared()(flat, parameters, self._sampling_seed())
+        return values[0].reshape(shape).to(inputs.dtype)
+
+    def extra_repr(self) -> str:
+        """Say what the circuit is, in the layer's printed form."""
+        return (
+            f"qubits={self.description.qubits}, in_features={self.in_features}, out_features={self.out_features}, "
+            f"backend='{self.backend_name}'"
+        )
+
+    def _prepared(self) -> CircuitBackend:
+        if self._backend is None:  # in a copy
+            self._backend = create_backend(self.backend_name, self.description, **self.backend_options)
+        return self._backend
+
+    def _sampling_seed(self) -> list[int] | None:
+        """Return the seed of this pass's samples, None where values are exact."""
+        backend = self._prepared()
+        if not getattr(backend, "draws", backend.shots is not None):
+            return None
+        return [int(torch.randint(2**63 - 1, ()))]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made of: it prepares a backend of its own when it is first called."""
+        return {**self.__dict__, "_backend": None}
