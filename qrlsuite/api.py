@@ -57,7 +57,7 @@ from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning import space
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.search import Request, Search, default_sampler, for_each_model, tuning_seeds
+from qrlsuite.tuning.search import Request, Search, default_sampler, tuning_seeds
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
@@ -693,6 +693,7 @@ def tune(
     }
     shared = Request(
         task=task,
+        entry="",
         algorithm=algorithm,
         settings=tuple(from_mapping(options)),
         grid=None if grid is None else space.load(grid),
@@ -705,7 +706,7 @@ def tune(
         epochs=epochs,
         objective=objective,
     )
-    requests = for_each_model(shared, _several(model))
+    requests = [replace(shared, entry=each) for each in _several(model)]
     if not requests or (preset is not None and len(requests) > 1):
         raise OptionError("model: give at least one model, and with `out` only one")
     searches = tuning_runner.build(requests, Path(runs))

@@ -5,6 +5,9 @@ Every error says where the value came from, what is wrong with it, and what to t
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import datetime
 import math
 import re
 import tomllib
@@ -358,9 +361,14 @@ class Setting:
     prefix: str = field(default="--set ", compare=False)
 
     @property
+    def full_name(self) -> str:
+        """The name with its side, where it has one: `model.width`."""
+        return f"{self.side}.{self.name}" if self.side else self.name
+
+    @property
     def written(self) -> str:
-        """Name the place where it was written: `--set model.width`."""
-        return f"{self.prefix}{self.side}.{self.name}" if self.side else f"{self.prefix}{self.name}"
+        """The name with what stands before it: `--set model.width`."""
+        return f"{self.prefix}{self.full_name}"
 
 
 def parse_setting(word: str, prefix: str = "--set ") -> Setting:
@@ -375,8 +383,7 @@ def parse_setting(word: str, prefix: str = "--set ") -> Setting:
     """
     key, equals, text = word.partition("=")
     if not equals or not key.strip():
-        example = "qubits=6" if prefix == "--set " else "shots=1000"
-        raise OptionError(f"{prefix}{word}: write name=value, for example {prefix}{example}")
+        raise OptionError(f"{prefix}{word}: write name=value, for example qubits=6")
     side, dot, name = key.strip().partition(".")
     value = parse_value(text.strip())
     return Setting(side, name, value, prefix) if dot else Setting(None, side, value, prefix)
@@ -418,12 +425,16 @@ def read_toml(text: str) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> Any:
-    """Read a value as TOML would (`6`, `0.5`, `.5`, `true`, `[1, 2]`, `"text"`), else as bare text."""
+    """Read a value as TOML would (`6`, `0.5`, `.5`, `true`, `[1, 2]`, `"text"`), else as Python, else as bare text."""
     for candidate in (text, f"0{text}" if text.startswith(".") else text):
         try:
-            return read_toml(f"value = {candidate}")["value"]
+            value = read_toml(f"value = {candidate}")["value"]
         except tomllib.TOMLDecodeError:
             continue
+        return text if isinstance(value, datetime.date | datetime.time) else value
+    if text in ("True", "False", "None") or text.startswith(("{", "[", "'", '"')):  # as labels have them
+        with contextlib.suppress(ValueError, SyntaxError, RecursionError, MemoryError):
+            return ast.literal_eval(text)
     return text
 
 

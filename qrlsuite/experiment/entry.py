@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import pydantic
 
-from qrlsuite import options, registry, specs
+from qrlsuite import notation, options, registry, specs
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment import preset as presets
 from qrlsuite.experiment.task import Task, TaskFile, digest, load
+from qrlsuite.notation import Written
 from qrlsuite.options import Setting
 
 
@@ -55,7 +57,7 @@ class Entry:
             "model_options": options.identity(self.model_options),
         }
 
-    @property
+    @cached_property
     def hash(self) -> str:
         """Sixteen hexadecimal digits that identify the entry."""
         return digest(self.identity)
@@ -80,18 +82,30 @@ class Entry:
         """The folder's name: algorithm, model, and the first eight digits of the hash."""
         return f"{self.algorithm.name}-{self.model.name}-{self.hash[:8]}"
 
-    @property
+    @cached_property
     def label(self) -> str:
-        """A readable name: the model with its first option and every option that is not the default."""
-        parts = [self.model.name]
-        plain = options.identity(self.model_options)
-        defaults = options.plain(specs.resolve(self.model.options)())
-        parts += [f"{k}={v}" for i, (k, v) in enumerate(plain.items()) if i == 0 or v != defaults.get(k)]
-        usual = self._usual_algorithm_options()
-        parts += [
-            f"{k}={v}" for k, v in options.identity(self.algorithm_options).items() if v != usual.get(k)
-        ]
-        return f"{self.algorithm.name} {' '.join(parts)}"
+        """The entry in its notation: the model with its first option and every option that is not the default.
+
+        `resolve` makes the entry of it again, on the same task. Only an option that was added later
+        (`qrlsuite.options.Since`) is not written where it has its default, whatever the task's preset says now.
+        """
+        own = {"model": self.model_options, "algorithm": self.algorithm_options}
+        usual = {
+            "model": options.plain(specs.resolve(self.model.options)()),
+            "algorithm": self._usual_algorithm_options(),
+        }
+        words = [self.algorithm.name, self.model.name]
+        for side, other in (("model", "algorithm"), ("algorithm", "model")):
+            taken = {notation.PRESET} | {
+                name
+                for each in (own[other], self.task.environment_options)
+                for name in options.field_names(type(each))
+            }
+            for index, (name, value) in enumerate(options.identity(own[side]).items()):
+                if value != usual[side].get(name) or (side == "model" and index == 0):
+                    full = f"{side}.{name}" if name in taken else name
+                    words.append(notation.write_setting(full, value))
+        return " ".join(words)
 
     def _usual_algorithm_options(self) -> options.Values:
         """Return the algorithm's options as the task's default preset has them, later ones at their defaults."""
@@ -147,64 +161,104 @@ class Entry:
 
 def resolve(
     task_name: str,
-    model_name: str,
-    algorithm_name: str | None = None,
+    entry: str | Written,
+    algorithm: str | None = None,
     settings: Sequence[Setting] = (),
     preset: str | None = None,
 ) -> Entry:
-    """Build an entry from names and settings.
+    """Build an entry from its notation.
 
     Parameters
     ----------
-    preset:
-        One of the task's presets, or a preset file's path (anything that ends in `.toml`). A file's values come
-        before those of the task's default preset; `settings` come before both.
+    entry:
+        As `qrlsuite.notation.parse_entry` reads it: a model's name alone, or an entry's label.
+    algorithm, settings, preset:
+        What was given beside the text. A preset is one of the task's, or a file's path (anything that ends in `.toml`).
+        A file's values come before those of the task's default preset; settings come before both.
 
     Raises
     ------
     QrlSuiteError
         For an unknown name or option, or a value that an option cannot have.
     """
-    task = load(task_name)
-    file = presets.load(Path(preset)) if preset is not None and preset.endswith(".toml") else None
-    name = algorithm_name or (file.algorithm if file is not None else task.file.default_algorithm)
-    algorithm = registry.algorithm(name)
-    model = registry.model(model_name)
-    model_defaults: Mapping[str, Any] = {} if file is None else file.model_options
-    sides = option_sides(task, algorithm, model, settings, model_defaults)
-    task.check_presets(algorithm.name, sides["algorithm"])
-    values = options.assign(settings, sides)
-    _hand_to_ansatz(values, sides, model_defaults)
-    task = task.with_environment(values["environment"])
-    chosen, defaults = task.preset(None if file is not None else preset, algorithm.name, model.family)
-    tuning, defaults_by_side = task.tuning(chosen, algorithm.name, model.family), {"algorithm": defaults}
-    if file is not None and preset is not None:
-        presets.require(file, preset, algorithm.name, model.name)
-        for side, side_options in (("algorithm", file.algorithm_options), ("model", file.model_options)):
-            options.build(sides[side], side_options, f"preset file {preset}: {side} '{getattr(file, side)}'")
-        chosen, defaults = Path(preset).name, {**defaults, **file.algorithm_options}
-        tuning, defaults_by_side = (
-            file.tuning,
-            {"algorithm": file.algorithm_options, "model": file.model_options},
-        )
+    written = entry if isinstance(entry, Written) else notation.parse_entry(entry)
+    written = written.given(algorithm, tuple(settings), preset)
+    task, model = load(task_name), registry.model(written.model)
+    file = _preset_file(written)
+    spec = registry.algorithm(written.algorithm or (file.algorithm if file else task.file.default_algorithm))
+    sides = option_sides(task, spec, model, written.settings, file.model_options if file else None)
+    task.check_presets(spec.name, sides["algorithm"])
+    source = _task_preset(task, None if file else written.preset, spec, model)
+    if file is not None:
+        source = _file_preset(file, written.preset or "", sides, source)
+    values = options.assign(written.settings, sides)
+    _hand_to_ansatz(values, sides, source.model)
     model_options = options.build(
-        sides["model"], {**model_defaults, **values["model"]}, f"model '{model.name}'"
+        sides["model"], {**source.model, **values["model"]}, f"model '{model.name}'"
     )
     if hasattr(model_options, "check"):
         model_options.check()
     return Entry(
-        task=task,
-        algorithm=algorithm,
+        task=task.with_environment(values["environment"]),
+        algorithm=spec,
         model=model,
         algorithm_options=options.build(
-            sides["algorithm"], {**defaults, **values["algorithm"]}, f"algorithm '{algorithm.name}'"
+            sides["algorithm"], {**source.algorithm, **values["algorithm"]}, f"algorithm '{spec.name}'"
         ),
         model_options=model_options,
-        preset=chosen,
-        tuning=None
-        if tuning is None or chosen is None
-        else presets.record_of(tuning, chosen, defaults_by_side, values),
+        preset=source.name,
+        tuning=source.record(values),
     )
+
+
+@dataclass(frozen=True)
+class _Preset:
+    """Values that come before the defaults, and how they were found.
+
+    Attributes
+    ----------
+    tuned:
+        By side the values that the record speaks of.
+    """
+
+    name: str | None
+    algorithm: Mapping[str, Any]
+    model: Mapping[str, Any]
+    tuning: presets.TuningRecord | None
+    tuned: Mapping[str, Mapping[str, Any]]
+
+    def record(self, values: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+        """Return what an entry with these own values keeps of the tuning."""
+        if self.tuning is None or self.name is None:
+            return None
+        return presets.record_of(self.tuning, self.name, self.tuned, values)
+
+
+def _preset_file(written: Written) -> presets.PresetFile | None:
+    """Read the preset file that an entry names, if it names one."""
+    if written.preset is None or not written.preset.endswith(".toml"):
+        return None
+    file = presets.load(Path(written.preset))
+    presets.require(file, written.preset, written.algorithm or file.algorithm, written.model)
+    return file
+
+
+def _task_preset(
+    task: Task, name: str | None, algorithm: specs.AlgorithmSpec, model: specs.ModelSpec
+) -> _Preset:
+    chosen, values = task.preset(name, algorithm.name, model.family)
+    tuning = task.tuning(chosen, algorithm.name, model.family)
+    return _Preset(chosen, values, {}, tuning, {"algorithm": values})
+
+
+def _file_preset(
+    file: presets.PresetFile, path: str, sides: Mapping[str, type[Any]], usual: _Preset
+) -> _Preset:
+    tuned = {"algorithm": file.algorithm_options, "model": file.model_options}
+    for side, values in tuned.items():
+        options.build(sides[side], values, f"preset file {path}: {side} '{getattr(file, side)}'")
+    algorithm = {**usual.algorithm, **file.algorithm_options}
+    return _Preset(Path(path).name, algorithm, file.model_options, file.tuning, tuned)
 
 
 def option_sides(

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from qrlsuite import registry
-from qrlsuite.errors import StoreError, UnknownNameError, listed, nearest
+from qrlsuite import notation, registry
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.results.store import EntryStore
 
 
@@ -117,8 +118,38 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
 
 def fitting(among: Sequence[N], name: str) -> list[N]:
     """Return the entries that a name may mean, as `choose` does."""
-    whole = [e for e in among if name in _names(e)]
+    whole = [e for e in among if name in _names(e)] or _written(among, name)
     return whole or [e for e in among if any(known.startswith(name) for known in _names(e))]
+
+
+def _written(among: Sequence[N], text: str) -> list[N]:
+    """Return the entries that a text in the notation of entries means, its options in any order."""
+    task, slash, rest = text.partition("/")
+    if not slash or "=" in task:
+        task, rest = "", text
+    try:
+        written = notation.parse_entry(rest)
+        same_task = [e for e in among if task in ("", e.task)]
+        if written.preset is None:
+            return [e for e in same_task if _same(written, e.label)] if written.settings else []
+        names = {task: resolve(task, written).name for task in {e.task for e in same_task}}
+        return [e for e in same_task if e.name == names[e.task]]
+    except QrlSuiteError:
+        return []
+
+
+def _same(written: notation.Written, label: str) -> bool:
+    """Return whether a label says the same, but for an algorithm that is not written."""
+    try:
+        known = notation.parse_entry(label)
+    except OptionError:  # of a folder that is damaged, or put aside
+        return False
+    options = ({each.full_name: each.value for each in one.settings} for one in (written, known))
+    return (
+        written.algorithm in (None, known.algorithm)
+        and written.model == known.model
+        and next(options) == next(options)
+    )
 
 
 def mentions(entry: Named, word: str) -> bool:

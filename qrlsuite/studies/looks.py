@@ -27,7 +27,7 @@ import pydantic
 import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-from qrlsuite import options, specs
+from qrlsuite import notation, options, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
@@ -287,14 +287,12 @@ def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
 
 
 def _read_entry(text: str, algorithm: str | None, preset: str | None) -> _WrittenEntry:
-    """Split `[ALGORITHM] MODEL NAME=VALUE ...` into its parts."""
-    plain = [word for word in text.split() if "=" not in word]
-    if len(plain) not in (1, 2) or text.split()[: len(plain)] != plain:
-        raise OptionError(f"entry '{text}': write 'MODEL NAME=VALUE ...', for example 'mlp width=64'")
-    settings = [options.parse_setting(word) for word in text.split()[len(plain) :]]
-    values = {".".join(part for part in (each.side, each.name) if part): each.value for each in settings}
-    chosen = str(values.pop("preset", preset or "")) or None
-    return _WrittenEntry(plain[0] if len(plain) == 2 else algorithm, plain[-1], chosen, values)
+    """Read an entry's notation; what the text leaves open is as given beside it."""
+    written = notation.parse_entry(text)
+    values = {each.full_name: each.value for each in written.settings}
+    return _WrittenEntry(
+        written.algorithm or algorithm, written.model, written.preset or preset or None, values
+    )
 
 
 def _next_block(file: PlanFile) -> int:

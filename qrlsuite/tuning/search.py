@@ -17,7 +17,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite import options, registry
+from qrlsuite import notation, options, registry
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
@@ -68,8 +68,10 @@ class Request:
 
     Attributes
     ----------
-    settings:
-        Values that all trials share.
+    entry:
+        What is tuned, as `qrlsuite.notation.parse_entry` reads it. Its settings are shared by all trials.
+    algorithm, settings:
+        Given beside it.
     grid, varied:
         What is varied: a grid file, and options with lists of values of their own.
     trials, sampler_seed:
@@ -83,7 +85,7 @@ class Request:
     """
 
     task: str
-    model: str = ""
+    entry: str
     algorithm: str | None = None
     settings: tuple[Setting, ...] = ()
     grid: space.GridFile | None = None
@@ -100,29 +102,6 @@ class Request:
 def default_sampler(varied: object) -> str:
     """Return the sampler of a search that names none: all combinations of what is listed, else halving."""
     return "grid" if varied else "halving"
-
-
-def split_model(text: str) -> tuple[str, tuple[Setting, ...]]:
-    """Split `vqc-native qubits=6` into the model and its settings.
-
-    Raises
-    ------
-    OptionError
-        If it does not begin with a name, or a setting has no `=`.
-    """
-    name, *settings = text.split() or [""]
-    if not name or "=" in name:
-        raise OptionError(f"--model '{text}': write a model and its settings, for example 'mlp width=16'")
-    return name, tuple(options.parse_setting(word) for word in settings)
-
-
-def for_each_model(shared: Request, models: Iterable[str]) -> list[Request]:
-    """Return a request for each model and its settings (`mlp width=16`); all else is as in `shared`."""
-    requests = []
-    for text in models:
-        model, own = split_model(text)
-        requests.append(replace(shared, model=model, settings=(*shared.settings, *own)))
-    return requests
 
 
 @dataclass(frozen=True)
@@ -185,7 +164,8 @@ class Search(Shown):
         self.request = request
         self.results = results
         self.runs = results / FOLDER
-        self.base = resolve(request.task, request.model, request.algorithm, request.settings)
+        self.notation = notation.parse_entry(request.entry).given(request.algorithm, request.settings)
+        self.base = self._entry()
         self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
         self.trials: list[Trial] = []
         self.pending: list[Entry] = []
@@ -193,6 +173,11 @@ class Search(Shown):
         self.asked = 0
         self._seconds: dict[tuple[str, int], float] = {}
         self._begin()
+
+    def _entry(self, point: space.Point | None = None) -> Entry:
+        """Build the entry that is tuned, or the one at a point."""
+        own = (*self.notation.settings, *space.settings(point or {}))
+        return resolve(self.request.task, replace(self.notation, settings=own))
 
     def _begin(self) -> None:
         request = self.request
@@ -211,7 +196,7 @@ class Search(Shown):
         """Return what is varied, with the ranges that algorithm and model declare, if they shall count."""
         request = self.request
         ranges = space.declared(self.base) if declared else {}
-        return space.space(self.base, request.grid, request.varied, request.settings, ranges)
+        return space.space(self.base, request.grid, request.varied, self.notation.settings, ranges)
 
     @property
     def planned(self) -> int:
@@ -302,16 +287,7 @@ class Search(Shown):
     def _try(self, proposals: Sequence[Proposal], train: Train) -> list[Trial | None]:
         """Train settings on the same seeds and look at their curves; None where some are left to others."""
         self.asked += len(proposals)
-        request = self.request
-        entries = [
-            resolve(
-                request.task,
-                request.model,
-                request.algorithm,
-                [*request.settings, *space.settings(each.point)],
-            )
-            for each in proposals
-        ]
+        entries = [self._entry(each.point) for each in proposals]
         stores = train(entries, proposals[0].seeds, self.epochs)
         return [self._judge(*each) for each in zip(proposals, entries, stores)]
 

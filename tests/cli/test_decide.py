@@ -432,7 +432,7 @@ TWO = (*NEW, "mlp width=16", "mlp width=4")
         ),
         ((*NEW, "mlp", "mpl"), "unknown model 'mpl'; did you mean 'mlp'"),
         ((*NEW, "mlp", "mlp widht=4"), "did you mean 'width'"),
-        ((*NEW, "mlp", "width=4 mlp"), "entry 'width=4 mlp': write 'MODEL NAME=VALUE ...'"),
+        ((*NEW, "mlp", "width=4 mlp"), "entry 'width=4 mlp': mlp: write name=value"),
         (
             (*NEW, "mlp", "ppo mlp"),
             "different horizons: 'ddqn mlp width=64' at 1200 steps, 'ppo mlp width=64' at 1800",

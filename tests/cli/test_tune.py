@@ -117,7 +117,7 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tm
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--model", "width=4"], "--model 'width=4': write a model and its settings"),
+        (["--model", "width=4"], "entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ..."),
         (["--model", "mlp", "--model", "mlp", "--out", "p.toml"], "for one model"),
         (["--model", "mlp", "--grid", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
         (

@@ -224,7 +224,7 @@ def test_the_command(trained: EntryStore) -> None:
     assert policies[1] == f"{policies[0]} on qiskit shots=10 estimator=aer"
     for wrong, message in (
         (["--backend-set", "shots=10"], "--backend-set needs --backend"),
-        (["--backend", "native", "--backend-set", "shots"], "write name=value, for example --backend-set shots=1000"),
+        (["--backend", "native", "--backend-set", "shots"], "--backend-set shots: write name=value"),
     ):  # fmt: skip
         result = CliRunner().invoke(build(), [*words, *wrong])
         assert isinstance(result.exception, OptionError)

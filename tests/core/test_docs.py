@@ -19,7 +19,6 @@ from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.published import PUBLISHED
 from qrlsuite.options import parse_setting
-from qrlsuite.tuning.search import split_model
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -111,8 +110,7 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
     for model in [value for key, value in itertools.pairwise(words) if key == "--model"] * (
         words[0] == "tune"
     ):
-        name, own = split_model(model)
-        resolve(named["--task"], name, named.get("--algorithm"), own)
+        resolve(named["--task"], model, named.get("--algorithm"))
     if (
         words[0] == "run"
         and "--task" in named

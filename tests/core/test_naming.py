@@ -44,6 +44,8 @@ SEVERAL = [
         ("beam6g-degree4/mlp width=16", 1),
         ("beam6g/ddqn mlp width=16", 0),
         ("beam6g-degree4/", 1),
+        ("beam6g/mlp depth=3 width=64", 6),
+        ("mlp depth=3.0 width=6.4e1", 6),
     ],
 )
 def test_an_entry_answers_to(name: str, found: int) -> None:

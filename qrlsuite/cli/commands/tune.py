@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -171,6 +172,7 @@ def tune(
     limit = None if budget is None else seconds(budget)
     shared = search.Request(
         task=task,
+        entry="",
         algorithm=algorithm,
         settings=tuple(options.parse_setting(word) for word in settings or []),
         grid=None if grid is None else space.load(grid),
@@ -183,7 +185,7 @@ def tune(
         epochs=epochs,
         objective=objective.value,
     )
-    searches = runner.build(search.for_each_model(shared, models), runs)
+    searches = runner.build([replace(shared, entry=each) for each in models], runs)
     where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
     display = TuneDisplay(searches, where, quiet=json_output)
     display.begin()
