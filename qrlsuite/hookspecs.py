@@ -201,7 +201,7 @@ def register_circuit_backends(register: Callable[[specs.CircuitBackendSpec], Non
 def register_rules(register: Callable[[specs.RuleSpec], None]) -> None:
     """Register rules that decide whether one entry needs significantly fewer samples than another.
 
-    They appear as `qrlsuite leaderboard --rule NAME`, `compare --rule NAME` and `calibrate --rule NAME`. A rule has
+    They appear as `qrlsuite leaderboard --rule NAME` and `compare --rule NAME`. A rule has
     a `name`, a `promise` (one sentence: which error probability it controls, and which it does not), and is
     called with two `qrlsuite.statistics.Evidence` objects, already at equal numbers of runs and one horizon. It
     returns an array (epsilons, deltas) of +1 where the first needs significantly fewer samples, -1 where it

@@ -47,9 +47,6 @@ BUILT_IN = {
         LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
         LazyCommand("compare", "Say which of two entries needs fewer steps.", f"{_ROOM}.compare:compare"),
         LazyCommand(
-            "calibrate", "Measure how often the significance rules err.", f"{_ROOM}.calibrate:calibrate"
-        ),
-        LazyCommand(
             "plot",
             "Draw a picture of results or of an environment.",
             f"{_ROOM}.plot:plot",
@@ -77,8 +74,8 @@ BUILT_IN = {
     )
 }
 
-RENAMED = {"status": "runs"}
-"""Commands of earlier versions, and what does their work now."""
+RENAMED = {"status": "qrlsuite runs", "calibrate": "python benchmarks/calibration.py"}
+"""Commands of earlier versions, one word or two, and what does their work now."""
 
 
 @functools.cache
@@ -100,8 +97,9 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return name, command and the remaining arguments, importing a built-in command."""
-        if args[0] in RENAMED and args[0] not in self.commands:
-            raise OptionError(f"`qrlsuite {args[0]}` is now `qrlsuite {RENAMED[args[0]]}`")
+        for words in (" ".join(args[:2]), args[0]):
+            if words in RENAMED and words not in self.commands:
+                raise OptionError(f"`qrlsuite {words}` is now `{RENAMED[words]}`")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load(BUILT_IN[name]) if name in BUILT_IN else command, rest
 

@@ -1,4 +1,4 @@
-"""`plot`, `compare --rule` and `calibrate` as a user meets them, on learning curves that are simply written down."""
+"""`plot` and `compare --rule` as a user meets them, on learning curves that are simply written down."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -162,27 +161,3 @@ def test_rules_are_listed_shown_and_named_by_the_board(entries: list[EntryResult
     assert "promises: all tolerances of one pair" in call("show", "times-skewed")
     assert "rule 'times-skewed': all tolerances" in call("leaderboard", "--rule", "times-skewed")
     assert json.loads(call("leaderboard", "--format", "json"))["rule"] == "intervals"
-
-
-def test_calibrate_says_how_long_and_what_came_out(entries: list[EntryResults]) -> None:
-    words = ("calibrate", "qubits=6", "--draws", "4", "--seeds", "20", "--board", "2", "--part", "pairs")
-    output = call(*words, "--rule", "intervals")
-    assert "'intervals' promises each cell by itself" in output
-    assert "a false winner between two equal entries of 20 seeds in" in output
-    content = json.loads(call(*words, "--rule", "intervals", "--json"))
-    assert [rate["seeds"] for rate in content["rates"]] == [[20, 20]]
-    assert 0 <= content["rates"][0]["winner"] <= 1
-    with pytest.raises(OptionError, match="--seeds 20;30: write two numbers"):
-        call("calibrate", "--seeds", "20;30")
-    with pytest.raises(OptionError, match="--seeds 1,30: both numbers must be between 2 and 10000"):
-        call("calibrate", "--seeds", "1,30")
-    halves = call("calibrate", "qubits=6", "--draws", "4", "--part", "halves", "--rule", "times")
-    assert "'times' declares a false winner between halves of one entry in" in halves
-    object.__setattr__(entries[0], "curves", entries[0].curves[:, :10])
-    cut = json.loads(call("calibrate", "--draws", "4", "--part", "halves", "--json").splitlines()[-1])
-    assert len(cut["entries"]) == 2, "an entry at epoch 10 of 100 would cut the others' curves to 10 epochs"
-    assert cut["horizon"] == 100 * entries[1].steps_per_epoch
-    object.__setattr__(entries[2], "curves", np.zeros((1, 100)))
-    object.__setattr__(entries[2], "seeds", (0,))
-    with pytest.raises(UnknownNameError, match="no entry with two seeds or more"):
-        call("calibrate", "qubits=6")

@@ -129,7 +129,6 @@ def two_tasks(tiny_task: str, train: Callable[..., Path], tmp_path: Path) -> Pat
         ("evaluate", "mlp width=8", "mlp width=16", "--episodes", "2"),
         ("export", "mlp width=8", "--out", "out"),
         ("plot", "curves", "--entry", "mlp width=8", "--out", "p.png"),
-        ("calibrate", "mlp width=8", "--draws", "4", "--part", "halves"),
     ],
 )
 def test_a_task_narrows_the_search(

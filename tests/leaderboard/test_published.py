@@ -22,7 +22,7 @@ from qrlsuite import api, hookimpl, registry
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import board, calibration, costs, studies
+from qrlsuite.leaderboard import board, costs, studies
 from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
@@ -726,14 +726,6 @@ def test_a_task_whose_published_entries_are_all_unranked_has_a_board_of_them(
     with pytest.raises(QrlSuiteError, match="'mlp' may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"):
         api.load("mlp", task="beam6g", runs=runs, published=True)
     assert len(api.board("beam6g", runs=runs, published=True, study=two).refused) == 1, "width 64 is absent"
-
-
-def test_calibration_takes_a_published_variant_of_a_task(tmp_path: Path) -> None:
-    entries, refused = calibration.choose(tmp_path, (), "beam6g+7d1167f1", published=True)
-    assert {entry.task for entry in entries} == {"beam6g+7d1167f1"}
-    assert not refused
-    with pytest.raises(QrlSuiteError, match="unknown task"):
-        calibration.choose(tmp_path, (), "beam6g+7d1167f1")
 
 
 def test_an_ambiguous_name_lists_ranked_entries_where_some_fit(tmp_path: Path) -> None:
