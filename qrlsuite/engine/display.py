@@ -13,8 +13,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn
 
 from qrlsuite import registry
-from qrlsuite.engine.api import Missing
 from qrlsuite.engine.terminal import command
+from qrlsuite.engine.work import Missing
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.text import counted, duration
 

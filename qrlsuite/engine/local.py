@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import IO
 
-from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
+from qrlsuite.engine.work import EngineOutcome, Show, Work, job_name, worker_command
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
@@ -31,10 +31,11 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_
 
 
 class WorkerJob:
-    """A group, the process that was started for it, and how often that died; `name` is the group's id if not given."""
+    """A group of one of the works, the process that was started for it, and how often that died."""
 
-    def __init__(self, group: SeedGroup, progress: ProgressFile, name: str | None = None) -> None:
-        self.group, self.progress, self.name = group, progress, name or group.id
+    def __init__(self, work: Work, group: SeedGroup, works: Sequence[Work]) -> None:
+        self.work, self.group, self.name = work, group, job_name(work, group, works)
+        self.progress = ProgressFile(work.store, group.id)
         self.deaths, self.epoch_at_death = 0, -1
         self.process: subprocess.Popen[bytes] | None = None
         self.output: IO[bytes] | None = None
@@ -87,7 +88,7 @@ class LocalEngine:
         """Return nothing: what waits for a local process waits in that process."""
         return set()
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
         """Train groups in worker processes until all have finished or failed.
 
         Raises
@@ -95,22 +96,7 @@ class LocalEngine:
         KeyboardInterrupt
             After Ctrl-C, when every worker has saved and ended.
         """
-        return self.run_all([work], show)
-
-    def run_all(self, several: Sequence[Work], show: Show) -> EngineOutcome:
-        """Do several pieces of work as `run` does one: as many groups at a time as `workers` of the first says.
-
-        Where there is more than one, an entry's name stands before the ids of its groups.
-        """
-        jobs = {
-            WorkerJob(
-                group,
-                ProgressFile(work.store, group.id),
-                f"{work.store.path.name} {group.id}" if len(several) > 1 else None,
-            ): work
-            for work in several
-            for group in work.groups
-        }
+        jobs = [WorkerJob(work, group, works) for work in works for group in work.groups]
         waiting = deque(jobs)
         outcome = EngineOutcome()
         for job in jobs:
@@ -118,10 +104,10 @@ class LocalEngine:
         pause = 0.01  # grows until another job begins, so that a short run is seen to end at once
         try:
             while waiting or self._running:
-                while waiting and len(self._running) < several[0].workers:
+                while waiting and len(self._running) < works[0].workers:
                     job = waiting.popleft()
                     self._running.append(job)
-                    _start(job, jobs[job])
+                    _start(job)
                     pause = 0.01
                 time.sleep(pause)
                 pause = min(1.5 * pause, 0.2)
@@ -156,11 +142,11 @@ class LocalEngine:
         self._running.clear()
 
 
-def _start(job: WorkerJob, work: Work) -> None:
+def _start(job: WorkerJob) -> None:
     job.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the worker has ended
     # a session of its own: Ctrl-C reaches the workers once, from here
     job.process = subprocess.Popen(
-        [*worker_command(work, job.group), "--follow-parent", str(os.getpid())],
+        [*worker_command(job.work, job.group), "--follow-parent", str(os.getpid())],
         env={**os.environ, **ONE_THREAD},
         stdin=subprocess.DEVNULL,
         stdout=job.output,

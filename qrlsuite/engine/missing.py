@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.engine import api, remote
-from qrlsuite.engine.api import EngineOutcome, Missing
+from qrlsuite.engine import remote
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
+from qrlsuite.engine.work import EngineOutcome, Missing, RemoteEngine, Snapshot, raise_failures
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
@@ -60,7 +60,7 @@ def find(
     busy &= set(requested)
     left = sorted(set(requested) - busy)
     missing = plan_groups(store, left, last, where.workers)
-    if missing and isinstance(where.engine, api.RemoteEngine):
+    if missing and isinstance(where.engine, RemoteEngine):
         missing = plan_groups(store, left, last, where.workers, remote.seeds_per_task(entry))
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
 
@@ -147,7 +147,7 @@ def train(
     """
     began = time.monotonic()
 
-    def show(snapshot: api.Snapshot) -> None:
+    def show(snapshot: Snapshot) -> None:
         display.update(snapshot)
         if display.endless and not confirmed and minutes is None and display.console.is_terminal:
             raise QrlSuiteError("stopped: this takes more than a day; --yes starts it anyway")
@@ -171,7 +171,7 @@ def train(
     if not work.groups:
         return EngineOutcome()
     try:
-        outcome = where.run(work, show)
+        outcome = where.run([work], show)
     except _TimeIsUp:
         display.out_of_time(minutes or 0.0)
         return EngineOutcome()
@@ -187,7 +187,7 @@ def train(
     if fresh and outcome.failed and not work.store.seeds() and not living(work.store):
         _remove(work.store.path)
         raise QrlSuiteError("; ".join(sorted(set(outcome.failed.values()))))
-    api.raise_failures(outcome)
+    raise_failures(outcome)
     for message in outcome.taken.values():
         display.console.print(f"left out: {printable(message)}", markup=False, emoji=False)
     return outcome

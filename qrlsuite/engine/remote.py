@@ -21,8 +21,17 @@ from typing import TYPE_CHECKING, Any
 from qrlsuite import registry
 from qrlsuite.engine import probe as probing
 from qrlsuite.engine.answers import Asked, Expected, expected_of, require_alike, require_fit
-from qrlsuite.engine.api import Answer, ChoosingLink, EngineOutcome, Link, RemoteEngine, Show, Work
 from qrlsuite.engine.local import ATTEMPTS
+from qrlsuite.engine.work import (
+    Answer,
+    ChoosingLink,
+    EngineOutcome,
+    Link,
+    RemoteEngine,
+    Show,
+    Work,
+    job_name,
+)
 from qrlsuite.engine.worker import checkpoint_seconds
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
@@ -91,8 +100,8 @@ def seeds_per_task(entry: Entry) -> int:
     return (MOST_BYTES - HEADER_BYTES) // size
 
 
-def train(engine: RemoteEngine, work: Work, show: Show) -> EngineOutcome:
-    """Train groups of an entry to their last epoch.
+def train(engine: RemoteEngine, works: Sequence[Work], show: Show) -> EngineOutcome:
+    """Train groups of entries to their last epoch, one entry after the other.
 
     Raises
     ------
@@ -101,18 +110,21 @@ def train(engine: RemoteEngine, work: Work, show: Show) -> EngineOutcome:
     QrlSuiteError
         If nobody can be connected to, or the connection is lost.
     """
-    run = _Run(engine, work)
-    try:
-        return run.train(show)
-    finally:
-        run.close()
+    outcome = EngineOutcome()
+    for work in works:
+        run = _Run(engine, work, works)
+        try:
+            outcome += run.train(show)
+        finally:
+            run.close()
+    return outcome
 
 
 class _Member:
     """A group, where it stands, and the task that it waits for."""
 
-    def __init__(self, work: Work, group: SeedGroup) -> None:
-        self.group = group
+    def __init__(self, work: Work, group: SeedGroup, works: Sequence[Work]) -> None:
+        self.group, self.name = group, job_name(work, group, works)
         self.progress_file = ProgressFile(work.store, group.id)
         self.progress = Progress(phase="waiting", epoch=group.epoch, epochs=work.epochs)
         self.epoch = group.epoch
@@ -130,7 +142,7 @@ class _Member:
 class _Run:
     """The training of groups of one entry."""
 
-    def __init__(self, engine: RemoteEngine, work: Work) -> None:
+    def __init__(self, engine: RemoteEngine, work: Work, works: Sequence[Work]) -> None:
         from qrlsuite.training.group import GroupFiles  # torch
 
         self.work, self.store = work, work.store
@@ -147,7 +159,7 @@ class _Run:
         self.found: dict[str, Any] | None = None
         """What a probe has found, see `qrlsuite.engine.probe`."""
         self.outcome = EngineOutcome()
-        self.members = [_Member(work, group) for group in work.groups]
+        self.members = [_Member(work, group, works) for group in work.groups]
         self.files: dict[str, GroupFiles] = {}
         self.answered = 0
         self.sent: dict[str, _Member] = {}
@@ -171,7 +183,7 @@ class _Run:
                 if answer.key in self.sent:  # else it is answered twice
                     self._guarded(self.sent.pop(answer.key), functools.partial(self._take, answer=answer))
             self.claims.require()
-            show({member.group.id: dataclasses.asdict(member.progress) for member in self.members})
+            show({member.name: dataclasses.asdict(member.progress) for member in self.members})
         return self.outcome
 
     def close(self) -> None:
@@ -196,7 +208,7 @@ class _Run:
             return
         try:
             first.progress.phase = "probing"
-            show({first.group.id: dataclasses.asdict(first.progress)})
+            show({first.name: dataclasses.asdict(first.progress)})
             self.found = probe.judge()
         finally:
             probe.claim.release()
@@ -212,12 +224,12 @@ class _Run:
         try:
             step(member)
         except SeedsClaimedError as error:
-            self.outcome.taken[member.group.id] = str(error)
+            self.outcome.taken[member.name] = str(error)
         except QrlSuiteError as error:
             self._fail(member, str(error))
 
     def _fail(self, member: _Member, message: str) -> None:
-        self.outcome.failed[member.group.id] = message
+        self.outcome.failed[member.name] = message
         self.claims.release(member.group.seeds)
         with contextlib.suppress(StoreError):  # on a full disk the message is in the outcome alone
             member.write(message)

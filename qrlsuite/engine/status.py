@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qrlsuite.engine.api import Queues
+from qrlsuite.engine.where import Queues
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import lookup
 from qrlsuite.results.store import entries

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from qrlsuite import registry, specs
-from qrlsuite.engine import api, remote
-from qrlsuite.engine.api import Engine, EngineOutcome, Missing, RemoteEngine
-from qrlsuite.engine.local import LocalEngine
+from qrlsuite import options, registry, specs
+from qrlsuite.engine.work import Engine, EngineOutcome, Missing, Show, Work
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup
+from qrlsuite.results.store import EntryStore
 from qrlsuite.training import device as devices
 from qrlsuite.training import memory
 
@@ -34,7 +36,7 @@ class Where:
         Its author's word that a change of code changes nothing: the reason.
     """
 
-    engine: Engine | RemoteEngine
+    engine: Engine
     workers: int
     device: str = "cpu"
     submits: bool = False
@@ -67,40 +69,35 @@ class Where:
             no such device.
         """
         devices.check(device)  # the machine that trains checks whether it has this device
-        built = api.create(engine, options or {})
+        built = build(engine, options or {})
         spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
         return cls(built, built.workers(workers), device, spec.submits, engine, spec.remote or spec.submits)
 
-    def run(self, missing: Missing, show: api.Show) -> EngineOutcome:
-        """Let the engine train the groups of missing seeds."""
-        handed = api.Work(missing.store, missing.groups, missing.epochs, self.workers, self.device)
-        if isinstance(self.engine, RemoteEngine):
-            return remote.train(self.engine, handed, show)
-        return self.engine.run(handed, show)
+    def run(self, several: Sequence[Missing], show: Show) -> EngineOutcome:
+        """Let the engine train one of the lists of `divide` to the same epoch: several entries in populations."""
+        if len(several) > 1:
+            return self.engine.run(self._populations(several), show)
+        [missing] = several
+        work = Work(missing.store, missing.groups, missing.epochs, self.workers, self.device)
+        return self.engine.run([work], show)
 
     @property
     def room(self) -> int:
         """How many seeds can be trained side by side; 1 where the engine trains one entry after the other."""
-        return LARGEST_GROUP * self.workers if isinstance(self.engine, LocalEngine) else 1
+        return 1 if self.remote else LARGEST_GROUP * self.workers
 
     def divide(self, several: Sequence[Missing]) -> list[list[Missing]]:
-        """Group the entries that one population can train: each list of them is one call of `run_together`."""
+        """Group the entries that one population can train: each list of them is one call of `run`."""
         alike: dict[str, list[Missing]] = {}
         for missing in several:
             if missing.groups:
                 # of an entry that another process trains too, other seeds are free than of the rest
-                side_by_side = isinstance(self.engine, LocalEngine) and not missing.busy
+                side_by_side = not (self.remote or missing.busy)
                 key = missing.entry.population_key if side_by_side else missing.entry.hash
                 alike.setdefault(key, []).append(missing)
         return list(alike.values())
 
-    def run_together(self, several: Sequence[Missing], show: api.Show) -> EngineOutcome:
-        """Let the engine train one of the lists of `divide` to the same epoch: several entries in populations."""
-        if len(several) > 1 and isinstance(self.engine, LocalEngine):
-            return self.engine.run_all(self._populations(several), show)
-        return self.run(several[0], show)
-
-    def _populations(self, several: Sequence[Missing]) -> list[api.Work]:
+    def _populations(self, several: Sequence[Missing]) -> list[Work]:
         """Divide entries that one population can train among the workers.
 
         Seeds are divided first, and entries where there are more workers than seeds, or groups would be too large.
@@ -123,5 +120,72 @@ class Where:
         for i in range(parts):
             first, *others = several[i * len(several) // parts : (i + 1) * len(several) // parts]
             stores = [missing.store for missing in others]
-            work.append(api.Work(first.store, groups, first.epochs, self.workers, self.device, stores))
+            work.append(Work(first.store, groups, first.epochs, self.workers, self.device, stores))
         return work
+
+
+def build(name: str, option_values: Mapping[str, Any]) -> Engine:
+    """Build a registered engine.
+
+    Parameters
+    ----------
+    option_values:
+        Its options by name; None stands for an option that was not given.
+
+    Raises
+    ------
+    UnknownNameError, OptionError
+        If there is no such engine, or it has no such option or value.
+    PluginError
+        If it has not the methods of an engine.
+    QrlSuiteError
+        If a package that it needs is not installed; the message has the pip command.
+    """
+    spec = cast(specs.EngineSpec, registry.load().get("engines", name).spec)
+    chosen_values = {key: value for key, value in option_values.items() if value is not None}
+    if spec.options is None and chosen_values:
+        raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(chosen_values))}")
+    for module, command in spec.extras.items():
+        if importlib.util.find_spec(module) is None:
+            raise QrlSuiteError(f"engine '{name}' needs the package '{module}': {command}")
+    chosen = None
+    if spec.options is not None:
+        chosen = options.build(specs.resolve(spec.options), chosen_values, f"engine '{name}'")
+    built: Engine = specs.resolve(spec.factory)(chosen)
+    run = getattr(built, "run", None)
+    if run is None or next(iter(inspect.signature(run).parameters), "") == "work":
+        raise PluginError(
+            f"engine '{name}' was written for an earlier version: `run(works, show)` takes a list of works and is what "
+            "every engine has, with or without `connect` (see `qrlsuite.engine.api`)"
+        )
+    return built
+
+
+class Queues:
+    """Queues of submitting engines; one that fails to answer is not asked again."""
+
+    def __init__(self) -> None:
+        self._engines: dict[str, Engine] = {}
+        self._silent: dict[str, QrlSuiteError] = {}
+
+    def waiting(self, store: EntryStore) -> set[int]:
+        """Return the seeds of an entry that were handed to a queue and are still there.
+
+        Raises
+        ------
+        QrlSuiteError
+            If a queue that was handed seeds cannot be asked on this machine.
+        """
+        seeds: set[int] = set()
+        for path in sorted(store.path.glob("*/submitted.json")):  # in a folder that has the engine's name
+            name = path.parent.name
+            if name in self._silent:
+                raise self._silent[name]
+            try:
+                if name not in self._engines:
+                    self._engines[name] = build(name, {})
+                seeds |= self._engines[name].queued(store)
+            except QrlSuiteError as error:
+                self._silent[name] = error
+                raise
+        return seeds

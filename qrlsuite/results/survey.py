@@ -15,7 +15,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, move_away
 from qrlsuite.results.progress import read_progress
-from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines
+from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines, write_json
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
 """What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
@@ -159,6 +159,26 @@ def waiting(store: EntryStore, problems: list[str]) -> list[dict[str, Any]]:
             continue
         queued += tasks
     return queued
+
+
+def submitted(store: EntryStore) -> list[dict[str, Any]]:
+    """Return what `waiting` returns.
+
+    Raises
+    ------
+    StoreError
+        If `submitted.json` is damaged.
+    """
+    problems: list[str] = []
+    tasks = waiting(store, problems)
+    if problems:
+        raise StoreError(problems[0])
+    return tasks
+
+
+def write_submitted(store: EntryStore, engine: str, tasks: Sequence[Mapping[str, Any]]) -> None:
+    """Write down which tasks of an entry an engine has handed to a queue: `job`, `seeds`, `epochs`, `time`."""
+    write_json(store.path / engine / "submitted.json", {"tasks": list(tasks)})
 
 
 def is_task(task: Any) -> bool:

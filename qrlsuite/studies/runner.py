@@ -14,11 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry
-from qrlsuite.engine.api import EngineOutcome, Missing
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.missing import find, train
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
+from qrlsuite.engine.work import EngineOutcome, Missing
 from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds

@@ -13,9 +13,8 @@ from qrlsuite import specs
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import Checklist, Finding, require
 
-BOTH = {"workers": ("asked",), "queued": ("store",)}
-METHODS = {**BOTH, "run": ("work", "show")}
-REMOTE_METHODS = {**BOTH, "connect": ("workers", "versions")}
+METHODS = {"workers": ("asked",), "queued": ("store",), "run": ("works", "show")}
+REMOTE_METHODS = {**METHODS, "connect": ("workers", "versions")}
 """Methods of an engine without a shared folder."""
 
 ANSWER_SECONDS = 60.0

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from qrlsuite.engine.api import Missing
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.where import Where
+from qrlsuite.engine.work import Missing
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
 from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text

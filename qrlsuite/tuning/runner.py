@@ -7,8 +7,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from qrlsuite.engine import api, missing
+from qrlsuite.engine import missing
 from qrlsuite.engine.where import Where
+from qrlsuite.engine.work import raise_failures
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
@@ -113,8 +114,8 @@ def _run(
         display.begin_trials(works)
         for together in where.divide(works):
             display.training(together)
-            outcome = where.run_together(together, display.update)
-            api.raise_failures(outcome)
+            outcome = where.run(together, display.update)
+            raise_failures(outcome)
             if outcome.submitted is not None:
                 display.console.print(outcome.submitted, markup=False)
         return [work.store for work in works]

@@ -38,7 +38,7 @@ class Engine:
     def queued(self, store):
         return set()
 
-    def run(self, work, show):
+    def run(self, works, show):
         raise AssertionError("a check starts nothing")
 
 @hookimpl

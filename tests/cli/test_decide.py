@@ -9,7 +9,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -87,7 +87,8 @@ class Scripted:
     def queued(self, store: EntryStore) -> set[int]:
         return set()
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        [work] = works
         for group in work.groups:
             if len(self.trained) == self.interrupt_at:
                 raise KeyboardInterrupt
@@ -101,7 +102,8 @@ class Scripted:
 class Queue(Scripted):
     """An engine that hands work over and leaves."""
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        [work] = works
         return EngineOutcome(submitted=f"{sum(len(group.seeds) for group in work.groups)} seeds submitted")
 
 

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.engine.api import Missing
 from qrlsuite.engine.display import CostEstimate, RunDisplay
 from qrlsuite.engine.missing import summarize
+from qrlsuite.engine.work import Missing
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import Progress, ProgressFile

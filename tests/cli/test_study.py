@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,8 @@ class Here:
     def queued(self, store: EntryStore) -> set[int]:
         return set()
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        [work] = works
         for group in work.groups:
             train_group(work.store.path, group.seeds, work.epochs)
             self.trained.append((work.store.record()["label"], group.seeds))
@@ -93,7 +95,8 @@ class Queue(Here):
     def queued(self, store: EntryStore) -> set[int]:
         return self.waiting.get(store.path.name, set())
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        [work] = works
         seeds = {seed for group in work.groups for seed in group.seeds}
         self.waiting.setdefault(work.store.path.name, set()).update(seeds)
         return EngineOutcome(submitted=f"{len(seeds)} seeds submitted")

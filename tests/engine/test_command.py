@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.engine import api
-from qrlsuite.engine.command import CommandEngine, CommandOptions, shell_line
 from qrlsuite.errors import OptionError
 from qrlsuite.options import build as build_options
+from qrlsuite.plugins.engines.command import CommandEngine, CommandOptions, shell_line
 from qrlsuite.results import claims
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
@@ -113,7 +113,7 @@ def test_a_killed_worker_is_started_again_and_ctrl_c_reaches_one_that_no_process
 
 def run(store: EntryStore, template: str, seeds: tuple[int, ...] = (5,)) -> api.EngineOutcome:
     work = api.Work(store, [SeedGroup(seeds, 0)], 2, 1)
-    return CommandEngine(CommandOptions(template)).run(work, lambda snapshot: None)
+    return CommandEngine(CommandOptions(template)).run([work], lambda snapshot: None)
 
 
 def test_a_command_that_fails_is_named_by_what_it_says(train: Callable[..., Path]) -> None:
@@ -144,5 +144,5 @@ def test_a_command_that_never_begins_a_worker_ends_with_ctrl_c(
     work = api.Work(store, [SeedGroup((5,), 0), SeedGroup((6,), 0)], 2, 2)
     template = "test {i} = 2 || sleep 1000 # {command}"
     with pytest.raises(KeyboardInterrupt):
-        CommandEngine(CommandOptions(template)).run(work, show)
+        CommandEngine(CommandOptions(template)).run([work], show)
     assert "1 worker may still wait in a queue" in caplog.text

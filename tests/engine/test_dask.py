@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import __version__, api
-from qrlsuite.engine.dask import DaskEngine, DaskLink, DaskOptions
 from qrlsuite.engine.status import survey
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError
+from qrlsuite.plugins.engines.dask import DaskEngine, DaskLink, DaskOptions
 from qrlsuite.results.store import EntryStore
 from tests.commands import Command, qrlsuite, start
 from tests.conftest import TINY, most_epochs, results

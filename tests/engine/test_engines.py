@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 
 from qrlsuite import registry
 from qrlsuite.cli.app import build
-from qrlsuite.engine import api, local, worker
+from qrlsuite.engine import api, local, where, worker
 from qrlsuite.engine.local import LocalEngine
-from qrlsuite.engine.slurm import SlurmEngine, SlurmOptions, minutes
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.options import build as build_options
+from qrlsuite.plugins.engines.slurm import SlurmEngine, SlurmOptions, minutes
 from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
 from qrlsuite.results.seeds import SeedGroup
@@ -32,7 +32,7 @@ from tests.conftest import Hold, results
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
     assert {"local", "slurm"} <= set(registry.load().names("engines"))
-    assert isinstance(api.create("local", {"partition": None}), LocalEngine)
+    assert isinstance(where.build("local", {"partition": None}), LocalEngine)
 
 
 @pytest.mark.parametrize(
@@ -44,13 +44,25 @@ def test_engines_enter_by_the_door_of_plugins() -> None:
 )
 def test_wrong_engines(name: str, given: dict[str, object], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        api.create(name, given)
+        where.build(name, given)
+
+
+def test_an_engine_of_an_earlier_version_is_told_what_run_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for without in (
+        {"run": lambda self, work, show: None},
+        {"connect": lambda self, workers, versions: None},
+    ):
+        monkeypatch.setattr(LocalEngine, "run", None)
+        for name, method in without.items():
+            monkeypatch.setattr(LocalEngine, name, method, raising=False)
+        with pytest.raises(PluginError, match=r"engine 'local' was written .* takes a list of works"):
+            where.build("local", {})
 
 
 def test_a_missing_package_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(QrlSuiteError, match=r"needs the package 'submitit': pip install 'qrlsuite\[slurm\]'"):
-        api.create("slurm", {})
+        where.build("slurm", {})
 
 
 @pytest.mark.parametrize(
@@ -81,7 +93,7 @@ def test_slurm_that_is_not_there(train: Callable[..., Path], monkeypatch: pytest
     monkeypatch.setenv("PATH", "")
     engine = SlurmEngine(SlurmOptions())
     with pytest.raises(QrlSuiteError, match="there is no SLURM on this machine"):
-        engine.run(api.Work(store, [SeedGroup((1,), 0)], 2, 1), lambda snapshot: None)
+        engine.run([api.Work(store, [SeedGroup((1,), 0)], 2, 1)], lambda snapshot: None)
     assert engine.queued(store) == set(), "without a submission nobody is asked"
     write_json(
         store.path / "slurm" / "submitted.json", {"tasks": [{"job": "1_0", "seeds": [3], "epochs": 2}]}

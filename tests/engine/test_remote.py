@@ -9,7 +9,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,9 @@ class Here:
     def queued(self, store: EntryStore) -> set[int]:
         return set()
 
+    def run(self, works: Sequence[api.Work], show: api.Show) -> EngineOutcome:
+        return api.train_remotely(self, works, show)
+
     def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
         return self
 
@@ -86,7 +89,7 @@ def train(
     engine: Here, store: EntryStore, groups: list[tuple[int, ...]], epochs: int = EPOCHS
 ) -> EngineOutcome:
     work = api.Work(store, [SeedGroup(seeds, 0) for seeds in groups], epochs, len(groups))
-    outcome = remote.train(engine, work, lambda snapshot: None)
+    outcome = engine.run([work], lambda snapshot: None)
     assert engine.closed
     assert claims.claims(store) == []
     return outcome
@@ -494,7 +497,7 @@ def advance_error(store: EntryStore) -> str:
 def test_seeds_that_somebody_else_trains_are_left_to_them(store: EntryStore) -> None:
     claim = claims.acquire(store, [0])
     work = api.Work(store, [SeedGroup((0,), 0), SeedGroup((1,), 0)], 1, 2)
-    outcome = remote.train(Here(), work, lambda snapshot: None)
+    outcome = remote.train(Here(), [work], lambda snapshot: None)
     claim.release()
     (message,) = outcome.taken.values()
     assert "is being trained" in message or "are being trained" in message
@@ -535,7 +538,7 @@ def test_ctrl_c_keeps_what_was_accepted(store: EntryStore, train_locally: Callab
     work = api.Work(store, [SeedGroup((0,), 0)], EPOCHS, 1)
     engine = Here()
     with pytest.raises(KeyboardInterrupt):
-        remote.train(engine, work, show)
+        remote.train(engine, [work], show)
     assert engine.closed
     assert claims.claims(store) == []
     assert checkpoint.load(store, [0])[0] == 2

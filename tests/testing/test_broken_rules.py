@@ -97,7 +97,7 @@ class GoodEngine:
     def queued(self, store: Any) -> set[int]:
         return set()
 
-    def run(self, work: Any, show: Any) -> None:
+    def run(self, works: Any, show: Any) -> None:
         raise AssertionError("a check starts nothing")
 
 
@@ -106,7 +106,7 @@ def picky_engine() -> GoodEngine:
 
 
 class ShortRun(GoodEngine):
-    def run(self, work: Any) -> None:  # type: ignore[override]
+    def run(self, works: Any) -> None:  # type: ignore[override]
         pass
 
 
@@ -152,7 +152,7 @@ class GoodLink:
 
 class GoodRemote:
     link: type[GoodLink] = GoodLink
-    workers, queued = GoodEngine.workers, GoodEngine.queued
+    workers, queued, run = GoodEngine.workers, GoodEngine.queued, GoodEngine.run
 
     def __init__(self, options: None) -> None:
         pass
@@ -264,7 +264,7 @@ BROKEN = [
     ("rules", "direction", Broken(rule("Backwards"), r"-1 for an entry that needs about 300")),
     ("rules", "against", Broken(rule("Hasty"), r"is not rule\(first, other\) for each")),
     ("engines", "builds", Broken(engine("picky_engine"), r"the factory takes the options, or None")),
-    ("engines", "methods", Broken(engine("ShortRun"), r"run\(work, show\) cannot be called")),
+    ("engines", "methods", Broken(engine("ShortRun"), r"run\(works, show\) cannot be called")),
     ("engines", "workers", Broken(engine("Many"), r"workers\(1\) returned 4: more than --workers 1 allows")),
     ("engines", "queued", Broken(engine("Queue"), r"returned \[0, 1\] .* seeds in it are never trained")),
     ("trackers", "builds", Broken(tracker("deaf_tracker"), r"object has none of the methods run_started")),

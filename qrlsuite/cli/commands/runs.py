@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.engine.api import Queues
 from qrlsuite.engine.status import survey
 from qrlsuite.engine.terminal import printable
+from qrlsuite.engine.where import Queues
 from qrlsuite.errors import OptionError
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from qrlsuite.hookspecs import hookimpl
+from qrlsuite import hookimpl
 from qrlsuite.specs import EngineSpec
 
 
@@ -22,8 +22,8 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
         EngineSpec(
             name="command",
             summary="Workers started by a shell command (PBS, LSF, HTCondor, ssh, Kubernetes), in a shared folder",
-            factory="qrlsuite.engine.command:CommandEngine",
-            options="qrlsuite.engine.command:CommandOptions",
+            factory="qrlsuite.plugins.engines.command:CommandEngine",
+            options="qrlsuite.plugins.engines.command:CommandOptions",
             remote=True,
         )
     )
@@ -31,8 +31,8 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
         EngineSpec(
             name="dask",
             summary="Workers of a Dask cluster, in a cloud or a queue: no shared folder is needed",
-            factory="qrlsuite.engine.dask:DaskEngine",
-            options="qrlsuite.engine.dask:DaskOptions",
+            factory="qrlsuite.plugins.engines.dask:DaskEngine",
+            options="qrlsuite.plugins.engines.dask:DaskOptions",
             extras={"distributed": "pip install 'qrlsuite[dask]'"},
             remote=True,
         )
@@ -41,8 +41,8 @@ def register_engines(register: Callable[[EngineSpec], None]) -> None:
         EngineSpec(
             name="slurm",
             summary="A SLURM job array: submit and leave; requeued at the time limit, see `qrlsuite runs`",
-            factory="qrlsuite.engine.slurm:SlurmEngine",
-            options="qrlsuite.engine.slurm:SlurmOptions",
+            factory="qrlsuite.plugins.engines.slurm:SlurmEngine",
+            options="qrlsuite.plugins.engines.slurm:SlurmOptions",
             extras={"submitit": "pip install 'qrlsuite[slurm]'"},
             submits=True,
             remote=True,

@@ -14,18 +14,25 @@ import importlib
 import logging
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from qrlsuite.engine.api import Answer
-from qrlsuite.engine.local import usable_cores
+from qrlsuite.engine.api import (
+    MOST_BYTES,
+    Answer,
+    EngineOutcome,
+    EntryStore,
+    Show,
+    Work,
+    differing,
+    train_remotely,
+    usable_cores,
+)
 from qrlsuite.errors import QrlSuiteError, listed
 from qrlsuite.registry import words
-from qrlsuite.results.store import EntryStore
-from qrlsuite.training.remote_task import MOST_BYTES, differing
 
 log = logging.getLogger("qrlsuite")
 
@@ -80,6 +87,10 @@ class DaskEngine:
     def queued(self, store: EntryStore) -> set[int]:
         """Return nothing: a task ends with the process that sent it."""
         return set()
+
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        """Send the groups of each work as tasks, and write what is answered."""
+        return train_remotely(self, works, show)
 
     def connect(self, workers: int, versions: Mapping[str, str | None]) -> DaskLink:
         """Connect to the scheduler, or start one with as many workers on this machine.

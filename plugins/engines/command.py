@@ -21,19 +21,26 @@ import subprocess
 import tempfile
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from qrlsuite.engine.api import EngineOutcome, Show, Work, worker_command
-from qrlsuite.engine.local import ONE_THREAD, WorkerJob, usable_cores
+from qrlsuite.engine.api import (
+    ONE_THREAD,
+    Claim,
+    EngineOutcome,
+    EntryStore,
+    SeedGroup,
+    Show,
+    Work,
+    WorkerJob,
+    certain,
+    usable_cores,
+    worker_command,
+)
 from qrlsuite.errors import nearest
-from qrlsuite.results.claims import Claim, certain
-from qrlsuite.results.progress import ProgressFile
-from qrlsuite.results.seeds import SeedGroup
-from qrlsuite.results.store import EntryStore
 
 log = logging.getLogger("qrlsuite")
 
@@ -108,17 +115,17 @@ class CommandEngine:
         """Return nothing: what a queue holds is not known here, and does no harm when it begins."""
         return set()
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
-        """Train the groups, `work.workers` at a time, until all have finished or failed.
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        """Train the groups until all have finished or failed.
 
         Raises
         ------
         KeyboardInterrupt
             After Ctrl-C, when every worker that had begun has saved and ended.
         """
-        jobs = [_CommandJob(group, ProgressFile(work.store, group.id)) for group in work.groups]
+        jobs = [_CommandJob(work, group, works) for work in works for group in work.groups]
         waiting, running = deque(jobs), list[_CommandJob]()
-        free = deque(range(1, work.workers + 1))
+        free = deque(range(1, works[0].workers + 1))
         outcome = EngineOutcome()
         for job in jobs:
             job.progress.clear()
@@ -126,20 +133,20 @@ class CommandEngine:
             while waiting or running:
                 while waiting and free:
                     job = waiting.popleft()
-                    job.start(self.options.template, work, free.popleft())
+                    job.start(self.options.template, free.popleft())
                     running.append(job)
                 time.sleep(LOOK_SECONDS)
-                at_work = {seed for claim in certain(work.store) for seed in claim.seeds}
+                held = _held(job.work.store for job in running)
                 for job in list(running):
-                    if job.look(work, at_work):
+                    if job.look(held):
                         continue
                     running.remove(job)
                     free.append(job.place)
-                    if job.ended(work, outcome):
+                    if job.ended(outcome):
                         waiting.append(job)
-                show({job.group.id: job.progress.read() for job in jobs})
+                show({job.name: job.progress.read() for job in jobs})
         except BaseException:
-            _stop(work.store, running)
+            _stop(running)
             raise
         return outcome
 
@@ -147,24 +154,24 @@ class CommandEngine:
 class _CommandJob(WorkerJob):
     """A group whose worker was started by a command."""
 
-    def __init__(self, group: SeedGroup, progress: ProgressFile) -> None:
-        super().__init__(group, progress)
+    def __init__(self, work: Work, group: SeedGroup, works: Sequence[Work]) -> None:
+        super().__init__(work, group, works)
         self.place = 0
         self.begun = False
         self._before: dict[str, Any] = {}
 
-    def start(self, template: str, work: Work, place: int) -> None:
+    def start(self, template: str, place: int) -> None:
         """Run the template's command.
 
         Parameters
         ----------
         place:
-            1 to `work.workers`: what `{i}` stands for.
+            From 1: what `{i}` stands for.
         """
         self.place, self.begun, self._before = place, False, self.progress.read()
         own = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
         words = ["env", *(f"{name}={value}" for name, value in sorted({**own, **ONE_THREAD}.items()))]
-        line = shell_line(template, [*words, *worker_command(work, self.group)], place, self.group.id)
+        line = shell_line(template, [*words, *worker_command(self.work, self.group)], place, self.group.id)
         self.output = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the command has ended
         self.process = subprocess.Popen(
             line,
@@ -175,50 +182,63 @@ class _CommandJob(WorkerJob):
             start_new_session=True,  # Ctrl-C reaches the worker once, from here
         )
 
-    def look(self, work: Work, at_work: set[int]) -> bool:
+    def claimed(self, held: Iterable[Claim]) -> bool:
+        """Return whether somebody trains seeds of the group."""
+        entry, seeds = self.work.store.path, set(self.group.seeds)
+        return any(claim.path.is_relative_to(entry) and seeds & set(claim.seeds) for claim in held)
+
+    def finished(self) -> bool:
+        """Return whether all seeds of the group are there."""
+        return self.work.store.finished(self.group.seeds, self.work.epochs) == set(self.group.seeds)
+
+    def look(self, held: Sequence[Claim]) -> bool:
         """Return whether the group is still being trained, or waits to be."""
         code = None if self.process is None else self.process.poll()
-        held = not at_work.isdisjoint(self.group.seeds)
-        self.begun |= held
+        claimed = self.claimed(held)
+        self.begun |= claimed
         if code is None:
             return True
-        if code == 3 or work.store.finished(self.group.seeds, work.epochs) == set(self.group.seeds):
+        if code == 3 or self.finished():
             return False
         waits = code == 0 and not self.begun and self.progress.read() == self._before
-        return held or waits
+        return claimed or waits
 
-    def ended(self, work: Work, outcome: EngineOutcome) -> bool:
+    def ended(self, outcome: EngineOutcome) -> bool:
         """Judge what has ended; returns whether to start it again, else enters what became of it in the outcome."""
         text, progress = self.take_output(), self.progress.read()
         code = 0 if self.process is None else self.process.returncode
-        if work.store.finished(self.group.seeds, work.epochs) == set(self.group.seeds):
+        if self.finished():
             return False
         if code == 3:
-            outcome.taken[self.group.id] = text.rpartition("qrlsuite: ")[2] or "its seeds are being trained"
+            outcome.taken[self.name] = text.rpartition("qrlsuite: ")[2] or "its seeds are being trained"
             return False
         if progress.get("error"):
-            outcome.failed[self.group.id] = str(progress["error"])
+            outcome.failed[self.name] = str(progress["error"])
             return False
         why = f"exit code {code} of its command" if code else "it left the results folder unfinished"
         given_up = self.died(why, text)
         if given_up is None:
             return True
-        outcome.failed[self.group.id] = given_up
+        outcome.failed[self.name] = given_up
         return False
 
 
-def _stop(store: EntryStore, running: Sequence[_CommandJob]) -> None:
+def _held(stores: Iterable[EntryStore]) -> list[Claim]:
+    return [claim for store in {store.path: store for store in stores}.values() for claim in certain(store)]
+
+
+def _stop(running: Sequence[_CommandJob]) -> None:
     """Ask every worker to save and end, and wait for it; end commands whose worker never began."""
-    seeds = {seed for job in running for seed in job.group.seeds}
     asked: dict[str, Claim] = {}
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        held = {claim.token: claim for claim in certain(store) if seeds & set(claim.seeds)}
+        claims = _held(job.work.store for job in running)
+        held = {claim.token: claim for claim in claims if any(job.claimed([claim]) for job in running)}
         for token in held.keys() - asked.keys():
             held[token].request_stop()
         asked |= held
         for job in running:
-            job.begun |= any(set(claim.seeds) & set(job.group.seeds) for claim in asked.values())
+            job.begun |= job.claimed(asked.values())
             if not job.begun:
                 _signal(job, signal.SIGTERM)
         if not held and all(job.process is None or job.process.poll() is not None for job in running):

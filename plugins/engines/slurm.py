@@ -22,12 +22,18 @@ from typing import Annotated, Any
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from qrlsuite.engine.api import EngineOutcome, Show, Work
-from qrlsuite.engine.local import LocalEngine
+from qrlsuite.engine.api import (
+    EngineOutcome,
+    EntryStore,
+    LocalEngine,
+    SeedGroup,
+    Show,
+    Work,
+    raise_failures,
+    submitted,
+    write_submitted,
+)
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.results import survey
-from qrlsuite.results.seeds import SeedGroup
-from qrlsuite.results.store import EntryStore, write_json
 
 TASKS = 10
 """Array tasks, where no number of workers was asked for."""
@@ -103,13 +109,11 @@ class ArrayTask:
         QrlSuiteError
             If it failed; SLURM then shows the task as failed, and its log has the message.
         """
-        from qrlsuite.engine.api import raise_failures
-
         signal.signal(signal.SIGTERM, _canceled)
         self._engine = LocalEngine()
         group = SeedGroup(self.seeds, 0)
         work = Work(EntryStore(Path(self.folder)), [group], self.epochs, 1, self.device)
-        outcome = self._engine.run(work, lambda snapshot: None)
+        outcome = self._engine.run([work], lambda snapshot: None)
         raise_failures(outcome)
         for message in outcome.taken.values():
             print(f"left out: {message}")
@@ -158,14 +162,20 @@ class SlurmEngine:
         waiting = self._answer
         return {seed for task in tasks if task["job"] in waiting for seed in task["seeds"]}
 
-    def run(self, work: Work, show: Show) -> EngineOutcome:
-        """Submit the groups as one job array and return.
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        """Submit the groups of each work as one job array, and return.
 
         Raises
         ------
         QrlSuiteError
             If there is no SLURM here, or it refuses the job; the message has SLURM's own.
         """
+        outcome = EngineOutcome()
+        for work in works:
+            outcome += self._submit(work)
+        return outcome
+
+    def _submit(self, work: Work) -> EngineOutcome:
         import submitit
 
         folder = work.store.path.absolute() / "slurm"
@@ -212,21 +222,6 @@ class SlurmEngine:
         )
 
 
-def submitted(store: EntryStore) -> list[dict[str, Any]]:
-    """Return the tasks that were submitted and remembered: `job` (SLURM's id), `seeds`, `epochs`.
-
-    Raises
-    ------
-    StoreError
-        If `submitted.json` is damaged.
-    """
-    problems: list[str] = []
-    tasks = survey.waiting(store, problems)
-    if problems:
-        raise StoreError(problems[0])
-    return tasks
-
-
 def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[SeedGroup], epochs: int) -> None:
     """Add tasks to `submitted.json`, and forget those that SLURM no longer knows."""
     try:
@@ -238,7 +233,7 @@ def _remember(store: EntryStore, ids: Sequence[str], groups: Sequence[SeedGroup]
         {"job": job, "seeds": list(g.seeds), "epochs": epochs, "time": int(time.time())}
         for job, g in zip(ids, groups)
     ]
-    write_json(store.path / "slurm" / "submitted.json", {"tasks": old + new})
+    write_submitted(store, "slurm", old + new)
 
 
 def _waiting() -> set[str]:

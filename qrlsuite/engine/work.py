@@ -1,0 +1,249 @@
+"""What is handed to an engine and what it returns; engines import it from `qrlsuite.engine.api`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.seeds import SeedGroup, format_seeds
+from qrlsuite.results.store import EntryStore
+
+Snapshot = dict[str, dict[str, Any]]
+"""Progress by group id."""
+
+Show = Callable[[Snapshot], None]
+
+
+@dataclass(frozen=True)
+class Missing:
+    """The seeds of an entry that are to be trained, and in which groups.
+
+    Attributes
+    ----------
+    runs:
+        The results folder.
+    store:
+        The entry's folder in it, which need not exist yet.
+    seeds:
+        All seeds that were asked for.
+    epochs:
+        The epoch to which each is to be trained.
+    busy:
+        Those that another process trains, or that wait in a queue.
+    groups:
+        The rest of those that are missing.
+    """
+
+    runs: Path
+    entry: Entry
+    store: EntryStore
+    seeds: Sequence[int]
+    epochs: int
+    busy: frozenset[int] = frozenset()
+    groups: Sequence[SeedGroup] = field(default_factory=list)
+
+    @property
+    def todo(self) -> list[int]:
+        """The seeds of the groups, sorted."""
+        return sorted(seed for group in self.groups for seed in group.seeds)
+
+    @property
+    def left(self) -> int:
+        """Epochs to train, summed over the seeds; none for those that an interrupted longer run has already."""
+        return sum(len(group.seeds) * max(0, self.epochs - group.epoch) for group in self.groups)
+
+    @property
+    def together(self) -> int | None:
+        """Seeds of the largest group, None where there is none."""
+        return max((len(group.seeds) for group in self.groups), default=None)
+
+
+@dataclass(frozen=True)
+class Work:
+    """Groups of one entry's seeds, to be trained to `epochs`, `workers` at a time.
+
+    Attributes
+    ----------
+    others:
+        Folders of further entries, of which the same seeds are trained in the same populations; only an engine whose
+        groups run on this machine is given any. `worker_command` names them.
+    """
+
+    store: EntryStore
+    groups: Sequence[SeedGroup]
+    epochs: int
+    workers: int
+    device: str = "cpu"
+    others: Sequence[EntryStore] = ()
+
+
+@dataclass(frozen=True)
+class EngineOutcome:
+    """How the groups ended.
+
+    Attributes
+    ----------
+    failed:
+        Message of failure by group id.
+    taken:
+        By group id, who else is training seeds of a group that was therefore left to them.
+    submitted:
+        Where the groups wait to be run, for engines that submit and leave: one line for the user.
+    """
+
+    failed: dict[str, str] = field(default_factory=dict)
+    taken: dict[str, str] = field(default_factory=dict)
+    submitted: str | None = None
+
+    def __add__(self, other: EngineOutcome) -> EngineOutcome:
+        """Return how the groups of both ended."""
+        lines = [line for line in (self.submitted, other.submitted) if line is not None]
+        return EngineOutcome(
+            {**self.failed, **other.failed}, {**self.taken, **other.taken}, "\n".join(lines) or None
+        )
+
+
+def job_name(work: Work, group: SeedGroup, works: Sequence[Work]) -> str:
+    """Return the name of a group in snapshots and outcomes: its id, after the entry's name where there are several."""
+    return group.id if len(works) == 1 else f"{work.store.path.name} {group.id}"
+
+
+class Engine(Protocol):
+    """A place where groups run; built as `factory(options)`, `options` None for a spec without options."""
+
+    def workers(self, requested: int | None) -> int:
+        """Return how many groups may run at a time, given what the user asked for."""
+
+    def queued(self, store: EntryStore) -> set[int]:
+        """Return the seeds of an entry that were handed to this engine before and still wait for their turn."""
+
+    def run(self, works: Sequence[Work], show: Show) -> EngineOutcome:
+        """Train the groups, calling `show` with their progress now and then; or hand them over and return.
+
+        Of all works together, as many groups at a time as `workers` of the first says. `job_name` names a group.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, when every worker has saved and ended.
+        QrlSuiteError
+            If nothing can be started.
+        """
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a task.
+
+    Attributes
+    ----------
+    key:
+        With which the task was sent.
+    content:
+        What `work_on` returned for it, None where the task was lost, as when its worker died.
+    problem:
+        Why it was lost.
+    """
+
+    key: str
+    content: bytes | None
+    problem: str = ""
+
+
+class Link(Protocol):
+    """A connection to workers that call `qrlsuite.training.remote_task.work_on`."""
+
+    def send(self, key: str, task: bytes, priority: int) -> None:
+        """Have a task worked on by any worker, now or when one is free.
+
+        Parameters
+        ----------
+        key:
+            New for every task.
+        priority:
+            Tasks with a higher one go first where they can; those of groups that have begun have a higher one.
+        """
+
+    def receive(self, seconds: float) -> list[Answer]:
+        """Return the answers that have come, each once; waits for the first of them, that long at most.
+
+        Raises
+        ------
+        QrlSuiteError
+            If no further answer will come, as when the connection is lost.
+        """
+
+    def close(self) -> None:
+        """Forget the tasks that have no answer yet, and disconnect."""
+
+
+@runtime_checkable
+class ChoosingLink(Link, Protocol):
+    """A link that can choose who works on a task: now and then, a second worker repeats what a first one did."""
+
+    def send_apart(self, key: str, task: bytes, priority: int, other: str) -> None:
+        """Have a task worked on by another worker than the one that answered the task `other`, if there is another."""
+
+
+@runtime_checkable
+class RemoteEngine(Engine, Protocol):
+    """An engine whose workers need no shared folder; its `run` returns `train_remotely(self, works, show)`."""
+
+    def connect(self, workers: int, versions: Mapping[str, str | None]) -> Link:
+        """Return a connection to workers.
+
+        Parameters
+        ----------
+        workers:
+            How many tasks will be sent at a time.
+        versions:
+            What a worker must have: versions of distributions, and of `python`. `work_on` refuses where they differ;
+            a link that knows which worker has what sends it nothing.
+
+        Raises
+        ------
+        QrlSuiteError
+            If there is nobody to connect to.
+        """
+
+
+def worker_command(work: Work, group: SeedGroup) -> list[str]:
+    """Return the command line that trains a group."""
+    # -P: never import from the folder one stands in, which may be a source tree without its plugins
+    command = [sys.executable, "-P", "-m", "qrlsuite.engine.worker"]
+    return [
+        *command,
+        *(str(store.path.absolute()) for store in (work.store, *work.others)),
+        "--seeds",
+        format_seeds(group.seeds),
+        "--epochs",
+        str(work.epochs),
+        "--device",
+        work.device,
+    ]
+
+
+def raise_failures(outcome: EngineOutcome) -> None:
+    """Turn failed groups into one error.
+
+    Raises
+    ------
+    QrlSuiteError
+        Naming every group that failed and why; groups that failed alike are named together.
+    """
+    if outcome.failed:
+        alike: dict[str, list[str]] = {}
+        for name, message in sorted(outcome.failed.items()):
+            alike.setdefault(message, []).append(name)
+        lines = [
+            f"{'group' if len(names) == 1 else 'groups'} {', '.join(names)}: {message}"
+            for message, names in alike.items()
+        ]
+        raise QrlSuiteError(
+            f"{len(outcome.failed)} group(s) failed, finished epochs are kept: " + "; ".join(lines)
+        )
