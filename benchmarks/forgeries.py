@@ -1,4 +1,4 @@
-"""What `qrlsuite leaderboard verify` finds: forged curves, by how many seeds trained again, and false alarms.
+"""What `qrlsuite verify` finds: forged curves, by how many seeds trained again, and false alarms.
 
     python benchmarks/forgeries.py --twins twins.npz --train      # 100 seeds of width 16 again: 3 minutes
     python benchmarks/forgeries.py --twins twins.npz [--draws 1000] [--markdown]

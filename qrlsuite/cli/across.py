@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 OPTION = "--across"
 
@@ -23,14 +23,6 @@ def spread(arguments: list[str]) -> list[str]:
             expanded.append(OPTION)
         expanded.append(word)
     return expanded
-
-
-class SeveralTasksGroup(TyperGroup):
-    """A group with the option."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words."""
-        return super().parse_args(ctx, spread(args))
 
 
 class SeveralTasksCommand(TyperCommand):

@@ -44,7 +44,12 @@ BUILT_IN = {
         LazyCommand("demo", "Train three models and compare them: 2 minutes.", f"{_ROOM}.demo:demo"),
         LazyCommand("run", "Train the missing seeds of a model on a task.", f"{_ROOM}.run:run"),
         LazyCommand("runs", "List the results folder, and what is running in it.", f"{_ROOM}.runs:app"),
-        LazyCommand("leaderboard", "Rank entries by significant outperformance.", f"{_ROOM}.leaderboard:app"),
+        LazyCommand(
+            "leaderboard",
+            "Rank entries by significant outperformance.",
+            f"{_ROOM}.leaderboard:leaderboard",
+            "qrlsuite.cli.across:SeveralTasksCommand",
+        ),
         LazyCommand("compare", "Say which of two entries needs fewer steps.", f"{_ROOM}.compare:compare"),
         LazyCommand(
             "plot",
@@ -63,6 +68,7 @@ BUILT_IN = {
             f"{_ROOM}.export:export",
             "qrlsuite.cli.across:SeveralTasksCommand",
         ),
+        LazyCommand("verify", "Check published entries, and train seeds again.", f"{_ROOM}.verify:verify"),
         LazyCommand("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
         LazyCommand("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
         LazyCommand("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
@@ -74,7 +80,11 @@ BUILT_IN = {
     )
 }
 
-RENAMED = {"status": "qrlsuite runs", "calibrate": "python benchmarks/calibration.py"}
+RENAMED = {
+    "status": "qrlsuite runs",
+    "calibrate": "python benchmarks/calibration.py",
+    "leaderboard verify": "qrlsuite verify",
+}
 """Commands of earlier versions, one word or two, and what does their work now."""
 
 

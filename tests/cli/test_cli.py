@@ -250,6 +250,7 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         ],
         (["runs", "--task", "/etc"], "unknown task '/etc'"),
         (["status"], "`qrlsuite status` is now `qrlsuite runs`"),
+        (["leaderboard", "verify", "."], "`qrlsuite leaderboard verify` is now `qrlsuite verify`"),
         (["calibrate"], "`qrlsuite calibrate` is now `python benchmarks/calibration.py`"),
         (["plot", "estimator", "--task", "beam6g"], "picture 'estimator' shows no results: leave --task out"),
         (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),

@@ -659,7 +659,7 @@ def test_a_published_plan_is_decided_by_its_curves_and_goes_on_elsewhere(exporte
     page = ["leaderboard", "--runs", "elsewhere", "--format", "html", "--out", "page.html"]
     runner.invoke(build(), page, catch_exceptions=False)
     assert "p: which needs fewer steps" in Path("page.html").read_text()
-    verified = runner.invoke(build(), ["leaderboard", "verify", str(exported)])
+    verified = runner.invoke(build(), ["verify", str(exported)])
     assert "2 of 2 entries ok" in verified.output, verified.output
 
 

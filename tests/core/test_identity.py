@@ -285,7 +285,7 @@ def test_an_export_carries_the_code_and_is_verified_with_it(author: Author) -> N
     assert author.command("export", "line", "--out", "out").returncode == 0
     (path,) = (author.folder / "out").glob("*/*/entry.json")
     assert [part["role"] for part in json.loads(path.read_text())["code"]["parts"]][-1] == "model"
-    verify = ("leaderboard", "verify", str(path.parent), "--rerun", "1")
+    verify = ("verify", str(path.parent), "--rerun", "1")
     good = qrlsuite(*verify, env=installed(author.site), cwd=author.folder)
     assert good.returncode == 0, good.stdout + good.stderr
     author.edit("own_helper", "rand(", "randn(")

@@ -567,19 +567,17 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
     done = command("export", "--all", "--runs", str(tmp_path / "runs"), "--out", str(out))
     assert done.exit_code == 0
     assert "8 seeds" in done.stdout
-    done = command("leaderboard", "verify", str(out), "--rerun", "1", "--choice", "3", "--json")
+    done = command("verify", str(out), "--rerun", "1", "--choice", "3", "--json")
     assert done.exit_code == 0
     (told,) = json.loads(done.stdout)["entries"]
     assert (told["choice"], told["check"]) == (3, "repeated")
     assert "seeds are trained again" in done.stderr
-    done = command("leaderboard", "verify", str(out), "--rerun", "auto")
+    done = command("verify", str(out), "--rerun", "auto")
     assert ": verified: 8 seeds trained again" in done.stdout
     with pytest.raises(QrlSuiteError, match="--rerun many: write a number of seeds"):
-        CliRunner().invoke(
-            build(), ["leaderboard", "verify", str(out), "--rerun", "many"], catch_exceptions=False
-        )
+        CliRunner().invoke(build(), ["verify", str(out), "--rerun", "many"], catch_exceptions=False)
     rewrite(next(out.glob("*/*")) / "curves.parquet", put("score", 0, 2.0))
-    done = command("leaderboard", "verify", str(out))
+    done = command("verify", str(out))
     assert done.exit_code == 1
     assert "outside [0, 1]" in done.stdout
     done = command("leaderboard", "--runs", str(tmp_path / "entries"), "--format", "csv")
@@ -593,7 +591,7 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
 def test_an_entry_is_verified_from_inside_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for here, path in ((folder, "."), (folder.parent, folder.name), (folder.parents[1], ".")):
         monkeypatch.chdir(here)
-        done = command("leaderboard", "verify", path)
+        done = command("verify", path)
         assert done.exit_code == 0, done.stdout
         assert f"{folder.parent.name}/{folder.name}" in done.stdout
 
@@ -699,7 +697,7 @@ def test_beside_ranked_entries_unranked_ones_are_found_by_name_and_by_study_only
         "width=16",
     ]
     assert command("leaderboard", "--study", two, "--across", "beam6g", "cartpole").exit_code
-    assert command("leaderboard", "verify").stdout.count("ok ") == 2
+    assert command("verify").stdout.count("ok ") == 2
 
 
 def test_a_task_whose_published_entries_are_all_unranked_has_a_board_of_them(

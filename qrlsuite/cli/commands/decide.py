@@ -249,7 +249,7 @@ def export(
     """Write a plan with the learning curves of its seeds, so that others can compute its verdicts.
 
     A plan that goes on may be written again. `qrlsuite decide status DIR/NAME` shows its verdicts, `qrlsuite import
-    DIR/NAME` takes its seeds over to go on with it elsewhere, and `qrlsuite leaderboard verify DIR/NAME --rerun 2`
+    DIR/NAME` takes its seeds over to go on with it elsewhere, and `qrlsuite verify DIR/NAME --rerun 2`
     trains some of them again.
 
     Example: qrlsuite decide export width.toml

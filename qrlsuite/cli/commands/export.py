@@ -50,7 +50,7 @@ def export(
 ) -> None:
     """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
 
-    Only finished seeds are written. `qrlsuite leaderboard verify` checks what was written, and can train some
+    Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some
     seeds again.
 
     With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
@@ -101,7 +101,7 @@ def export(
     if json_output:
         typer.echo(json.dumps(written))
     else:
-        typer.echo(f"next: {command('leaderboard', 'verify', str(out), '--rerun', '2')}")
+        typer.echo(f"next: {command('verify', str(out), '--rerun', '2')}")
 
 
 def _rliable(

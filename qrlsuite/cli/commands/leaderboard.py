@@ -13,7 +13,6 @@ from typing import Annotated
 import typer
 
 from qrlsuite import api
-from qrlsuite.cli.across import SeveralTasksGroup
 from qrlsuite.cli.arguments import (
     AcrossOption,
     AlphaOption,
@@ -25,7 +24,6 @@ from qrlsuite.cli.arguments import (
     TaskOption,
     names_of,
 )
-from qrlsuite.cli.commands import verify
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import across as several
@@ -62,13 +60,7 @@ class By(StrEnum):
     area = "area"
 
 
-app = typer.Typer(cls=SeveralTasksGroup, invoke_without_command=True)
-app.command("verify")(verify.verify)
-
-
-@app.callback()
 def leaderboard(
-    context: typer.Context,
     task: TaskOption = None,
     entry: EntryOption = None,
     study: Annotated[
@@ -134,9 +126,6 @@ def leaderboard(
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
-    if context.invoked_subcommand is not None:
-        return
-
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     if by is not By.steps and (across is not None or rule is not None):

@@ -1,4 +1,4 @@
-"""`qrlsuite leaderboard verify`: check published entries."""
+"""`qrlsuite verify`: check published entries."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def verify(
     leaderboard/, that differ from a commit or are not committed; a file with a name that no published file has is
     refused.
 
-    Example: qrlsuite leaderboard verify leaderboard/entries --rerun 2
+    Example: qrlsuite verify leaderboard/entries --rerun 2
     """
     if base is not None and paths:
         raise OptionError("give PATH or --base, not both")
