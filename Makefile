@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long test-lowest verify docs tutorials site pictures dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-long breaks test-lowest verify docs tutorials site pictures dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -22,6 +22,10 @@ test: install-dev
 # What is long by nature, before a release: CONTRIBUTING.md says what, and when it last passed.
 test-long: install-dev
 	$(BIN)/python -m pytest -q -m long --durations=0
+
+# Breaks of the product, drawn once over all packages, and the test that finds each: when tests were removed.
+breaks: install-dev
+	$(BIN)/python tests/breaks.py
 
 # The lowest versions that pyproject.toml allows, in an environment of its own: the tests of the commands, of what is on
 # disk and of circuits exported to PennyLane and Qiskit. Warnings of old versions about each other are no errors here.
@@ -41,7 +45,7 @@ RERUN ?= 2
 verify: export BASE := $(BASE)
 verify: export RERUN := $(RERUN)
 verify: install
-	$(BIN)/qrlsuite verify --base "$$BASE" --rerun "$$RERUN"
+	$(BIN)/qrlsuite leaderboard verify --base "$$BASE" --rerun "$$RERUN"
 
 # Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
 docs: install-dev
