@@ -1,55 +1,94 @@
-"""What the tests of broken plugins share: a table of rules, the plugin that breaks each, and the expected message."""
+"""What the tests of broken plugins share: edits of a good plugin, each of which breaks one rule."""
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
+from qrlsuite import scaffold
 from qrlsuite.specs import Spec
 from qrlsuite.testing import _FILES
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import Finding
 
+NUMBERS = itertools.count()
+
 
 @dataclass(frozen=True)
-class Broken:
-    """A spec that breaks one rule.
+class Edit:
+    """A change that makes something good break one rule.
 
     Attributes
     ----------
     message:
         A regular expression for what the broken rule says.
+    changes:
+        Texts and what stands in their place, in turn.
     also:
         Rules that cannot but break with it.
+    spec:
+        What else the spec says.
     """
 
-    spec: Spec
+    rule: str
     message: str
-    also: frozenset[str] = field(default_factory=frozenset)
+    changes: tuple[str, ...]
+    also: frozenset[str]
+    spec: Mapping[str, Any]
+
+    def of(self, good: str) -> str:
+        """Return what is broken."""
+        for old, new in zip(self.changes[::2], self.changes[1::2], strict=True):
+            assert old in good
+            good = good.replace(old, new, 1)
+        return good
 
 
-Cases = Sequence[tuple[str, Broken]]
-"""Broken plugins by the rule that they break; a rule may be broken in several ways."""
+def edit(rule: str, message: str, *changes: str, also: Iterable[str] = (), **spec: Any) -> Edit:
+    return Edit(rule, message, changes, frozenset(also), spec)
 
 
-def ids(cases: Cases) -> list[str]:
-    """Return what pytest calls each case: the rule, and the spec's name."""
-    return [f"{rule.replace(' ', '-')}-{case.spec.name}" for rule, case in cases]
+def ids(edits: Iterable[Edit]) -> list[str]:
+    """Return what pytest calls each case."""
+    return [f"{edit.rule.replace(' ', '-')}-{number}" for number, edit in enumerate(edits)]
+
+
+def template(kind: scaffold.Kind) -> str:
+    """Return the plugin that `qrlsuite new plugin` writes for a kind."""
+    return scaffold.package("good-one", kind).files[f"src/good_one/{kind}.py"]
+
+
+def module(source: str) -> str:
+    """Return the name of a new module with this source."""
+    made = ModuleType(f"broken_{next(NUMBERS)}")
+    sys.modules[made.__name__] = made
+    exec(compile(source, made.__name__, "exec"), made.__dict__)
+    return made.__name__
 
 
 def own_rules(kind: str, spec: Spec, settings: Mapping[str, Any] | None = None) -> list[Finding]:
     """Go through the rules of a kind, without those that all kinds share (they start an interpreter each time)."""
-    module = importlib.import_module(f"qrlsuite.testing.{_FILES[kind]}")
-    findings: list[Finding] = module.check(Subject(kind, spec, None, (), dict(settings or {})))
+    rules = importlib.import_module(f"qrlsuite.testing.{_FILES[kind]}")
+    findings: list[Finding] = rules.check(Subject(kind, spec, None, (), dict(settings or {})))
     return findings
 
 
-def assert_breaks(kind: str, rule: str, case: Broken) -> None:
+def assert_breaks(kind: str, spec: Spec, rule: str, message: str, also: frozenset[str] = frozenset()) -> None:
     """Assert that a plugin breaks exactly this rule, and what is said about it."""
-    broken = {finding.rule: finding.message for finding in own_rules(kind, case.spec) if not finding.ok}
+    broken = {finding.rule: finding.message for finding in own_rules(kind, spec) if not finding.ok}
     assert rule in broken, f"'{rule}' holds; broken are {broken}"
-    assert re.search(case.message, broken[rule]), broken[rule]
-    assert broken.keys() == {rule} | case.also, f"also broken: {broken.keys() - {rule}}"
+    assert re.search(message, broken[rule]), broken[rule]
+    assert broken.keys() == {rule} | also, f"also broken: {broken.keys() - {rule}}"
+
+
+def assert_all_good(kind: str, spec: Spec) -> set[str]:
+    """Assert that no rule is broken; return the rules."""
+    findings = own_rules(kind, spec)
+    assert all(finding.ok for finding in findings), findings
+    return {finding.rule for finding in findings}

@@ -1,12 +1,11 @@
-"""Ansatzes that break one rule each."""
+"""Ansatzes that break one rule each: edits of the one that `new plugin` writes."""
 
 from __future__ import annotations
 
-import functools
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from pydantic.dataclasses import dataclass
@@ -15,300 +14,86 @@ from torch import Tensor
 from qrlsuite import registry
 from qrlsuite.circuit import Circuit, create_backend
 from qrlsuite.errors import OptionError
+from qrlsuite.scaffold import Kind
 from qrlsuite.specs import AnsatzSpec, CircuitBackendSpec
 from qrlsuite.testing import effects
-from qrlsuite.testing.findings import Finding
-from tests.testing.broken import Broken, Cases, assert_breaks, ids, own_rules
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, own_rules, template
 
-HERE = __name__
+GOOD = template(Kind.ansatz)
+CIRCUIT, RETURN = "circuit = Circuit(qubits)", "return circuit"
+SCALING = 'scaling = circuit.parameter("scaling", (layers, qubits), low=1.0, high=1.0)'
+SHAPE, COUPLING = "(layers, qubits))", 'coupling = circuit.parameter("coupling", (layers, qubits))'
+UPLOAD = 'circuit.append("RY", q, scaling[layer, q] * circuit.input(q))'
+FREE = 'circuit.append("RY", q, circuit.input(q))'
+RING, ROTATION = "circuit.append(options.entangler, pair)", 'circuit.append("RY", q, weights[layer, q])'
+REFUSE = "from qrlsuite.errors import OptionError; raise OptionError"
+LAST_ROTATION = (
+    SHAPE, "(layers, qubits, 2))", SCALING, "", UPLOAD, FREE, RING, "circuit.append('CNOT', pair)",
+    ROTATION, "circuit.append('RY', q, weights[layer, q, 0]); circuit.append('RZ', q, weights[layer, q, 1])",
+)  # fmt: skip
+EDITS = [
+    edit("builds", r"returned NoneType, .* is `return circuit` there\?", RETURN, "circuit"),
+    edit("builds", r"with qubits = 1 the circuit has 4: write Circuit\(qubits\)", CIRCUIT, f"qubits = 4; {CIRCUIT}"),
+    edit("builds", r"1 qubit, 1 layer: the circuit has no gate", "in range(layers)", "in range(0)"),
+    edit("builds", r"2 qubits, 3 layers: IndexError: .*; .* raises qrlsuite.errors.OptionError",
+         "options.entangler", "['CNOT', 'CZ'][layer]"),
+    edit("builds", r"1 qubit, 1 layer: CZ needs 2 distinct .* raises qrlsuite.errors.Op",
+         "pairs if qubits > 2 else pairs[: qubits - 1]", "pairs"),
+    edit("builds", r"refuses every size .*: ansatz 'nowhere' has 7 qubits",
+         CIRCUIT, f"{REFUSE}(\"ansatz 'nowhere' has 7 qubits\")"),
+    edit("pure", r"built twice, the circuits differ; .* must not draw random numbers",
+         CIRCUIT, f"import random; {CIRCUIT}; circuit.append('RY', 0, random.random())"),
+    edit("pure", r"circuits differ; .* remember anything.* make the Circuit inside",
+         "def build", "BUILT = {}\n\n\ndef build",
+         RETURN, "circuit = BUILT.setdefault((qubits, layers), circuit); circuit.append('X', 0); return circuit"),
+    edit("inputs used", r"1 qubit, 1 layer: input 1 sets no angle.*; encode it with",
+         CIRCUIT, "circuit = Circuit(qubits, inputs=qubits + 1)"),
+    edit("parameters used", r"weights\[1, 0\] of shape \(2, 1\) sets no angle \(1 of 2.*smaller",
+         SHAPE, "(layers + 1, qubits))"),
+    edit("parameters used", r"there is no trainable parameter; declare some", SCALING, "", UPLOAD, FREE,
+         'weights = circuit.parameter("weights", (layers, qubits))', "", ROTATION, "pass"),
+    edit("layers", r"1 qubit, 2 layers: .* no more gates than with 1; is the loop over layers",
+         CIRCUIT, f"layers = 1; {CIRCUIT}"),
+    edit("effects", r"input 0 sets an angle, .* cannot see it: it acts on the starting state", SCALING, "",
+         UPLOAD, "circuit.append('RZ', q, circuit.input(q)) if layer == 0 else None"),
+    edit("effects", r"input 0 .*: neither what comes before nor .*every gate is about Z",
+         SCALING, "", UPLOAD, FREE.replace("RY", "RZ"), ROTATION, ROTATION.replace("RY", "RZ")),
+    edit("effects", r"2 qubits, 1 layer: input 1 .* qubit that meets no measured one",
+         RING, "pass", RETURN, "circuit.measure([0]); return circuit"),
+    edit("effects", r"1 layer: no expectation value depends on any element of 'coupling' of shape \(1, 1\), so it is "
+         r"trained for nothing: nothing after it makes a difference of it.*; or refuse this size",
+         'weights = circuit.parameter("weights", (layers, qubits))',
+         'coupling = circuit.parameter("coupling", (layers, len(ring(qubits)) or 1))',
+         RING, "[circuit.append(*gate) for gate in "
+         "(('CNOT', pair), ('RZ', pair[1], coupling[layer, pair[0]]), ('CNOT', pair))]",
+         ROTATION, "circuit.append('RZ', 0, coupling[layer, 0]) if qubits == 1 else None"),
+    edit("effects", r"1 qubit, 3 layers: no .* depends on weights\[1, 0, 1\] of shape \(3, 1, 2\), which is used in "
+         r"the middle of the circuit; it is trained for nothing: it cancels within the circuit",
+         SHAPE, "(layers, qubits, 2))",
+         ROTATION, "circuit.append('RY', q, weights[layer, q, 0])\n            "
+         "[circuit.append(*gate) for gate in 2 * (('RZ', q, weights[layer, q, 1]), ('X', q))]"),
+    edit("effects", r"2 qubits, \d layers: no .* depends on coupling\[\d, 1\] of shape .*, nor on \d more there; .*: "
+         r"it cancels", CIRCUIT, f"if qubits < 2: {REFUSE}('2 to 20 qubits')\n    {CIRCUIT}; {COUPLING}", RING, "pass",
+         ROTATION, f"{ROTATION}\n        for q in range(qubits):\n            "
+         "turn = 'RY', (q + 1) % qubits, coupling[layer, q]\n            circuit.append(*turn, control=q)\n            "
+         "[circuit.append(*gate, control=c) for gate, c in ((('Z', 0), None), (turn, q), (('Z', 0), None))"
+         "  if q == qubits - 1]"),
+]  # fmt: skip
+
+
+def spec(*changes: str) -> AnsatzSpec:
+    name = module(edit("", "", *changes).of(GOOD))
+    return AnsatzSpec("broken", "Breaks a rule", options=f"{name}:Options", build=f"{name}:build")
+
+
+@pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
+def test_one_rule_is_broken(edit: Edit) -> None:
+    assert_breaks("ansatzes", spec(*edit.changes), edit.rule, edit.message)
 
 
 @dataclass(frozen=True)
-class Options:
+class NoOptions:
     pass
-
-
-def chain(circuit: Circuit) -> None:
-    for q in range(circuit.qubits - 1):
-        circuit.append("CNOT", (q, q + 1))
-
-
-def reuploading(circuit: Circuit, layers: int) -> Circuit:
-    """Append layers of RX(input) and RY(weight) on every qubit, and a chain."""
-    weights = circuit.parameter("weights", (layers, circuit.qubits))
-    for layer in range(layers):
-        for q in range(circuit.qubits):
-            circuit.append("RX", q, circuit.input(q))
-            circuit.append("RY", q, weights[layer, q])
-        chain(circuit)
-    return circuit
-
-
-def good(qubits: int, layers: int, options: Options) -> Circuit:
-    return reuploading(Circuit(qubits), layers)
-
-
-def picky(qubits: int, layers: int, options: Options) -> Circuit:
-    if not 2 <= qubits <= 10:
-        raise OptionError("ansatz 'picky' has 2 to 10 qubits")
-    return good(qubits, layers, options)
-
-
-def last_rotation(qubits: int, layers: int, options: Options) -> Circuit:
-    """Do what published circuits do: end every layer with RZ, the last one too."""
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits, 2))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q))
-            circuit.append("RY", q, weights[layer, q, 0])
-            circuit.append("RZ", q, weights[layer, q, 1])
-        chain(circuit)
-    return circuit
-
-
-def no_return(qubits: int, layers: int, options: Options) -> None:
-    good(qubits, layers, options)
-
-
-def four_qubits(qubits: int, layers: int, options: Options) -> Circuit:
-    return good(4, layers, options)
-
-
-def no_gate(qubits: int, layers: int, options: Options) -> Circuit:
-    return Circuit(qubits)
-
-
-def two_layers(qubits: int, layers: int, options: Options) -> Circuit:
-    entanglers = ["CNOT", "CZ"]
-    circuit = good(qubits, layers, options)
-    for layer in range(layers):
-        circuit.append("H" if qubits == 1 else entanglers[layer], range(qubits)[:2])
-    return circuit
-
-
-def closed_ring(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = good(qubits, layers, options)
-    for q in range(qubits):
-        circuit.append("CZ", (q, (q + 1) % qubits))
-    return circuit
-
-
-def nowhere(qubits: int, layers: int, options: Options) -> Circuit:
-    raise OptionError("ansatz 'nowhere' has 7 qubits")
-
-
-def random_start(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = Circuit(qubits)
-    circuit.append("RY", 0, float(np.random.default_rng().uniform()))
-    return reuploading(circuit, layers)
-
-
-@functools.cache
-def remembered(qubits: int, layers: int) -> Circuit:
-    return good(qubits, layers, Options())
-
-
-def growing(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = remembered(qubits, layers)
-    circuit.append("X", 0)
-    return circuit
-
-
-def one_input_more(qubits: int, layers: int, options: Options) -> Circuit:
-    return reuploading(Circuit(qubits, inputs=qubits + 1), layers)
-
-
-def one_layer_more(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers + 1, qubits))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q))
-            circuit.append("RY", q, weights[layer, q])
-    return circuit
-
-
-def fixed(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = Circuit(qubits)
-    for _ in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q))
-    return circuit
-
-
-def shallow(qubits: int, layers: int, options: Options) -> Circuit:
-    return good(qubits, 1, options)
-
-
-def blind(qubits: int, layers: int, options: Options) -> Circuit:
-    """Upload the inputs once, by RZ, to qubits that are still in 0."""
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits))
-    for q in range(qubits):
-        circuit.append("RZ", q, circuit.input(q))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RY", q, weights[layer, q])
-        chain(circuit)
-    return circuit
-
-
-def diagonal(qubits: int, layers: int, options: Options) -> Circuit:
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RZ", q, circuit.input(q) + weights[layer, q])
-    return circuit
-
-
-def short_sighted(qubits: int, layers: int, options: Options) -> Circuit:
-    """Measure one qubit, and let no other act on it."""
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q) + weights[layer, q])
-    circuit.measure([0])
-    return circuit
-
-
-def last_coupling(qubits: int, layers: int, options: Options) -> Circuit:
-    """Couple neighbors by RZZ, with nothing between the last of them and the measurement."""
-    circuit = Circuit(qubits)
-    scaling = circuit.parameter("scaling", (layers, qubits))
-    coupling = circuit.parameter("coupling", (layers, max(1, qubits - 1)))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RY", q, scaling[layer, q] * circuit.input(q))
-        for q in range(max(1, qubits - 1)):
-            pair = (q, q + 1)[:qubits]
-            if qubits > 1:
-                circuit.append("CNOT", pair)
-            circuit.append("RZ", pair[-1], coupling[layer, q])
-            if qubits > 1:
-                circuit.append("CNOT", pair)
-    return circuit
-
-
-def canceling(qubits: int, layers: int, options: Options) -> Circuit:
-    """Rotate forth and back by the second of two weights."""
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits, 2))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q))
-            circuit.append("RY", q, weights[layer, q, 0])
-            for _ in range(2):
-                circuit.append("RZ", q, weights[layer, q, 1])
-                circuit.append("X", q)
-        chain(circuit)
-    return circuit
-
-
-def dead_coupling(qubits: int, layers: int, options: Options) -> Circuit:
-    """Couple all neighbors but the last two by a controlled rotation, these two by one that only adds a phase."""
-    if qubits < 2:
-        raise OptionError("ansatz 'dead-coupling' couples neighbors: it has 2 to 20 qubits")
-    circuit = Circuit(qubits)
-    weights = circuit.parameter("weights", (layers, qubits))
-    coupling = circuit.parameter("coupling", (layers, qubits))
-    for layer in range(layers):
-        for q in range(qubits):
-            circuit.append("RX", q, circuit.input(q) + weights[layer, q])
-        for q in range(qubits):
-            circuit.append("RY", (q + 1) % qubits, coupling[layer, q], control=q)
-            if q == qubits - 1:
-                circuit.append("Z", 0)
-                circuit.append("RY", 0, coupling[layer, q], control=q)
-                circuit.append("Z", 0)
-    return circuit
-
-
-def spec(build: str) -> AnsatzSpec:
-    name = build.replace("_", "-")
-    return AnsatzSpec(name, "Breaks a rule", options=f"{HERE}:Options", build=f"{HERE}:{build}")
-
-
-CASES: Cases = [
-    ("builds", Broken(spec("no_return"), r"returned NoneType, .* is `return circuit` there\?")),
-    (
-        "builds",
-        Broken(spec("four_qubits"), r"with qubits = 1 the circuit has 4: write Circuit\(qubits\)"),
-    ),
-    ("builds", Broken(spec("no_gate"), r"1 qubit, 1 layer: the circuit has no gate")),
-    (
-        "builds",
-        Broken(
-            spec("two_layers"), r"2 qubits, 3 layers: IndexError: .*; .* raises qrlsuite.errors.OptionError"
-        ),
-    ),
-    (
-        "builds",
-        Broken(spec("closed_ring"), r"1 qubit, 1 layer: CZ needs 2 distinct .* raises qrlsuite.errors.Op"),
-    ),
-    ("builds", Broken(spec("nowhere"), r"refuses every size .*: ansatz 'nowhere' has 7 qubits")),
-    (
-        "pure",
-        Broken(spec("random_start"), r"built twice, the circuits differ; .* must not draw random numbers"),
-    ),
-    ("pure", Broken(spec("growing"), r"circuits differ; .* remember anything.* make the Circuit inside")),
-    (
-        "inputs used",
-        Broken(spec("one_input_more"), r"1 qubit, 1 layer: input 1 sets no angle.*; encode it with"),
-    ),
-    (
-        "parameters used",
-        Broken(spec("one_layer_more"), r"weights\[1, 0\] of shape \(2, 1\) sets no angle \(1 of 2.*smaller"),
-    ),
-    ("parameters used", Broken(spec("fixed"), r"there is no trainable parameter; declare some")),
-    (
-        "layers",
-        Broken(spec("shallow"), r"1 qubit, 2 layers: .* no more gates than with 1; is the loop over layers"),
-    ),
-    (
-        "effects",
-        Broken(spec("blind"), r"input 0 sets an angle, .* cannot see it: it acts on the starting state"),
-    ),
-    (
-        "effects",
-        Broken(spec("diagonal"), r"input 0 .*: neither what comes before nor .*every gate is about Z"),
-    ),
-    (
-        "effects",
-        Broken(spec("short_sighted"), r"2 qubits, 1 layer: input 1 .* qubit that meets no measured one"),
-    ),
-    (
-        "effects",
-        Broken(
-            spec("last_coupling"),
-            r"1 layer: no expectation value depends on any element of 'coupling' of shape \(1, 1\), so it is trained "
-            r"for nothing: nothing after it makes a difference of it.*; or refuse this size",
-        ),
-    ),
-    (
-        "effects",
-        Broken(
-            spec("canceling"),
-            r"1 qubit, 3 layers: no .* depends on weights\[1, 0, 1\] of shape \(3, 1, 2\), which is used in the middle "
-            r"of the circuit; it is trained for nothing: it cancels within the circuit",
-        ),
-    ),
-    (
-        "effects",
-        Broken(
-            spec("dead_coupling"),
-            r"2 qubits, 6 layers: no .* depends on coupling\[2, 1\] of shape \(6, 2\), .*, nor on 1 more there; .*: it "
-            r"cancels",
-        ),
-    ),
-]
-
-
-@pytest.mark.parametrize(("rule", "case"), CASES, ids=ids(CASES))
-def test_one_rule_is_broken(rule: str, case: Broken) -> None:
-    assert_breaks("ansatzes", rule, case)
 
 
 class Installed:
@@ -316,7 +101,7 @@ class Installed:
 
     shots: int | None = None
 
-    def __init__(self, circuit: Circuit, options: Options) -> None:
+    def __init__(self, circuit: Circuit, options: Any) -> None:
         self.native = create_backend("native", circuit)
 
     def __call__(
@@ -337,9 +122,9 @@ class HalfGradient(Installed):
 
 
 class NoEntangler(Installed):
-    def __init__(self, circuit: Circuit, options: Options) -> None:
-        if any(operation.gate == "CNOT" for operation in circuit):
-            raise OptionError("this device has no CNOT")
+    def __init__(self, circuit: Circuit, options: Any) -> None:
+        if any(operation.gate == "CZ" for operation in circuit):
+            raise OptionError("this device has no CZ")
         super().__init__(circuit, options)
 
 
@@ -353,7 +138,8 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Installed]], None
 
     def put(cls: type[Installed]) -> None:
         known = registry.load().entries["circuit_backends"]
-        backend = CircuitBackendSpec("theirs", "A stranger's", f"{HERE}:Options", f"{HERE}:{cls.__name__}")
+        reference = f"{__name__}:{cls.__name__}"
+        backend = CircuitBackendSpec("theirs", "A stranger's", f"{__name__}:NoOptions", reference)
         monkeypatch.setitem(
             registry.load().entries,
             "circuit_backends",
@@ -363,23 +149,13 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Installed]], None
     return put
 
 
-BACKENDS: list[tuple[str, type[Installed], str]] = [
-    (
-        "backends",
-        NoEntangler,
-        r"backend 'theirs' cannot run it: OptionError: this device has no CNOT; write a gate that it lacks as others",
-    ),
-    (
-        "backends",
-        Damped,
-        r"values of backend 'theirs' differ by 0\.\d+ from dense .* `qrlsuite check circuit-backend:theirs`",
-    ),
-    (
-        "gradients",
-        HalfGradient,
-        r"'theirs' gives the derivative by inputs as .*, finite differences .*backend's",
-    ),
-]
+BACKENDS = [
+    ("backends", NoEntangler,
+     r"'theirs' cannot run it: OptionError: this device has no CZ; write a gate that it lacks as others"),
+    ("backends", Damped,
+     r"values of backend 'theirs' differ by 0\.\d+ from dense .* `qrlsuite check circuit-backend:theirs`"),
+    ("gradients", HalfGradient, r"'theirs' gives the derivative by inputs as .*, finite differences .*backend's"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("rule", "cls", "message"), BACKENDS, ids=["lacks-a-gate", "values", "gradients"])
@@ -387,7 +163,7 @@ def test_an_installed_backend_that_fails_it_is_named(
     install: Callable[[type[Installed]], None], rule: str, cls: type[Installed], message: str
 ) -> None:
     install(cls)
-    assert_breaks("ansatzes", rule, Broken(spec("good"), message))
+    assert_breaks("ansatzes", spec(), rule, message)
 
 
 @pytest.mark.parametrize("cls", [Installed, Sampling])
@@ -395,35 +171,30 @@ def test_a_backend_that_samples_is_only_run(
     install: Callable[[type[Installed]], None], cls: type[Installed]
 ) -> None:
     install(cls)
-    assert not broken(own_rules("ansatzes", spec("good")))
+    assert_all_good("ansatzes", spec())
 
 
 def test_without_a_backend_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(registry.load().entries, "circuit_backends", {})
-    assert_breaks(
-        "ansatzes", "effects", Broken(spec("good"), "no circuit backend is installed: install qrlsuite")
-    )
-
-
-def broken(findings: list[Finding]) -> list[Finding]:
-    return [finding for finding in findings if not finding.ok]
+    assert_breaks("ansatzes", spec(), "effects", "no circuit backend is installed: install qrlsuite")
 
 
 def test_every_rule_has_an_ansatz_that_breaks_it() -> None:
-    findings = own_rules("ansatzes", spec("good"))
-    assert not broken(findings)
-    assert {f.rule for f in findings} == {rule for rule, _ in CASES} | {rule for rule, _, _ in BACKENDS}
+    rules = {edit.rule for edit in EDITS} | {rule for rule, _, _ in BACKENDS}
+    assert assert_all_good("ansatzes", spec()) == rules
 
 
 def test_sizes_may_be_refused() -> None:
-    assert not broken(own_rules("ansatzes", spec("picky")))
+    assert_all_good(
+        "ansatzes", spec(CIRCUIT, f"if not 2 <= qubits <= 10: {REFUSE}('2 to 10')\n    {CIRCUIT}")
+    )
 
 
 def test_what_the_ends_of_a_pattern_leave_without_effect_is_named_and_breaks_nothing() -> None:
-    findings = own_rules("ansatzes", spec("last_rotation"))
-    assert not broken(findings)
-    [message] = [finding.message for finding in findings if finding.rule == "effects"]
-    assert message.endswith(
+    """Published circuits end every layer with RZ, the last one too."""
+    findings = {finding.rule: finding for finding in own_rules("ansatzes", spec(*LAST_ROTATION))}
+    assert all(finding.ok for finding in findings.values())
+    assert findings["effects"].message.endswith(
         "4 of 24 scalars do not (4 qubits, 3 layers: weights[2, 0, 1], weights[2, 1, 1], weights[2, 2, 1], ...)"
     )
 
@@ -431,12 +202,13 @@ def test_what_the_ends_of_a_pattern_leave_without_effect_is_named_and_breaks_not
 @pytest.mark.parametrize("gate", ["xyz", "u3"])
 @pytest.mark.parametrize("name", ["iqp", "cx", "cz"])
 def test_the_gates_of_built_in_ansatzes_have_effects(name: str, gate: str) -> None:
-    found = registry.ansatz(name)
-    assert not broken(own_rules("ansatzes", found, {"gate": gate}))
+    findings = own_rules("ansatzes", registry.ansatz(name), {"gate": gate})
+    assert all(finding.ok for finding in findings), findings
 
 
 def test_effects_are_those_of_finite_differences() -> None:
-    circuit = last_rotation(2, 2, Options())
+    name, _, build = spec(*LAST_ROTATION).build.partition(":")
+    circuit = getattr(sys.modules[name], build)(2, 2, None)
     inputs, scalars = effects.effective(circuit)
     run = create_backend("native", circuit)
     x, parameters, _ = effects.sample(circuit, effects.POINTS)

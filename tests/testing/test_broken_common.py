@@ -17,7 +17,7 @@ from qrlsuite.testing import common
 from qrlsuite.testing.common import check_common, subject
 from qrlsuite.testing.fresh import fresh_process
 from tests.core.test_hooks import install
-from tests.testing.broken import Broken, ids
+from tests.testing.broken import Edit, edit, ids
 
 STRANGE = "tests.testing.strange"
 PLUGIN = """
@@ -111,38 +111,49 @@ def registered(name: str) -> ModelSpec:
     return model(name=name)
 
 
-SPAWN, OPTIONS = frozenset({"spawn"}), frozenset({"options"})
 POLICIES = {"policies": {"best": f"{STRANGE}:bild"}}
-BROKEN = [
-    ("name", Broken(model(name="mlp"), r"^model 'mlp' is already registered by 'qrlsuite': give yours another name")),
-    ("name", Broken(registered("twin"), r"^model 'twin' is registered by both twins_a and twins_b: give")),
-    ("references", Broken(model(build=f"{STRANGE}:bild"), r"^build = .* has no 'bild'; is the name spelled as", SPAWN)),
-    ("references", Broken(model(build="strage:build"), r"No module named 'strage'; .* the package installed", SPAWN)),
-    ("references", Broken(engine("no_cloud:E", no_cloud="pip install no-cloud"), r"; pip install no-cloud$", SPAWN)),
-    ("references", Broken(environment(**POLICIES), r"^policies.best = .* has no 'bild'; is the name", SPAWN)),
-    ("references", Broken(model(build=f"{STRANGE}:NUMBER"), r"^build = .* is int, and it must be callable")),
-    ("references", Broken(model("NoDataclass"), r"is not a dataclass: write a class under @pydantic.dataclasses")),
-    ("references", Broken(environment(**picture("NoDataclass")), r"^pictures.map.options = .* is not a dataclass")),
-    ("lazy imports", Broken(registered("heavy"), r"^registering imports gymnasium: move that import .* top of heavy")),
-    ("lazy imports", Broken(registered("heavy-hook"), r"^registering imports scipy: move that import .* heavy_hook")),
-    ("spawn", Broken(model(build="notebook_of_mine:build"), r"as workers are: .* not in __main__, a note")),
-    ("spawn", Broken(registered("shy"), r"^plugin module 'shy' fails in a fresh .*: RuntimeError: not in a worker")),
-    ("spawn", Broken(registered("fatal"), r"ends when it imports the plugin: exit code 3, and no message")),
-    ("spawn", Broken(engine(numpy=lambda: "pip install numpy"), r"spec cannot be pickled: .* specs hold text")),
-    ("spawn", Broken(model("Local"), r"options cannot be pickled: .*Options'; .* at the top of its file")),
-    ("options documented", Broken(model("Silent"), r"^Silent has no description of depth; write name: Annotated\[int")),
-    ("options documented", Broken(environment(**picture("Silent")), r"^Silent has no description of depth")),
-    ("options", Broken(model("Required"), r"^the defaults are not valid: .*width.*; every option needs a default")),
-    ("options", Broken(model("OutOfBounds"), r"width = 0: .* greater than or equal to 1; defaults are not validated")),
-    ("options", Broken(model("Undefined"), r"^options cannot be stored as JSON: .* nan, infinity and objects have no")),
-    ("options", Broken(model("Objects"), r"^options cannot be stored as JSON: .*Spline.*; keep plain values")),
-    ("options", Broken(model("Doubling"), r"differ: .*width=8\) became .*width=16\); is a value changed when it is")),
-    ("options", Broken(model("Unordered"), r"^option 'names' holds a set, whose order is another one in every")),
-    ("options", Broken(model("Assigned"), r"^option 'width' can be assigned to: write @dataclass\(frozen=True\)")),
-    ("memory", Broken(model(memory=f"{STRANGE}:build"), r":build' fails: AssertionError: no rule that all")),
-    ("memory", Broken(model(memory=f"{STRANGE}:Good"), r"Good' fails: .*")),
-    ("memory", Broken(AlgorithmSpec("learner", "Strange", f"{STRANGE}:Good", f"{STRANGE}:build", f"{STRANGE}:memory"),
-     r"^'learner': memory = '.*:memory' returned 1000, and must return a Memory of whole numbers")),
+EDITS = [
+    edit("name", r"^model 'mlp' is already registered by 'qrlsuite': give yours another name",
+         subject=model(name="mlp")),
+    edit("name", r"^model 'twin' is registered by both twins_a and twins_b: give", subject=registered("twin")),
+    edit("references", r"^build = .* has no 'bild'; is the name spelled as",
+         subject=model(build=f"{STRANGE}:bild"), also=["spawn"]),
+    edit("references", r"No module named 'strage'; .* the package installed",
+         subject=model(build="strage:build"), also=["spawn"]),
+    edit("references", r"; pip install no-cloud$",
+         subject=engine("no_cloud:E", no_cloud="pip install no-cloud"), also=["spawn"]),
+    edit("references", r"^policies.best = .* has no 'bild'; is the name",
+         subject=environment(**POLICIES), also=["spawn"]),
+    edit("references", r"^build = .* is int, and it must be callable", subject=model(build=f"{STRANGE}:NUMBER")),
+    edit("references", r"is not a dataclass: write a class under @pydantic.dataclasses", subject=model("NoDataclass")),
+    edit("references", r"^pictures.map.options = .* is not a dataclass", subject=environment(**picture("NoDataclass"))),
+    edit("lazy imports", r"^registering imports gymnasium: move that import .* top of heavy",
+         subject=registered("heavy")),
+    edit("lazy imports", r"^registering imports scipy: move that import .* heavy_hook",
+         subject=registered("heavy-hook")),
+    edit("spawn", r"as workers are: .* not in __main__, a note", subject=model(build="notebook_of_mine:build")),
+    edit("spawn", r"^plugin module 'shy' fails in a fresh .*: RuntimeError: not in a worker",
+         subject=registered("shy")),
+    edit("spawn", r"ends when it imports the plugin: exit code 3, and no message", subject=registered("fatal")),
+    edit("spawn", r"spec cannot be pickled: .* specs hold text", subject=engine(numpy=lambda: "pip install numpy")),
+    edit("spawn", r"options cannot be pickled: .*Options'; .* at the top of its file", subject=model("Local")),
+    edit("options documented", r"^Silent has no description of depth; write name: Annotated\[int",
+         subject=model("Silent")),
+    edit("options documented", r"^Silent has no description of depth", subject=environment(**picture("Silent"))),
+    edit("options", r"^the defaults are not valid: .*width.*; every option needs a default", subject=model("Required")),
+    edit("options", r"width = 0: .* greater than or equal to 1; defaults are not validated",
+         subject=model("OutOfBounds")),
+    edit("options", r"^options cannot be stored as JSON: .* nan, infinity and objects have no",
+         subject=model("Undefined")),
+    edit("options", r"^options cannot be stored as JSON: .*Spline.*; keep plain values", subject=model("Objects")),
+    edit("options", r"differ: .*width=8\) became .*width=16\); is a value changed when it is",
+         subject=model("Doubling")),
+    edit("options", r"^option 'names' holds a set, whose order is another one in every", subject=model("Unordered")),
+    edit("options", r"^option 'width' can be assigned to: write @dataclass\(frozen=True\)", subject=model("Assigned")),
+    edit("memory", r":build' fails: AssertionError: no rule that all", subject=model(memory=f"{STRANGE}:build")),
+    edit("memory", r"Good' fails: .*", subject=model(memory=f"{STRANGE}:Good")),
+    edit("memory", r"^'learner': memory = '.*:memory' returned 1000, and must return a Memory of whole numbers",
+         subject=AlgorithmSpec("learner", "Strange", f"{STRANGE}:Good", f"{STRANGE}:build", f"{STRANGE}:memory")),
 ]  # fmt: skip
 
 KINDS = {
@@ -156,7 +167,7 @@ KINDS = {
 @pytest.fixture(scope="module", autouse=True)
 def one_process(site: None) -> Iterator[None]:
     """One process resolves the references of all specs that nothing registered, instead of one for each."""
-    subjects = [subject(KINDS[type(case.spec)], case.spec) for _, case in BROKEN]
+    subjects = [subject(KINDS[type(spec)], spec) for spec in (edit.spec["subject"] for edit in EDITS)]
     references = {r for each in subjects if not each.modules for r in each.references().values()}
     result = fresh_process((), tuple(sorted(references)))
 
@@ -173,11 +184,11 @@ def broken_rules(spec: Spec) -> dict[str, str]:
     return {finding.rule: finding.message for finding in findings if not finding.ok}
 
 
-@pytest.mark.parametrize(("rule", "case"), BROKEN, ids=ids(BROKEN))
-def test_one_rule_is_broken(rule: str, case: Broken) -> None:
-    broken = broken_rules(case.spec)
-    assert broken.keys() == {rule} | case.also, broken
-    assert re.search(case.message, broken[rule]), broken[rule]
+@pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
+def test_one_rule_is_broken(edit: Edit) -> None:
+    broken = broken_rules(edit.spec["subject"])
+    assert broken.keys() == {edit.rule} | edit.also, broken
+    assert re.search(edit.message, broken[edit.rule]), broken[edit.rule]
 
 
 def test_every_rule_has_a_plugin_that_breaks_it() -> None:
@@ -185,7 +196,7 @@ def test_every_rule_has_a_plugin_that_breaks_it() -> None:
     findings, usable = check_common(subject("models", "tidy"))
     assert usable
     assert all(finding.ok for finding in findings), findings
-    assert {finding.rule for finding in findings} == {rule for rule, _ in BROKEN}
+    assert {finding.rule for finding in findings} == {edit.rule for edit in EDITS}
 
 
 def test_what_nothing_registered_is_not_said_to_import_nothing() -> None:
