@@ -21,123 +21,130 @@ from qrlsuite.results.text import counted, duration
 PLAIN_SECONDS = 20.0
 """Seconds between lines where the output is not a terminal."""
 
-WINDOW_SECONDS = 2.0
-"""Seconds of training over which the speed of the first epoch is measured."""
-
-VALIDATION = 1.25
-"""By what an epoch is longer than its training, before a whole one was measured."""
-
 SILENCE_SECONDS = 20.0
-"""Seconds of training without a finished epoch after which is said what it will take."""
+"""Seconds of training without a finished epoch after which is said what a round takes."""
 
 DAY = 86400.0
 
+PHASES = {
+    "starting": "starting",
+    "compiling": "compiling circuits: once per machine",
+    "probing": "probing",
+}
+"""What is shown of a group before its first epoch; none of it is part of an epoch's time."""
+
 
 class _Clock:
-    """Times one group's epochs, and the rounds of its first epoch, from its progress file."""
+    """Times one group from its progress: its epochs, and the rounds of its first one.
 
-    def __init__(self) -> None:
-        self.epoch, self.epoch_began = -1, 0.0
-        self.round, self.round_began = (-1, ""), 0.0
-        """How many are done, and the phase: `learning` once all rounds of training are, which PPO and REINFORCE do."""
-        self.window: tuple[float, int] | None = None
-        self.rate: float | None = None
-        """Seconds per round, measured over the last few seconds of training: the first rounds only fill a memory."""
+    The first epoch that a process trains is left out: it holds what happens once (memory that fills up, code that is
+    compiled when it is first run).
+    """
+
+    def __init__(self, epoch: int) -> None:
+        self.first = epoch
+        self.begun: float | None = None
+        """When the group was started, or first heard of."""
+        self.marks: list[tuple[int, float]] = []
+        """Epochs, and when they were seen to have ended."""
+        self.round, self.round_began = -1, 0.0
+        self.trains = False
+        """Whether rounds of training are under way; PPO and REINFORCE learn when all of them are done."""
 
     def look(self, state: Mapping[str, Any], now: float) -> None:
         """Take in where the group stands."""
-        epoch, done, phase = (
-            int(state.get("epoch") or 0),
-            int(state.get("done") or 0),
-            str(state.get("phase")),
-        )
-        if epoch != self.epoch:
-            self.epoch, self.epoch_began, self.window = epoch, now, None
-        if phase == "training" and 0 < int(state.get("total") or 0) <= done:
-            phase = "learning"
-        if (done, phase) != self.round:
-            self.round, self.round_began = (done, phase), now
-        if phase != "training" or not done:
+        if not state:
             return
-        began, before = self.window = self.window or (now, done)
-        if done - before >= 2 and now - began >= WINDOW_SECONDS:
-            self.rate, self.window = (now - began) / (done - before), (now, done)
+        self.begun = now if self.begun is None else self.begun
+        epoch, done = int(state.get("epoch") or 0), int(state.get("done") or 0)
+        if epoch > (self.marks[-1][0] if self.marks else self.first):
+            self.marks.append((epoch, now))
+        trains = state.get("phase") == "training" and done < int(state.get("total") or 0)
+        if (done, trains) != (self.round, self.trains):
+            self.round, self.trains, self.round_began = done, trains, now
 
-    def seconds_per_round(self, now: float) -> float | None:
-        """Return what a round takes by now, at least what the current one has taken; None outside of training."""
-        if self.round[1] != "training":
+    @property
+    def pace(self) -> float | None:
+        """Seconds per epoch, over the later half of the epochs that were timed; None before there are two marks."""
+        if len(self.marks) < 2:
             return None
-        waited = now - self.round_began
-        return (
-            max(self.rate, waited) if self.rate is not None else waited if waited >= WINDOW_SECONDS else None
+        last, ended = self.marks[-1]
+        middle = (self.marks[0][0] + last) // 2
+        epoch, began = max(mark for mark in self.marks[:-1] if mark[0] <= max(middle, self.marks[0][0]))
+        return (ended - began) / (last - epoch)
+
+    @property
+    def once(self) -> float:
+        """Seconds for what happens once: the start, and what the first epoch takes more than others."""
+        if self.begun is None or self.pace is None:
+            return 0.0
+        epoch, ended = self.marks[0]
+        return max(0.0, ended - self.begun - (epoch - self.first) * self.pace)
+
+    def waited(self, now: float) -> float:
+        """Return for how long the round of training under way has gone on."""
+        return now - self.round_began if self.trains else 0.0
+
+    def left(self, epochs: int, now: float) -> float | None:
+        """Return the seconds left; an epoch is never taken to be shorter than what the current one has taken."""
+        if self.pace is None:
+            return None
+        epoch, ended = self.marks[-1]
+        elapsed = now - ended
+        return max(0.0, (epochs - epoch) * max(self.pace, elapsed) - elapsed)
+
+
+class CostEstimate:
+    """Estimates the remaining time from whole epochs: nothing is said before a group's second one has ended."""
+
+    def __init__(self, groups: Sequence[SeedGroup], epochs: int, workers: int) -> None:
+        self.groups = {group.id: group for group in groups}
+        self.epochs = epochs
+        self.workers = min(workers, max(1, len(groups)))
+        self._clocks = {name: _Clock(group.epoch) for name, group in self.groups.items()}
+        self._began = False
+
+    def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:
+        """Return the seconds left on these workers, None before enough was measured."""
+        if not self._began:
+            self._began = True
+            for clock in list(self._clocks.values())[: self.workers]:
+                clock.begun = now
+        for name, state in snapshot.items():
+            self._clocks[name].look(state, now)
+        timed = {name: clock for name, clock in self._clocks.items() if clock.pace is not None}
+        if not timed:
+            return None
+        pace = statistics.mean(
+            (clock.pace or 0.0) / len(self.groups[name].seeds) for name, clock in timed.items()
         )
+        once = statistics.mean(clock.once for clock in timed.values())
+        total, longest = 0.0, 0.0
+        for name, group in self.groups.items():
+            clock = self._clocks[name]
+            left = clock.left(self.epochs, now)
+            if left is None:  # it waits for a worker, or is at its first epochs
+                epoch = clock.marks[-1][0] if clock.marks else group.epoch
+                left = (self.epochs - epoch) * pace * len(group.seeds)
+                left += 0.0 if clock.begun is not None else once
+            total += left
+            longest = max(longest, left)
+        return max(total / self.workers, longest)
 
+    def slowest_round(self, now: float) -> float:
+        """Return for how long the longest of the rounds under way has gone on."""
+        return max((clock.waited(now) for clock in self._clocks.values()), default=0.0)
 
-def _short(seconds: float) -> str:
-    return duration(seconds) if seconds >= 10 else f"{seconds:.2g} s"
+    @property
+    def epoch_done(self) -> bool:
+        """Whether an epoch has ended by now."""
+        return any(clock.marks for clock in self._clocks.values())
 
 
 PROBING = (
     "probing: the middle seed of a group is trained again alone in a fresh process, to show that it does not depend on "
     "the others"
 )
-
-
-class CostEstimate:
-    """Estimates the remaining time: from rounds during the first epoch, then from whole epochs.
-
-    An epoch is never taken to be shorter than what the current one has taken so far.
-    """
-
-    def __init__(self, groups: Sequence[SeedGroup], epochs: int, workers: int) -> None:
-        self.groups = {group.id: group for group in groups}
-        self.epochs = epochs
-        self.workers = min(workers, max(1, len(groups)))
-        self._clocks = {name: _Clock() for name in self.groups}
-
-    def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:
-        """Return the seconds left on these workers, None before anything was measured."""
-        per_epoch = {name: self._epoch_seconds(name, state, now) for name, state in snapshot.items()}
-        known = [
-            seconds / len(self.groups[name].seeds)
-            for name, seconds in per_epoch.items()
-            if seconds is not None
-        ]
-        if not known:
-            return None
-        mean = sum(known) / len(known)
-        total, longest = 0.0, 0.0
-        for name, group in self.groups.items():
-            state = snapshot.get(name, {})
-            measured = per_epoch.get(name)
-            seconds = measured if measured is not None else mean * len(group.seeds)
-            left = (self.epochs - float(state.get("epoch") or group.epoch)) * seconds
-            if measured is not None and state.get("phase") in ("training", "validating"):
-                left -= now - self._clocks[name].epoch_began
-            total += max(0.0, left)
-            longest = max(longest, left)
-        return max(total / self.workers, longest)
-
-    def slowest_round(self, now: float) -> float | None:
-        """Return what one round takes in the group where it takes longest, in seconds; None before it is known."""
-        known = [clock.seconds_per_round(now) for clock in self._clocks.values()]
-        return max((seconds for seconds in known if seconds is not None), default=None)
-
-    def _epoch_seconds(self, name: str, state: Mapping[str, Any], now: float) -> float | None:
-        clock = self._clocks[name]
-        clock.look(state, now)
-        elapsed = now - clock.epoch_began if state.get("phase") in ("training", "validating") else 0.0
-        if state.get("epoch_seconds"):
-            return max(float(state["epoch_seconds"]), elapsed)
-        a_round, total = clock.seconds_per_round(now), int(state.get("total") or 0)
-        if a_round is not None and total:
-            rest = (total - int(state.get("done") or 0)) * a_round
-            return VALIDATION * (elapsed + rest)
-        if clock.round[1] == "learning":
-            return VALIDATION * elapsed if elapsed >= WINDOW_SECONDS else None
-        if state.get("phase") == "validating":
-            return VALIDATION * elapsed if clock.rate is not None else None
-        return None
 
 
 class Bar:
@@ -241,7 +248,7 @@ class RunDisplay:
         """Whether more than a day is left, by what was measured."""
         self.probing = False
         """Whether a group has made a probe, see `qrlsuite.engine.probe`."""
-        self._announced = False
+        self._announced = self._warned = False
         self._began = time.monotonic()
         self._last_line = time.monotonic()
         self._last: dict[str, dict[str, Any]] = {}
@@ -296,9 +303,10 @@ class RunDisplay:
             self.probing = True
             self.console.print(PROBING, markup=False, soft_wrap=True)
         left = self.estimate.remaining(snapshot, now)
-        epoch_done = any(state.get("epoch_seconds") for state in snapshot.values())
-        if left is not None and not self._announced and (epoch_done or now - self._began >= SILENCE_SECONDS):
-            self._announce(left, now, epoch_done)
+        if left is not None and not self._announced:
+            self._announce(left)
+        elif now - self._began >= SILENCE_SECONDS and not (self._warned or self.estimate.epoch_done):
+            self._warn(snapshot, now)
         if left is not None and self.deadline is not None:
             left = min(left, max(0.0, self.deadline - now))
         done, completed, epochs = 0.0, 0, []
@@ -321,7 +329,7 @@ class RunDisplay:
         ]
         parts += [f"median score {statistics.median(scores):.3f}"] if scores else []
         parts += [f"{diverged} diverged"] if diverged else []
-        parts += [f"{duration(left)} left"] if left is not None else ["measuring"]
+        parts.append(f"{duration(left)} left" if left is not None else self._phase(snapshot))
         text = "  ".join(parts)
         if self.bar.shown:
             self.bar.update(done, "training", text)
@@ -329,26 +337,37 @@ class RunDisplay:
             self._last_line = now
             self.console.print(text)
 
-    def _announce(self, left: float, now: float, epoch_done: bool) -> None:
-        """Say once what it will take, after the first epoch or after some seconds without one."""
+    def _phase(self, snapshot: Mapping[str, Mapping[str, Any]]) -> str:
+        """Say what is done where no time is known yet: the earliest phase that a group is in."""
+        phases = {str(state.get("phase")) for state in snapshot.values() if state} or {"starting"}
+        return next((text for phase, text in PHASES.items() if phase in phases), "measuring")
+
+    def _announce(self, left: float) -> None:
+        """Say once, after the second epoch, what the rest will take."""
         self._announced = True
-        self.endless = left > DAY
-        if left < 10:
+        self.endless |= left > DAY
+        if left >= 10:
+            self.console.print(f"about {duration(left)} left, by the pace since epoch 1", soft_wrap=True)
+        if left > 3600 and not self._warned:
+            self._advise()
+
+    def _warn(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> None:
+        """Say once that a round of the first epoch takes long, and what is faster."""
+        waited = self.estimate.slowest_round(now)
+        rounds = max((int(state.get("total") or 0) for state in snapshot.values()), default=0)
+        if waited < SILENCE_SECONDS / 2:
             return
-        a_round = self.estimate.slowest_round(now)
-        if epoch_done:
-            text = f"this will take about {duration(left)} here (measured on the first epoch)"
-        else:
-            round_text = (
-                ""
-                if a_round is None
-                else f"one round of steps and updates of a group takes {_short(a_round)}, "
-            )
-            text = f"no epoch is done yet: {round_text}all of it takes about {duration(left)} or more"
-        self.console.print(text, soft_wrap=True)
-        if left > 3600:
-            for advice in self._faster():
-                self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
+        self._warned = True
+        self.endless = waited * rounds * self.epochs > DAY
+        self.console.print(
+            f"one round of steps and updates of a group takes {duration(waited)} or more, and an epoch has {rounds}",
+            soft_wrap=True,
+        )
+        self._advise()
+
+    def _advise(self) -> None:
+        for advice in self._faster():
+            self.console.print(f"faster: {advice}", markup=False, soft_wrap=True)
 
     def _faster(self) -> list[str]:
         faster = self.entry.model.faster

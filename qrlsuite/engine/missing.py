@@ -194,12 +194,14 @@ def train(
 
 
 def expected(work: Missing, where: Where) -> str | None:
-    """Say how long training should take, None where nothing is known before the first epoch."""
+    """Say how long training should take, None where this entry was not measured here before."""
     if not work.groups or where.remote or where.device != "cpu":
         return None
     try:
         estimate = speed.known(work.runs).estimate(work.entry, work.together)
     except TaskError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
+        return None
+    if estimate.basis != "measured":
         return None
     seconds = estimate.range(work.left / min(where.workers, len(work.groups)))
     return seconds and f"it should take {duration_range(*seconds)} ({speed.BASES[estimate.basis]})"

@@ -335,6 +335,8 @@ class _Run:
             files.record(lines, timing)
             means = [sum(line["scores"]) / len(line["scores"]) for line in lines]
             progress.finished_epoch(timing["epoch"], means, [line.get("diverged") is True for line in lines])
+            if timing["epoch"] == member.group.epoch + 1:
+                continue  # it holds what happens once
             progress.epoch_seconds = len(lines) * sum(timing.get(name, 0.0) for name in ("train", "validate"))
         policy = {name.removeprefix(POLICY): a for name, a in arrays.items() if name.startswith(POLICY)}
         state = {name: array for name, array in arrays.items() if not name.startswith(POLICY)}

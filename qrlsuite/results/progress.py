@@ -30,6 +30,7 @@ class Progress:
     seed_diverged: list[bool] = field(default_factory=list)
     """Whether numbers of each seed's agent are no longer finite after `epoch`."""
     epoch_seconds: float | None = None
+    """Of the last epoch; None for the first one of a process, which holds what happens once."""
     warnings: list[str] = field(default_factory=list)
     """What the user should know although nothing failed: a tracker that was left out."""
 
@@ -66,7 +67,7 @@ class ProgressFile:
         """
         now = time.monotonic()
         silent = progress.phase == "training" and 0 < progress.total <= progress.done
-        silent |= progress.phase == "probing"
+        silent |= progress.phase in ("compiling", "probing")
         if not (force or silent) and now - self._written < 0.5:
             return
         self._written = now

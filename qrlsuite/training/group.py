@@ -331,7 +331,7 @@ class GroupRun:
                     and self.probe.begin(self.trainer)
                 ):
                     self._judge(guard, self.probe)
-                self.trainer.models.compile_circuits()
+                self._compile()
                 last_save = time.monotonic()
                 while self.trainer.epoch < self.epochs:
                     epoch = self.trainer.train_epoch()
@@ -379,6 +379,13 @@ class GroupRun:
         origin = provenance.of(self.trainer.entry, self.trainer.device)
         for files in self.files:
             files.begin(self.trainer.epoch, parameters, origin)
+
+    def _compile(self) -> None:
+        """Compile circuits, where the model has any, before the first epoch: that is once per machine."""
+        if self.trainer.models.circuits:
+            self.progress.phase = "compiling"
+            self.report(self.progress)
+            self.trainer.models.compile_circuits()
 
     def _judge(self, guard: Interruptible, probe: GroupProbe) -> None:
         """Make the probe, and note what it found; an interruption ends it, and the same command makes it again.

@@ -246,10 +246,15 @@ class ModelBuilder:
         counts = {"classical": classical, "quantum": quantum, "networks": len(counted)}
         return {**counts, "fixed": fixed} if fixed else counts
 
+    @property
+    def circuits(self) -> list[Any]:
+        """The models that compile circuits."""
+        return [module for module in self.built if hasattr(module, "compile_circuits")]
+
     def compile_circuits(self) -> None:
         """Let models of circuits compile what their first pass would: no epoch's time, and no estimate, holds that."""
-        for module in self.built:
-            getattr(module, "compile_circuits", lambda: None)()
+        for module in self.circuits:
+            module.compile_circuits()
 
     def problems(self) -> list[str]:
         """Say why populations run slower than they might; each reason once."""
@@ -347,6 +352,7 @@ class Trainer:
         self.device = find_device(device)
         self.progress = Progress()
         self.epoch = 0
+        self._warm = False
         protocol = entry.task.file.protocol
         self.S, self.E, self.V = len(self.seeds), protocol.environments, protocol.validation_episodes
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
@@ -408,7 +414,8 @@ class Trainer:
             }
             for steps in own_steps.tolist()
         ]
-        self.progress.epoch_seconds = finished - started
+        self.progress.epoch_seconds = finished - started if self._warm else None
+        self._warm = True
         seconds = {"train": trained - started, "validate": finished - trained}
         if self.device.type == "cpu":
             seconds["cpu"] = time.process_time() - processor
