@@ -34,7 +34,7 @@ PHASES = {
 """What is shown of a group before its first epoch; none of it is part of an epoch's time."""
 
 
-class _Clock:
+class Clock:
     """Times one group from its progress: its epochs, and the rounds of its first one.
 
     The first epoch that a process trains is left out: it holds what happens once (memory that fills up, code that is
@@ -101,7 +101,7 @@ class CostEstimate:
         self.groups = {group.id: group for group in groups}
         self.epochs = epochs
         self.workers = min(workers, max(1, len(groups)))
-        self._clocks = {name: _Clock(group.epoch) for name, group in self.groups.items()}
+        self._clocks = {name: Clock(group.epoch) for name, group in self.groups.items()}
         self._began = False
 
     def remaining(self, snapshot: Mapping[str, Mapping[str, Any]], now: float) -> float | None:

@@ -2,14 +2,11 @@
 
 A speed is the time of one epoch of one seed, training and validation, on one core, as its share of the group that
 it was trained in. That share depends on the size of the group: a small network alone takes thirty times as long as
-in a group of fifty. So every estimate is for groups of a given size. It is a range, and says what it rests on, from the
-best evidence to the weakest:
+in a group of fifty. So every estimate is for groups of a given size. It is a range, and says what it rests on:
 
 - `measured`: epochs of this very entry in this results folder, in groups of about this size;
-- `scaled`: epochs of this entry in other groups, or of the most similar entry, times the ratio of reference speeds;
-- `alike`: the same without a reference to scale them by;
-- `reference`: the speed of the most similar entry on another machine, times the ratio of the two machines'
-  calibrations (see `calibration`);
+- `reference`: the most similar row of the reference table, to which belongs what was measured here in groups of about
+  this size; a row of another machine counts times the ratio of the two machines' calibrations (see `calibration`);
 - `unknown`: there is nothing to go by until a first epoch has been trained.
 """
 
@@ -44,21 +41,13 @@ SAMPLED_SEEDS = 8
 
 BASES = {
     "measured": "measured on its own epochs",
-    "scaled": "measured on a similar entry or group size, scaled by reference speeds",
-    "alike": "measured on a similar entry or group size, not scaled",
-    "reference": "reference speeds, scaled by a calibration of this machine",
+    "reference": "the most similar reference speed, scaled by a calibration of this machine",
     "unknown": "not known before a first epoch is trained",
 }
 
-Basis = Literal["measured", "scaled", "alike", "reference", "unknown"]
+Basis = Literal["measured", "reference", "unknown"]
 
-WITHIN: Mapping[Basis, float] = {
-    "measured": 1.25,
-    "scaled": 2.0,
-    "alike": 3.0,
-    "reference": 3.0,
-    "unknown": 1.0,
-}
+WITHIN: Mapping[Basis, float] = {"measured": 1.25, "reference": 3.0, "unknown": 1.0}
 """An estimate ranges from what it says divided by this factor to what it says times it. For `reference`, it covers the
 distance between the reference speeds and the hours of all published entries (a test holds it to that). What was
 measured ranges at least this far, and as far as the 10th and 90th percentile of its epochs."""
@@ -100,6 +89,10 @@ class Speed:
     alone: float | None = None
     calibration: float | None = None
     within: float = 1.0
+
+    def resembles(self, seeds: int) -> bool:
+        """Tell whether it counts as measured in groups of `seeds`."""
+        return max(self.group / seeds, seeds / self.group) <= SAME_SIZE
 
     def together(self, seeds: int) -> float:
         """Return the seconds per seed and epoch in a group of `seeds`, `seconds` where `alone` is not known.
@@ -182,29 +175,16 @@ class Speeds:
 
     def estimate(self, entry: Entry, together: int | None) -> Estimate:
         """Return the best estimate for an entry in groups of `together` seeds; None for as many as were measured."""
-        subject = _subject(entry)
-        reference = _nearest(subject, self.references)
-        same_entry = next((speed for speed in self.measured if speed.hash == entry.hash), None)
-        size = together or (same_entry.group if same_entry is not None else None)
-        if (
-            same_entry is not None
-            and size
-            and max(same_entry.group / size, size / same_entry.group) <= SAME_SIZE
-        ):
-            return Estimate(same_entry.seconds, "measured", max(same_entry.within, WITHIN["measured"]))
-        alike = same_entry or _nearest(subject, self.measured)
-        if alike is not None:
-            base = _nearest(alike, self.references)
-            if reference is None or base is None:
-                return Estimate(alike.seconds, "alike", WITHIN["alike"])
-            ratio = reference.together(size or alike.group) / base.together(alike.group)
-            return Estimate(alike.seconds * ratio, "scaled", WITHIN["scaled"])
-        if reference is None:
+        own = next((speed for speed in self.measured if speed.hash == entry.hash), None)
+        size = together or (own.group if own is not None else None)
+        here = [speed for speed in self.measured if size is None or speed.resembles(size)]
+        if own is not None and own in here:
+            return Estimate(own.seconds, "measured", max(own.within, WITHIN["measured"]))
+        row = _nearest(_subject(entry), [*here, *self.references])
+        if row is None:
             return Estimate(None, "unknown")
-        machine = 1.0 if reference.calibration is None else self.calibrate() / reference.calibration
-        return Estimate(
-            reference.together(size or reference.group) * machine, "reference", WITHIN["reference"]
-        )
+        machine = 1.0 if row.calibration is None else self.calibrate() / row.calibration
+        return Estimate(row.together(size or row.group) * machine, "reference", WITHIN["reference"])
 
     def note(self, store: EntryStore) -> None:
         """Take in what an entry's folder has measured by now."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from qrlsuite.engine.display import Bar
+from qrlsuite.engine.display import Bar, Clock
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import Missing
 from qrlsuite.results import speed
@@ -40,10 +40,12 @@ class TuneDisplay:
         self.searches, self.where, self.again = searches, where, again
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
-        self._began = time.monotonic()
         self._works: Sequence[Missing] = ()
-        self._done = self._trained = 0
-        """Trials before those that are trained now; those among them that were trained here."""
+        self._clock = Clock(0)
+        self._per_run: float | None = None
+        """Seconds of one seed of a trial, by the pace of the trials that are trained now or were last."""
+        self._done = 0
+        """Trials before those that are trained now."""
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
@@ -62,8 +64,10 @@ class TuneDisplay:
             bases.setdefault(basis)
             total = None if total is None or cost is None else (total[0] + cost[0], total[1] + cost[1])
         cores = self.where.workers
-        if total is None:
-            self.console.print("what it costs will be known after the first trial")
+        if total is None or [*bases] != [speed.BASES["measured"]]:
+            self.console.print(
+                "what it takes will be known after the first trial; finished trials cost nothing again"
+            )
         else:
             low, high = total
             self.console.print(
@@ -93,8 +97,9 @@ class TuneDisplay:
     def training(self, works: Sequence[Missing]) -> None:
         """Show that some of these trials are trained now, side by side."""
         self._done += len(self._works)
-        self._trained += len(self._works)
         self._works = works
+        self._clock = Clock(min(group.epoch for work in works for group in work.groups))
+        self._clock.begun = time.monotonic()
         self.update({})
 
     def update(self, snapshot: dict[str, dict[str, Any]]) -> None:
@@ -110,18 +115,25 @@ class TuneDisplay:
             f"epoch {min(epochs)}/{last}",
         ]
         parts += [f"best {steps_text(s.best.merit.value)}" for s in self.searches if s.best is not None]
-        left = self._left()
+        left = self._left(min(epochs), last)
         if left is not None:
             parts.append(f"{duration(left)} left")
         part = sum(epochs) / (len(epochs) * last)
         self.bar.update(self._done + count * part, "tuning", "  ".join(parts))
 
-    def _left(self) -> float | None:
-        """Return the seconds left by the pace of the trials that were trained now; None before one was."""
-        if not self._trained:
+    def _left(self, epoch: int, last: int) -> float | None:
+        """Return the seconds left; None before a trial's second epoch has ended."""
+        now = time.monotonic()
+        self._clock.look({"epoch": epoch}, now)
+        trained = sum(len(work.todo) for work in self._works)
+        if self._clock.pace is not None:
+            self._per_run = (self._clock.once + self._clock.pace * last) / trained
+        if self._per_run is None:
             return None
-        left = sum(search.planned for search in self.searches) - self._done
-        return (time.monotonic() - self._began) / self._trained * left
+        rest = sum(search.runs_planned - search.runs_done for search in self.searches) - trained
+        current = self._clock.left(last, now)
+        current = trained * self._per_run if current is None else current
+        return current + max(0, rest) * self._per_run
 
     def told(self, search: Search, trial: Trial | None) -> None:
         """Show a trial's result."""

@@ -289,6 +289,28 @@ def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp
     assert "every finished epoch is saved" in shown.getvalue()
 
 
+def test_what_is_left_of_a_search_is_known_after_the_second_epoch(
+    tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch starts for 5 s, its epochs take 2 s, and as many runs again are to come as each batch has."""
+    clock = [100.0]
+    monkeypatch.setattr("qrlsuite.tuning.display.time.monotonic", lambda: clock[0])
+    by = where.Where(local.LocalEngine(), 1)
+    found = halving(tiny_task, tmp_path)
+    display = TuneDisplay([found], by, quiet=True)
+    begun = [missing.find(found.runs, entry, by, [0, 1], 10) for entry in entries(tiny_task)]
+    display.training(begun)
+    runs = 2 * len(begun)
+    monkeypatch.setattr(type(found), "runs_planned", 3 * runs)
+    said = []
+    for epoch, now in enumerate((105.0, 107.0, 109.0, 111.0)):
+        clock[0] = now
+        said.append(display._left(epoch, 10))
+    assert said == [None, None, pytest.approx(8 * 2 + 2 * 25), pytest.approx(7 * 2 + 2 * 25)]
+    display.training(begun)
+    assert display._left(0, 10) == pytest.approx(25 + 2 * 25), "by the pace of the batch before"
+
+
 def preset(found: Halving) -> str:
     found.write(found.path)
     return without_hours(found.path.read_text())
