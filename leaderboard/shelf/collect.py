@@ -16,7 +16,6 @@ from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf import published as published_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
 from qrlsuite.results import codes, genuine, lookup, probes, provenance
-from qrlsuite.results.lookup import Stored
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
@@ -38,7 +37,7 @@ def collect(
         both is shown once, the copy with more seeds: equal seeds are the same runs, not further evidence. Where the
         own copy gets less far towards the task's shortest horizon, both are shown.
     only:
-        Read these alone, the unranked among them, too. None reads what boards rank.
+        Read these alone, of studies or not. None reads what boards rank.
 
     Returns
     -------
@@ -50,7 +49,7 @@ def collect(
     if only is None:
         stores = [store for store in _folders(runs, published, tasks) if not tasks or _task(store) in tasks]
     else:
-        stores = _folders(runs, published, everything=True)
+        stores = _folders(runs, published, of_studies=True)
         stores = [store for store in stores if (_task(store), store.path.name) in only]
         absent = len(only) - len({(_task(store), store.path.name) for store in stores})
         if absent:
@@ -259,20 +258,13 @@ def _every_copy(runs: Path, name: str, published: bool, tasks: Collection[str]) 
     if (Path(name) / "entry.json").exists():
         folders = [EntryStore(Path(name))]
     else:
-        ranked = lookup.stored(_folders(runs, published, tasks))
-        everything = lookup.stored(_folders(runs, published, tasks, everything=True))
-        ranked, everything = (
-            [e for e in found if not tasks or e.task in tasks] for found in (ranked, everything)
-        )
-        try:
-            key = _choose(ranked, name, runs, tasks)
-        except UnknownNameError as error:
-            try:  # it may be one that no board ranks
-                key = _choose(everything, name, runs, tasks)
-            except UnknownNameError:
-                if lookup.fitting(ranked, name):  # the shorter list of choices
-                    raise error from None
-                raise
+        everything = lookup.stored(_folders(runs, published, tasks, of_studies=True))
+        everything = [entry for entry in everything if not tasks or entry.task in tasks]
+        on_boards = {store.path for store in _folders(runs, published, tasks)}
+        fitting = lookup.fitting(everything, name)
+        # where entries of boards and of studies fit, those of boards are meant
+        meant = [entry for entry in fitting if entry.store.path in on_boards] or fitting or everything
+        key = lookup.choose(list({e.key: e for e in meant}.values()), name, _place(runs, tasks)).key
         folders = [entry.store for entry in everything if entry.key == key]
     copies = [entry for store in folders for entry in read_each(store)]
     if not copies:
@@ -292,11 +284,6 @@ def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
     return [further]
 
 
-def _choose(among: Sequence[Stored], name: str, runs: Path, tasks: Collection[str]) -> tuple[str, str, str]:
-    """Return the key of the entry that has a name."""
-    return lookup.choose(list({entry.key: entry for entry in among}.values()), name, _place(runs, tasks)).key
-
-
 def _place(runs: Path, tasks: Collection[str]) -> str:
     """Say where an entry was looked for."""
     return f"{runs}, task {' or '.join(sorted(tasks))}" if tasks else str(runs)
@@ -310,19 +297,12 @@ def _weight(entry: EntryResults) -> tuple[int, int, int]:
 
 
 def _folders(
-    runs: Path, published: bool, tasks: Collection[str] = (), everything: bool = False
+    runs: Path, published: bool, tasks: Collection[str] = (), of_studies: bool = False
 ) -> list[EntryStore]:
     """Return the folders of what boards rank: the entries in the results folder, and with `published` those published.
 
-    Where a task has no published entries but unranked ones, its board ranks these, if the task is named or has
-    entries in the results folder.
-
-    Parameters
-    ----------
-    tasks:
-        Those that are named; the folders of all tasks are returned.
-    everything:
-        All unranked entries, too.
+    Entries of studies are among them where `of_studies` asks for all, or if their task has no other published entries
+    and is named in `tasks` or has entries in the results folder.
     """
     if not runs.is_dir() and not published:
         raise StoreError(
@@ -331,10 +311,10 @@ def _folders(
         )
     stores = entries(runs) if runs.is_dir() else []
     if published:
-        ranked = entries(published_entries.PUBLISHED)
-        asked = {*tasks, *map(_task, stores)} - set(map(_task, ranked))
-        unranked = entries(published_entries.UNRANKED)
-        stores += ranked + [store for store in unranked if everything or _task(store) in asked]
+        on_boards = entries(published_entries.PUBLISHED)
+        asked = {*tasks, *map(_task, stores)} - set(map(_task, on_boards))
+        others = entries(published_entries.OF_STUDIES)
+        stores += on_boards + [store for store in others if of_studies or _task(store) in asked]
     return stores
 
 

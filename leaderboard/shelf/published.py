@@ -36,12 +36,10 @@ from qrlsuite.specs import NAME
 PUBLISHED = Path(__file__).parents[1] / "entries"
 """The entries that come with the suite and stand on its boards."""
 
-UNRANKED = Path(__file__).parents[1] / "unranked"
-"""The others that come with the suite: each answers a study's question. A board ranks them only when it is asked.
+OF_STUDIES = Path(__file__).parents[1] / "unranked"
+"""The entries of studies that come with the suite: more entries on a board make each of its pairs harder to decide.
 
-It is asked by a study or an entry's name. And where all published entries of a task are unranked, they are on its board
-if the task is named, or has entries of one's own. More entries on a board make each of its pairs harder to decide, so a
-board has those of one question.
+A study ranks its own. A task that has no others has a board of them.
 """
 
 CURVES = "curves.parquet"
@@ -149,7 +147,7 @@ class PublishedEntry:
 
 def folders() -> tuple[Path, ...]:
     """Return the folders of all entries that come with the suite."""
-    return PUBLISHED, UNRANKED
+    return PUBLISHED, OF_STUDIES
 
 
 def is_published(folder: Path) -> bool:

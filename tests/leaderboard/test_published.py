@@ -658,7 +658,7 @@ kind = "bars"
 @pytest.fixture
 def two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A study of two published networks: width 64 stands on the board, width 16 does not."""
-    places = {"PUBLISHED": "mlp width=64", "UNRANKED": "mlp width=16"}
+    places = {"PUBLISHED": "mlp width=64", "OF_STUDIES": "mlp width=16"}
     folders = [
         api.load(label, task="beam6g", runs="none", published=True).folder for label in places.values()
     ]
@@ -671,9 +671,7 @@ def two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(path)
 
 
-def test_beside_ranked_entries_unranked_ones_are_found_by_name_and_by_study_only(
-    two: str, tmp_path: Path
-) -> None:
+def test_entries_of_studies_are_found_by_name_and_by_study_only(two: str, tmp_path: Path) -> None:
     def labels(**choice: Any) -> list[str]:
         found = api.board("beam6g", runs=tmp_path, published=True, **choice)
         return sorted(row.entry.label for row in found.sections[0].rows)
@@ -700,7 +698,7 @@ def test_beside_ranked_entries_unranked_ones_are_found_by_name_and_by_study_only
     assert command("verify").stdout.count("ok ") == 2
 
 
-def test_a_task_whose_published_entries_are_all_unranked_has_a_board_of_them(
+def test_a_task_that_only_studies_have_entries_of_has_a_board_of_them(
     two: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "empty").mkdir()
@@ -726,7 +724,7 @@ def test_a_task_whose_published_entries_are_all_unranked_has_a_board_of_them(
     assert len(api.board("beam6g", runs=runs, published=True, study=two).refused) == 1, "width 64 is absent"
 
 
-def test_an_ambiguous_name_lists_ranked_entries_where_some_fit(tmp_path: Path) -> None:
+def test_an_ambiguous_name_lists_entries_of_boards_where_some_fit(tmp_path: Path) -> None:
     with pytest.raises(QrlSuiteError, match=r"may be any of .*'beam6g/ddqn mlp width=64': write") as raised:
         api.load("mlp width=64", runs=tmp_path, published=True)
     assert "beam6g-a5-0" not in str(raised.value)
