@@ -14,8 +14,8 @@ from qrlsuite.experiment import identity
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
-from qrlsuite.results import codes
-from qrlsuite.results.store import EntryStore, parameters_of
+from qrlsuite.results import codes, probes
+from qrlsuite.results.store import EntryStore, SeedRun, parameters_of
 
 
 def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
@@ -61,10 +61,23 @@ def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
         [_made_with(run.record.get("provenance") or [{}]) for run in runs],
         {"classical": 0, "quantum": 0, **parameters_of(run.record for run in runs)},
         fingerprint(built, entry.seeds),
+        _found(runs),
     )
     _replace(folder, content)
     published.read(folder)
     return folder
+
+
+_OF_PROBE = ("result", "seed", "epochs", "reason", "seconds", "cpu")
+
+
+def _found(runs: Sequence[SeedRun]) -> dict[str, Any]:
+    """Return which seeds diverged, and the probe of independent seeds; of either nothing, where there is none."""
+    diverged = {str(run.seed): run.diverged for run in runs if run.diverged is not None}
+    made = [probe for run in runs if (probe := probes.of_record(run.record)) is not None]
+    made.sort(key=lambda probe: probe["result"] != probes.EQUAL)
+    kept = {name: made[0][name] for name in _OF_PROBE if name in made[0]} if made else {}
+    return {name: value for name, value in (("diverged", diverged), ("probe", kept)) if value}
 
 
 def _made_with(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -219,6 +219,9 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> I
         rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
         if executions := int(exported.executions[row]):
             rows[-1]["executions"] = {"imported": executions}
+        diverged, probe = exported.diverged.get(seed), exported.probe
+        if diverged is not None:
+            rows[diverged - 1]["diverged"] = True
         made = _unplaced(store, seed)
         made.path.mkdir(parents=True)
         write_atomically(made.table, table_bytes(rows))
@@ -241,6 +244,8 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> I
                 "status": "finished",
                 "epochs": len(rows),
                 **({"code": exported.record["code"]} if "code" in exported.record else {}),
+                **({} if diverged is None else {"diverged": diverged}),
+                **({"probe": dict(probe)} if probe.get("seed") == seed else {}),
                 "provenance": [dict(exported.provenance[row])],
             }
         )

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
-from qrlsuite.results import codes, parquet, provenance
+from qrlsuite.results import codes, parquet, probes, provenance
 from qrlsuite.results.store import EntryStore, round_means
 from qrlsuite.specs import NAME
 
@@ -83,6 +83,17 @@ class PublishedEntry:
         return [made[index] for index in self.origins]
 
     @property
+    def diverged(self) -> dict[int, int]:
+        """By seed, the first epoch after which its agent's numbers were not finite; seeds without one are absent."""
+        return {int(seed): epoch for seed, epoch in self.record["published"].get("diverged", {}).items()}
+
+    @property
+    def probe(self) -> Mapping[str, Any]:
+        """What a probe of independent seeds found (`qrlsuite.results.probes`); empty where none was made."""
+        found: Mapping[str, Any] = self.record["published"].get("probe", {})
+        return found
+
+    @property
     def chosen_seeds(self) -> str:
         """Why no board ranks an entry whose seeds may have been chosen; empty where they are 0 to N - 1.
 
@@ -130,6 +141,7 @@ class PublishedEntry:
             plan=record.get("plan"),
             codes=codes.distinct([codes.read(record, self.folder / "entry.json")]),
             first_thresholds=self.task_file.ranking.grid.thresholds,
+            unprobed=any(map(probes.third_party, made_with)) and self.probe.get("result") != probes.EQUAL,
             source="published",
             chosen_seeds=self.chosen_seeds,
             records={
@@ -138,7 +150,7 @@ class PublishedEntry:
                     "finished": True,
                     "hours": float(hours),
                     "executions": int(executions),
-                    "diverged": None,  # not recorded
+                    "diverged": self.diverged.get(seed),
                 }
                 for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
             },
@@ -207,6 +219,7 @@ def _read(folder: Path) -> PublishedEntry:
         count = published[name]
         _require(type(count) is int and 0 < count < 10**9, folder, f"{name}: {count!r}")
     seeds, curves = _curves(folder, task_file, published["seeds"] * published["epochs"])
+    _check_found(folder, published, seeds)
     facts = _table(folder / SEEDS, _SEED_COLUMNS, published["seeds"], 10_000)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
     hours = np.array(facts["hours"], np.float64)
@@ -234,6 +247,23 @@ def _read(folder: Path) -> PublishedEntry:
         f"{SEEDS} has rows of different lengths",
     )
     return PublishedEntry(folder, record, task_file, seeds, curves, hours, executions, origins, beginning)
+
+
+def _check_found(folder: Path, published: Mapping[str, Any], seeds: Sequence[int]) -> None:
+    """Check what was found in training: seeds that diverged, and what a probe of independent seeds says."""
+    diverged, probe, names = published.get("diverged", {}), published.get("probe", {}), set(map(str, seeds))
+    _require(
+        isinstance(diverged, dict)
+        and diverged.keys() <= names
+        and all(type(epoch) is int and 0 < epoch <= published["epochs"] for epoch in diverged.values()),
+        folder,
+        f"diverged: {str(diverged)[:100]} does not name seeds and their epochs",
+    )
+    _require(
+        isinstance(probe, dict) and (not probe or probe.get("result") in (probes.EQUAL, probes.NOT_PROBED)),
+        folder,
+        f"probe: {str(probe)[:100]} is not the result of one that found seeds independent",
+    )
 
 
 def _require(holds: bool, folder: Path, problem: str) -> None:
@@ -368,6 +398,7 @@ def files(
     made_with: list[Mapping[str, Any]],
     parameters: Mapping[str, int],
     beginning: Fingerprint,
+    found: Mapping[str, Any],
 ) -> dict[str, bytes]:
     """Encode an entry's three files, by name; equal entries give equal bytes.
 
@@ -381,6 +412,8 @@ def files(
         As `qrlsuite.results.store.parameters_of` returns them.
     hours, executions, made_with, beginning:
         Per seed, N of each.
+    found:
+        `diverged` and `probe`, as `PublishedEntry` has them; where there are none, their names are left out.
     """
     distinct: list[Mapping[str, Any]] = []
     for made in made_with:
@@ -396,6 +429,7 @@ def files(
             "core_hours": round(math.fsum(hours), 6),
             "circuit_executions": sum(executions),
             "provenance": distinct,
+            **found,
         },
     }
     return {

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import api
+from qrlsuite.leaderboard.shelf import importing, published
+from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from tests.commands import qrlsuite
@@ -41,6 +43,16 @@ def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores
     loaded = api.load("mlp width=16 lr=1e+30", runs=tmp_path / "straight")
     assert loaded.diverged == (0, 1)
     assert "2, 2 diverged" in loaded.facts["seeds"]
+    probe = {"result": "equal", "seed": 1, "epochs": 1}
+    probed = EntryStore(entry).seed(1)
+    probed.write_record({**(probed.record() or {}), "probe": {**probe, "host": "mine"}})
+    folder = export(loaded, tmp_path / "export")
+    there = published.read(folder)
+    assert (there.entry_results().diverged, there.probe) == ((0, 1), probe)
+    importing.import_seeds(EntryStore(folder), tmp_path / "imported")
+    (here,) = (tmp_path / "imported").glob("*/*")
+    assert EntryStore(here).seed(0).read().diverged == 1
+    assert (EntryStore(here).seed(1).record() or {})["probe"] == probe
 
 
 def test_the_end_of_a_run_and_the_board_say_it(tiny_task: str, tmp_path: Path) -> None:

@@ -217,6 +217,8 @@ RECORDS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "parameters": (lambda r: r["published"]["parameters"].update(classical=-1), "classical parameters"),
     "networks": (lambda r: r["published"]["parameters"].update(networks="two"), "networks: 'two'"),
     "provenance": (lambda r: r["published"].update(provenance=[]), "provenance"),
+    "diverged": (lambda r: r["published"].update(diverged={"77": 1}), "diverged: {'77': 1}"),
+    "probe": (lambda r: r["published"].update(probe={"result": "differs"}), "probe: .*differs"),
     "nothing published": (lambda r: r.pop("published"), "published"),
 }
 
