@@ -168,7 +168,7 @@ class Bar:
 
     def start(self, total: float, description: str) -> None:
         """Show the bar, where it can be shown and is not yet."""
-        if self.shown or self.console.quiet or not self.console.is_terminal:
+        if self.shown or self.console.quiet or not (self.console.is_terminal or self.console.is_jupyter):
             return
         self._total = total
         if self.console.is_jupyter:

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -208,6 +209,19 @@ def test_a_bar_is_shown_on_a_terminal_only() -> None:
     shown.update(5, "training", "half")
     shown.stop()
     assert not shown.shown
+
+
+def test_a_notebook_s_bar_is_one_output_that_is_emptied_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a line printed in its place would leave stays in the notebook."""
+    outputs: list[dict[str, str]] = []
+    cell = SimpleNamespace(update=lambda data, raw: outputs.append(data))
+    module = SimpleNamespace(display=lambda data, raw, display_id: outputs.append(data) or cell)
+    monkeypatch.setitem(sys.modules, "IPython.display", module)
+    bar = Bar(Console(force_jupyter=True))
+    bar.start(10, "training")
+    bar.update(5, "training", "6 s left")
+    bar.stop()
+    assert [data["text/plain"] for data in outputs] == ["training  0%  ", "training  50%  6 s left", ""]
 
 
 def test_importing_the_package_imports_no_library() -> None:
