@@ -5,7 +5,7 @@ RUNS ?= runs
 BIN := $(VENV)/bin
 TORCH ?= 2.13.0
 
-.PHONY: quickstart test test-long breaks test-lowest verify docs tutorials site pictures dist demo-of-wheel install install-dev
+.PHONY: quickstart test test-long breaks test-lowest verify docs tutorials site pictures statements dist demo-of-wheel install install-dev
 
 quickstart: install
 	$(BIN)/qrlsuite demo --runs $(RUNS)
@@ -74,6 +74,10 @@ site: docs
 pictures: install-dev
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python docs/tables.py
+
+# The table of the paper's statements, docs/statements.csv, from what is published; it takes a minute.
+statements: install-dev
+	$(BIN)/python docs/statements.py
 
 # What a release publishes; and what a user gets of it, who has no clone.
 dist: $(BIN)/python

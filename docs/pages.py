@@ -1,7 +1,8 @@
-"""Makes a page of every notebook with its stored output: nothing is executed (a hook of mkdocs)."""
+"""A hook of mkdocs: pages of notebooks with their stored output, and the table of statements. Nothing is executed."""
 
 from __future__ import annotations
 
+import csv
 import shutil
 from html import escape
 from pathlib import Path
@@ -45,6 +46,29 @@ def on_page_read_source(page: Page, config: MkDocsConfig) -> str | None:
         f'<p><a href="{Path(page.file.src_uri).name}" download>Download this page as a notebook</a></p>'
     )
     return "\n\n".join([*(block for cell in cells for block in _blocks(cell)), download])
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Put the table of the paper's statements where its page asks for it."""
+    if page.file.src_uri != "statements.md":
+        return markdown
+    with Path(config.docs_dir, "statements.csv").open(newline="") as file:
+        return markdown.replace("<!-- statements -->", _table(list(csv.DictReader(file))))
+
+
+def _table(rows: list[dict[str, str]]) -> str:
+    """Return the statements as a table, behind a field to search them."""
+    kinds = "".join(f"<option>{kind}</option>" for kind in sorted({row["kind"] for row in rows}))
+    columns = ("paper", "statement", "verdict", "seeds", "evidence", "error")
+    lines = [" | ".join(columns), "|".join(["---"] * len(columns))]
+    for row in rows:
+        verdict = f'<span data-kind="{row["kind"]}">{row["verdict"]}</span>'
+        lines.append(" | ".join({**row, "verdict": verdict}[name] for name in columns))
+    return (
+        '<p id="statements"><input type="search" placeholder="Search" aria-label="Search statements"> '
+        f'<select aria-label="Verdict"><option value="">every verdict</option>{kinds}</select> <output></output></p>'
+        "\n\n" + "".join(f"| {line} |\n" for line in lines)
+    )
 
 
 def on_post_build(config: MkDocsConfig) -> None:

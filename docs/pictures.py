@@ -73,6 +73,7 @@ BOARD = "leaderboard --published --task beam6g --format html"
 PLAN = "leaderboard/plans/quantum-or-not"
 PLAN_FILES = ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
 PICTURES: dict[str, Picture] = {
+    "field.png": Plot("plot field --task beam6g", ()),
     "cartpole.png": Plot("plot curves --task cartpole --published", ("entries/cartpole/*",)),
     "curves.png": Plot(
         "plot curves --task beam6g --published --entry 'mlp width=16' --entry 'mlp width=16 lr=0.002' "
@@ -110,6 +111,45 @@ PICTURES: dict[str, Picture] = {
     "study-fig7-scaling.png": Plot("study draw fig7 --published --seeds 30", ("entries/beam6g/*",)),
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
 }
+
+CAPTIONS = {
+    "field.png": "The task: which antenna serves each place best",
+    "curves.png": "Learning curves on beam6g",
+    "cartpole.png": "Learning curves on CartPole",
+    "study-fig1-surface.png": "Surfaces of sample complexity",
+    "study-fig6-bars.png": "Sample complexity as bars",
+    "study-fig7-scaling.png": "Scaling with the size of networks and circuits",
+    "study-ablation-layers.png": "Scaling with the layers of a circuit",
+    "study-degree-scaling.png": "Scaling with the degree of the paths",
+    "study-antennas-scaling.png": "Scaling with the number of antennas",
+    "study-ppo-bars.png": "PPO as bars",
+    "study-fidelity-text.png": "The text's replay buffer and copies",
+    "quantum-or-not-entries.png": "A plan: every entry",
+    "quantum-or-not-pairs.png": "A plan: every pair below its question",
+    "policies.png": "What trained agents earn",
+    "study-deploy-shots.png": "Trained agents that act with shots",
+    "study-deploy-errors.png": "Trained agents that act with gate errors",
+    "study-shots-costs.png": "Training with shots, by steps, executions and shots",
+    "study-shots-curves.png": "Training with shots, learning curves",
+    "report-wide.png": "The board as a page",
+    "report-pairs.png": "The page: who outperforms whom",
+    "report-narrow.png": "The page on a phone",
+}
+"""What the gallery says above each picture, in its order."""
+
+
+def gallery() -> str:
+    """Return docs/gallery.md: every picture below the command that makes it."""
+    text = (
+        "# Gallery\n\nEvery picture of these pages, with the command that makes it. Without `--published` a command "
+        "shows your own\nruns. `qrlsuite plot KIND --settings` lists what you can change.\n"
+    )
+    for name, caption in CAPTIONS.items():
+        picture = PICTURES[name]
+        note = "\nIts runs are not published: the command needs agents or seeds that you train.\n"
+        text += f"\n## {caption}\n\n```sh\nqrlsuite {picture.command}\n```\n"
+        text += note * isinstance(picture, Unpublished) + f"\n![{caption}](images/{name})\n"
+    return text
 
 
 def made_from(picture: Plot | Screenshot) -> str:
@@ -150,6 +190,7 @@ def main(chosen: Sequence[str]) -> None:
                 _photograph(chromium, page, picture, made)
             _mark(made, made_from(picture), IMAGES / name)
             print(f"made {name}: qrlsuite {picture.command}")
+    (ROOT / "docs" / "gallery.md").write_text(gallery())
 
 
 def _run(command: str, out: Path) -> None:

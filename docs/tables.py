@@ -1,11 +1,9 @@
-"""The tables of published boards and decision plans in README and docs: `make pictures` writes them anew.
+"""The tables of published boards and decision plans in docs: `make pictures` writes them anew.
 
 A comment names the task or plan and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
-
-A number behind the kind of a plan's table leaves only so many questions.
 """
 
 from __future__ import annotations
@@ -15,6 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+
+from statements import MODELS, each_model, load
 
 from qrlsuite import api
 from qrlsuite.leaderboard.sheet import Sheet
@@ -28,19 +28,18 @@ ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / page
     for page in (
-        "README.md",
         "docs/fidelity.md",
         "docs/leaderboard.md",
-        "docs/quantum-or-not.md",
+        "docs/plans.md",
         "leaderboard/README.md",
     )
 ]
-TABLE = re.compile(r"(?<=<!-- table: )([\w+-]+) (\w+)(?: (\d+))? -->\n\n(?:\|.*\n)*\n*")
+TABLE = re.compile(r"(?<=<!-- table: )([\w+-]+) (\w+) -->\n\n(?:\|.*\n)*\n*")
 
 Rows = Iterator[Sequence[str]]
 
 
-def settings(outcome: StudyOutcome, questions: int | None) -> Rows:
+def settings(outcome: StudyOutcome) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     yield "entry", "parameters", "settings", "trials", "M"
     for planned in outcome.study.file.entries:
@@ -57,17 +56,17 @@ def settings(outcome: StudyOutcome, questions: int | None) -> Rows:
         yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(planned.tuning.value)
 
 
-def verdicts(outcome: StudyOutcome, questions: int | None) -> Rows:
+def verdicts(outcome: StudyOutcome) -> Rows:
     """Every pair below its question."""
     yield "pair A / B", "verdict", "seeds", "B against A", "interval"
-    for question, pairs in by_question(outcome.study, outcome.pairs)[:questions]:
+    for question, pairs in by_question(outcome.study, outcome.pairs):
         yield f"**{question}**", "", "", "", ""
         for pair in pairs:
             seeds = str(pair.n_runs) if pair.n_runs else ""
             yield versus(pair), pair.verdict, seeds, *difference_text(pair, outcome.study.grid)
 
 
-def entries(outcome: StudyOutcome, questions: int | None) -> Rows:
+def entries(outcome: StudyOutcome) -> Rows:
     """Mean times and costs of the entries that a look has reached."""
     assert isinstance(outcome.study, PublishedStudy)
     yield "entry", "seeds", "steps below threshold (95%)", "core-hours", "circuits per seed"
@@ -114,12 +113,32 @@ def executions(task: str) -> Rows:
     return _chosen(kept.sheet(), kept.columns()[:5])
 
 
-OF_PLANS: dict[str, Callable[[StudyOutcome, int | None], Rows]] = {
+def changes(task: str) -> Rows:
+    """What three settings change for four models: M, and who needs more steps."""
+    yield "changed", "model", "seeds", "M, ours", "M, changed", "changed against ours"
+    for title, other, options in (
+        ("the released rejection of paths", f"{task}+476ac3d2", ""),
+        ("the text's buffer and copies", task, " buffer=1000 target_steps=1000"),
+        ("a buffer of 10,000", task, " buffer=10000"),
+    ):
+        pairs = [(f"ddqn {model}{options}", f"ddqn {model}") for model in MODELS]
+        entries = [(load(changed, other), load(usual, task)) for changed, usual in pairs]
+        for label, board, _, said in each_model(entries, title, "ours"):
+            after, before = (steps_text(mean.mean, digits=3) for mean in board.means)
+            yield title, label.removeprefix("ddqn "), str(board.n_runs[0]), before, after, said
+
+
+OF_PLANS: dict[str, Callable[[StudyOutcome], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
 }
-OF_BOARDS: dict[str, Callable[[str], Rows]] = {"board": board, "tiers": tiers, "executions": executions}
+OF_BOARDS: dict[str, Callable[[str], Rows]] = {
+    "board": board,
+    "tiers": tiers,
+    "executions": executions,
+    "changes": changes,
+}
 
 
 def _padded(cell: str) -> str:
@@ -136,11 +155,11 @@ def filled(text: str) -> str:
     """Return a page with every table as the published entries and plans now give it."""
 
     def table(found: re.Match[str]) -> str:
-        name, kind, questions = found.groups()
+        name, kind = found.groups()
         if kind in OF_BOARDS:
             header, *rows = OF_BOARDS[kind](name)
         else:
-            header, *rows = OF_PLANS[kind](published(name), int(questions) if questions else None)
+            header, *rows = OF_PLANS[kind](published(name))
         lines = [header, ["---"] * len(header), *rows]
         body = "\n".join("|" + "|".join(map(_padded, line)) + "|" for line in lines)
         asked = found[0].partition(" -->")[0]

@@ -59,6 +59,16 @@ def test_a_block_runs(text: str, results: Path, capsys: pytest.CaptureFixture[st
         names["env"].close()
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_what_the_first_lines_print_is_below_them(
+    page: str, results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / page).read_text()
+    code, printed = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, re.DOTALL)[0]
+    exec(code, {})
+    assert capsys.readouterr().out == printed
+
+
 def test_there_are_blocks_to_run() -> None:
     assert len(blocks()) >= 6
 

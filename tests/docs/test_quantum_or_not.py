@@ -1,4 +1,4 @@
-"""docs/quantum-or-not.md and docs/fidelity.md say what the published plans say."""
+"""docs/plans.md and docs/quantum-or-not.md say what the published plans say."""
 
 from __future__ import annotations
 
@@ -10,16 +10,10 @@ import pytest
 from qrlsuite.leaderboard.shelf import published_studies
 from tests.docs import load
 
-PAGE = (Path(__file__).parents[2] / "docs" / "quantum-or-not.md").read_text()
-PROSE = " ".join(PAGE.split())
+DOCS = Path(__file__).parents[2] / "docs"
+PLANS = (DOCS / "plans.md").read_text()
+PROSE = " ".join((DOCS / "quantum-or-not.md").read_text().split())
 NAMES = sorted(folder.name for folder in published_studies.PUBLISHED.iterdir())
-ELSEWHERE = {
-    "cartpole-sizes": "fidelity.md",
-    "paper-settings": "fidelity.md",
-    "paper-settings-circuit": "fidelity.md",
-    "paper-settings-ppo": "fidelity.md",
-}
-"""Plans of another page."""
 
 tables = load("tables")
 
@@ -32,23 +26,22 @@ def test_tables_are_what_the_published_files_say(page: Path) -> None:
 
 
 def test_a_table_that_was_empty_stands_apart_from_what_follows() -> None:
-    text = tables.filled("<!-- table: quantum-or-not verdicts 1 -->\n\n## Next\n")
-    assert re.search(r"<!-- .* -->\n\n\| pair A / B \|.*\n(\|.*\n)+\n## Next\n$", text)
+    text = tables.filled("<!-- table: quantum-or-not settings -->\n\n## Next\n")
+    assert re.search(r"<!-- .* -->\n\n\| entry \|.*\n(\|.*\n)+\n## Next\n$", text)
     assert tables.filled(text) == text
 
 
 def test_a_stale_table_is_replaced() -> None:
-    stale = PAGE.replace("| 313 |", "| 312 |", 1)
-    assert stale != PAGE
-    assert tables.filled(stale) == PAGE
+    stale = PLANS.replace("| 313 |", "| 312 |", 1)
+    assert stale != PLANS
+    assert tables.filled(stale) == PLANS
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_plan_is_on_a_page(name: str) -> None:
+def test_every_plan_is_on_the_page(name: str) -> None:
     file = tables.published(name).study.file
-    text = (Path(__file__).parents[2] / "docs" / ELSEWHERE.get(name, "quantum-or-not.md")).read_text()
-    prose = " ".join(text.split())
-    assert f"<!-- table: {name} verdicts -->" in text
+    prose = " ".join(PLANS.split())
+    assert f"<!-- table: {name} verdicts -->" in PLANS
     assert f"`{file.hash}`" in prose
     assert f"{len(tables.published(name).pairs)} pairs" in prose
     assert f"seeds {file.first_seed} to {file.first_seed + file.looks[-1] - 1}" in prose
