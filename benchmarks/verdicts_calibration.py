@@ -1,4 +1,4 @@
-"""How often permutation tests, boards by mean times and decision plans err, and how much they find.
+"""How often permutation tests, boards by mean times and studies with looks err, and how much they find.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/verdicts_calibration.py [--pairs 10000] [PART ...]
 

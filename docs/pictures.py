@@ -70,8 +70,6 @@ class Unpublished:
 
 Picture = Plot | Screenshot | Unpublished
 BOARD = "leaderboard --published --task beam6g --format html"
-PLAN = "leaderboard/plans/quantum-or-not"
-PLAN_FILES = ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
 PICTURES: dict[str, Picture] = {
     "field.png": Plot("plot field --task beam6g", ()),
     "cartpole.png": Plot("plot curves --task cartpole --published", ("entries/cartpole/*",)),
@@ -80,8 +78,6 @@ PICTURES: dict[str, Picture] = {
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
         ("entries/beam6g/*",),
     ),
-    "quantum-or-not-entries.png": Plot(f"decide plot {PLAN} --entries", PLAN_FILES),
-    "quantum-or-not-pairs.png": Plot(f"decide plot {PLAN}", PLAN_FILES),
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
     "report-pairs.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1000, "Who outperforms whom"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
@@ -109,6 +105,12 @@ PICTURES: dict[str, Picture] = {
     "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig6-bars.png": Plot("study draw fig6 --published --seeds 30", ("entries/beam6g/*",)),
     "study-fig7-scaling.png": Plot("study draw fig7 --published --seeds 30", ("entries/beam6g/*",)),
+    **{
+        f"study-quantum-or-not-{kind}.png": Plot(
+            "study draw quantum-or-not", ("plans/quantum-or-not", "plans/quantum-or-not/beam6g/*")
+        )
+        for kind in ("pairs", "entries")
+    },
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
 }
 
@@ -124,8 +126,8 @@ CAPTIONS = {
     "study-antennas-scaling.png": "Scaling with the number of antennas",
     "study-ppo-bars.png": "PPO as bars",
     "study-fidelity-text.png": "The text's replay buffer and copies",
-    "quantum-or-not-entries.png": "A plan: every entry",
-    "quantum-or-not-pairs.png": "A plan: every pair below its question",
+    "study-quantum-or-not-entries.png": "A study with looks: every entry",
+    "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
     "policies.png": "What trained agents earn",
     "study-deploy-shots.png": "Trained agents that act with shots",
     "study-deploy-errors.png": "Trained agents that act with gate errors",

@@ -208,7 +208,7 @@ def every_model(row: Row, match: re.Match[str]) -> Row:
     }
 
 
-# --- plans
+# --- studies with looks
 
 
 def planned(row: Row, match: re.Match[str]) -> Row:
@@ -512,7 +512,7 @@ def table() -> list[Row]:
 
 
 def computed(rows: list[Row]) -> list[Row]:
-    """Return the rows as the published entries and plans now give them."""
+    """Return the rows as the published entries and studies now give them."""
     result, facts = [], Counter[str]()
     for row in rows:
         evidence = row["evidence"]

@@ -1,6 +1,6 @@
-"""The tables of published boards and decision plans in docs: `make pictures` writes them anew.
+"""The tables of published boards and studies with looks in docs: `make pictures` writes them anew.
 
-A comment names the task or plan and the kind of the table that follows it:
+A comment names the task or study and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
@@ -42,18 +42,18 @@ Rows = Iterator[Sequence[str]]
 def settings(outcome: StudyOutcome) -> Rows:
     """What tuning found for each entry, and M of these settings on the tuning's last seeds."""
     yield "entry", "parameters", "settings", "trials", "M"
-    for planned in outcome.study.file.entries:
-        if planned.tuning is None or planned.tuning.value is None:  # the task's own settings
+    for table in outcome.study.file.entries:
+        if table.tuning is None or table.tuning.value is None:  # the task's own settings
             continue
-        entry, tuning = outcome.study.entries[str(planned.name)], planned.tuning
+        entry, tuning = outcome.study.entries[str(table.name)], table.tuning
         found = []
         for option in tuning.space or ():
             side, _, name = option.partition(".")
             options = entry.model_options if side == "model" else entry.algorithm_options
             found.append(f"{name} {getattr(options, name):g}")
-        name = str(planned.name).removesuffix(", tuned")
+        name = str(table.name).removesuffix(", tuned")
         parameters = str(sum(count_parameters(entry)))
-        yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(planned.tuning.value)
+        yield name, parameters, ", ".join(found), str(tuning.trials), steps_text(table.tuning.value)
 
 
 def verdicts(outcome: StudyOutcome) -> Rows:
@@ -128,7 +128,7 @@ def changes(task: str) -> Rows:
             yield title, label.removeprefix("ddqn "), str(board.n_runs[0]), before, after, said
 
 
-OF_PLANS: dict[str, Callable[[StudyOutcome], Rows]] = {
+OF_STUDIES: dict[str, Callable[[StudyOutcome], Rows]] = {
     "settings": settings,
     "verdicts": verdicts,
     "entries": entries,
@@ -147,19 +147,19 @@ def _padded(cell: str) -> str:
 
 @cache
 def published(name: str) -> StudyOutcome:
-    """Return what a published plan has decided."""
+    """Return what a published study has decided."""
     return published_studies.read(published_studies.PUBLISHED / name)
 
 
 def filled(text: str) -> str:
-    """Return a page with every table as the published entries and plans now give it."""
+    """Return a page with every table as the published entries and studies now give it."""
 
     def table(found: re.Match[str]) -> str:
         name, kind = found.groups()
         if kind in OF_BOARDS:
             header, *rows = OF_BOARDS[kind](name)
         else:
-            header, *rows = OF_PLANS[kind](published(name))
+            header, *rows = OF_STUDIES[kind](published(name))
         lines = [header, ["---"] * len(header), *rows]
         body = "\n".join("|" + "|".join(map(_padded, line)) + "|" for line in lines)
         asked = found[0].partition(" -->")[0]

@@ -274,9 +274,9 @@ def learning_curves(entry: EntryResults) -> LearningCurves:
     return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
 
 
-_PLANNED = (
-    "trained by a decision plan, which stops by what the seeds show, so that no rule for a fixed number of seeds "
-    "applies; `qrlsuite decide status` has its verdicts"
+_WITH_LOOKS = (
+    "trained by a study with looks, which stops by what the seeds show, so that no rule for a fixed number of seeds "
+    "applies; `qrlsuite show STUDY` has its verdicts"
 )
 
 
@@ -291,7 +291,7 @@ def build(
     """Rank entries, task by task and horizon by horizon.
 
     Entries of one task that were made under another definition of it are refused: the majority's stands. So are those
-    of a decision plan, whose number of seeds depends on what they showed.
+    of a study with looks, whose number of seeds depends on what they showed.
 
     Parameters
     ----------
@@ -338,14 +338,14 @@ def build(
 
 
 def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
-    """Leave out entries of decision plans or chosen seeds, and those made under another definition than most.
+    """Leave out entries of studies with looks or chosen seeds, and those made under another definition than most.
 
     Returns
     -------
     tuple
         The entries that stay, task by task, and one line for each that was left out.
     """
-    problems = [f"{entry.folder}: {_PLANNED}" for entry in entries if entry.plan]
+    problems = [f"{entry.folder}: {_WITH_LOOKS}" for entry in entries if entry.plan]
     problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
     fixed = [entry for entry in entries if not entry.plan and not entry.chosen_seeds]
     kept = []
@@ -503,7 +503,7 @@ def compare_entries(
     Raises
     ------
     QrlSuiteError
-        If they belong to different tasks, one was trained by a decision plan, or their lengths have no common horizon.
+        If they belong to different tasks, one is of a study with looks, or their lengths have no common horizon.
     """
     if first.task_hash != second.task_hash:
         raise QrlSuiteError(
@@ -512,7 +512,7 @@ def compare_entries(
         )
     for entry in (first, second):
         if entry.plan:
-            raise QrlSuiteError(f"'{entry.label}' was {_PLANNED}")
+            raise QrlSuiteError(f"'{entry.label}' was {_WITH_LOOKS}")
         if entry.chosen_seeds:
             raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
     epochs = min(first.curves.shape[1], second.curves.shape[1])

@@ -272,8 +272,8 @@ def on_board(
     Parameters
     ----------
     entries:
-        Those of the task. Entries of a decision plan, of another definition of the task, shorter than the pair or with
-        fewer than 20 seeds are not ranked.
+        Those of the task. Entries of a study with looks, of another definition of the task, shorter than the pair or
+        with fewer than 20 seeds are not ranked.
 
     Returns
     -------

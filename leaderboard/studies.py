@@ -16,11 +16,13 @@ from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.pictures import cells, style
-from qrlsuite.leaderboard.shelf import collect, published
+from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import PendingEntry
 from qrlsuite.studies.study import Member, PictureSection, Study, load
 
@@ -67,6 +69,43 @@ class Drawn:
             "seeds": [{"task": task, "label": label, "seeds": count} for task, label, count in self.seeds],
             "short": [{"task": task, "label": label, "epochs": count} for task, label, count in self.short],
         }
+
+
+def find(name: str) -> Study:
+    """Load a study: registered, one with looks that comes with the suite, a folder with a published one, or a file.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none.
+    QrlSuiteError
+        If it is malformed, or a picture of it is unknown or cannot have its settings.
+    """
+    registered = registry.load().names("studies")
+    if not name.endswith(".toml") and name not in registered:
+        if (folder := published_studies.folder_of(name)) is None:
+            files = [f"{name}.toml"] if Path(f"{name}.toml").exists() else []
+            known = [*files, *registered, *published_studies.names()]
+            raise UnknownNameError(f"unknown study '{name}'{nearest(name, files or known)}")
+        return dataclasses.replace(published_studies.load(folder), source=name)
+    study = load(name)
+    check(study)
+    return study
+
+
+def read_outcome(name: str, runs: Path) -> StudyOutcome:
+    """Return what a study with looks has decided: in the results folder where it has begun, else as published.
+
+    Raises
+    ------
+    QrlSuiteError
+        If there is no such study, or its results cannot be used.
+    """
+    study = StudyWithLooks(find(name), runs)
+    folder = published_studies.folder_of(name)
+    if folder is not None and (folder == Path(name) or not study.begun):
+        return published_studies.read(folder)
+    return StudyOutcome(study, study.read())
 
 
 def check(study: Study) -> None:
@@ -183,7 +222,7 @@ def decided_pairs(entries: Iterable[EntryResults]) -> tuple[int, int]:
     """Count the pairs of entries that rule `times` decides, and all pairs that it tests: both of 20 seeds or more.
 
     Entries are compared within a task, at its shortest horizon; Holm's procedure goes over the task's pairs. Entries
-    of a decision plan are left out: their number of seeds depends on what the seeds showed.
+    of a study with looks are left out: their number of seeds depends on what the seeds showed.
     """
     by_task: dict[str, list[EntryResults]] = {}
     for entry in entries:
@@ -262,34 +301,39 @@ def draw(
     return drawn
 
 
-def write(
-    study: Study,
-    members: Sequence[Member],
-    runs: Path,
-    format_: str,
-    with_published: bool = False,
-    seeds: str | None = None,
-) -> list[Drawn]:
-    """Draw every picture of a study, and write those that can be drawn into the results folder.
+def draw_outcome(outcome: StudyOutcome) -> list[Drawn]:
+    """Draw the pairs and the entries of a study with looks, and the pictures that its file names.
+
+    Raises
+    ------
+    OptionError
+        If it has taken no look yet.
+    """
+    from qrlsuite.leaderboard.pictures import outcome as drawing
+
+    study = Study(outcome.study.file, outcome.study.source)
+    own = draw(study, study.members(), outcome.study.folder) if study.file.pictures else []
+    figures = {"pairs": drawing.draw(outcome), "entries": drawing.draw_entries(outcome)}
+    return [*(Drawn(name, name, (), figure=figure) for name, figure in figures.items()), *own]
+
+
+def write(name: str, pictures_: Iterable[Drawn], runs: Path, format_: str) -> list[Drawn]:
+    """Write the pictures of a study that could be drawn into the results folder.
 
     Parameters
     ----------
     format_:
         `png`, `pdf` or `svg`.
-    with_published, seeds:
-        As for `draw`.
 
     Raises
     ------
     StoreError
-        If an entry's folder is damaged, or a file cannot be written.
-    OptionError
-        If an entry has not all of the seeds.
+        If a file cannot be written.
     """
     written = []
-    for drawn in draw(study, members, runs, with_published=with_published, seeds=seeds):
+    for drawn in pictures_:
         if drawn.figure is not None:
-            path = runs / f"study-{study.name}-{drawn.name}.{format_}"
+            path = runs / f"study-{name}-{drawn.name}.{format_}"
             write_atomically(path, pictures.encode(drawn.figure, format_))
             drawn = dataclasses.replace(drawn, path=path)
         written.append(drawn)

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
     from qrlsuite.api import costs as costs
-    from qrlsuite.api import decide as decide
     from qrlsuite.api import evaluate as evaluate
     from qrlsuite.api import load as load
+    from qrlsuite.api import new_study as new_study
     from qrlsuite.api import plot as plot
+    from qrlsuite.api import read_study as read_study
     from qrlsuite.api import run_study as run_study
     from qrlsuite.api import train as train
     from qrlsuite.api import tune as tune
@@ -34,14 +35,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "costs", "decide", "evaluate", "hookimpl", "layer", "load",
-    "plot",
-    "register_environments", "run_study", "train", "tune",
+    "__version__", "api", "board", "compare", "costs", "evaluate", "hookimpl", "layer", "load", "new_study", "plot",
+    "read_study", "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 
-_FROM_API = frozenset(
-    {"board", "compare", "costs", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"}
-)
+_FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}
 """Functions of `qrlsuite.api` that are attributes here too: no submodule may have one of these names."""
 
 # Python started in a checkout finds this folder before an installed package, and without the folders that an

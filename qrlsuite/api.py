@@ -9,7 +9,7 @@
     api.costs("beam6g", by="executions", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
-    api.decide("width.toml")
+    api.run_study("width.toml")
 
 Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
 those of `qrlsuite.errors`; where a message names an option of a command, such as `--task`, the function's argument has
@@ -48,10 +48,11 @@ from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import read_seeds
-from qrlsuite.studies import looks
-from qrlsuite.studies import outcome as outcomes
+from qrlsuite.results.store import write_atomically
+from qrlsuite.studies import looks as with_looks
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
+from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
@@ -62,7 +63,9 @@ from qrlsuite.tuning.search import Request, Search, default_sampler, tuning_seed
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
-__all__ = ["board", "compare", "costs", "decide", "evaluate", "load", "plot", "run_study", "train", "tune"]
+__all__ = [
+    "board", "compare", "costs", "evaluate", "load", "new_study", "plot", "read_study", "run_study", "train", "tune",
+]  # fmt: skip
 
 show_figures_in_notebook()
 
@@ -540,62 +543,6 @@ def evaluate(
     )
 
 
-def decide(
-    plan: str | PathLike[str],
-    *,
-    train: bool = True,
-    engine: str | Where = "local",
-    workers: int | None = None,
-    device: str = "cpu",
-    same: str | None = None,
-    runs: str | PathLike[str] = "runs",
-    progress: bool = True,
-) -> StudyOutcome:
-    """Compare entries with as many seeds as it takes, by a plan that `qrlsuite decide new` wrote.
-
-    Seeds are trained look by look, until every pair is decided or the plan's last look was taken. Interrupt it at any
-    time: the same call continues, and ends with the same decisions.
-
-    Parameters
-    ----------
-    plan:
-        The plan's file.
-    train:
-        False only reads what is decided so far.
-    engine, workers, device, same, runs:
-        As for `train`. The plan's seeds lie below `runs`/decisions.
-    progress:
-        Whether to show a bar on a terminal or in a notebook, and lines elsewhere.
-
-    Returns
-    -------
-    StudyOutcome
-        With `pairs`, each with its `verdict`, `difference` (mean time below threshold of the second over that of the
-        first, minus 1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
-
-    Raises
-    ------
-    TaskError, OptionError
-        If the plan cannot be read or used, was changed after it began, or needs seeds that were trained already.
-    StoreError
-        If its results are damaged, or were changed after a look.
-    QrlSuiteError
-        If training failed; finished epochs are kept.
-    KeyboardInterrupt
-        When it was interrupted and every worker has saved and ended.
-
-    Examples
-    --------
-    >>> found = decide("width.toml", workers=8)  # doctest: +SKIP
-    >>> [(pair.first, pair.second, pair.verdict) for pair in found.pairs]  # doctest: +SKIP
-    [('mlp width=64', 'mlp width=16', 'mlp width=64 needs fewer')]
-    """
-    if not train:
-        return outcomes.read(Path(plan), Path(runs))
-    study = looks.StudyWithLooks(looks.load(Path(plan)), str(plan), Path(runs))
-    return outcomes.run(study, _where(engine, workers, device, same=same), not progress, "call")
-
-
 def tune(
     task: str,
     model: str | Sequence[str],
@@ -755,6 +702,104 @@ class StudyRun(Shown):
             )
 
 
+def new_study(
+    path: str | PathLike[str],
+    entries: Sequence[str],
+    *,
+    task: str,
+    algorithm: str | None = None,
+    preset: str | None = None,
+    epochs: int | None = None,
+    looks: Sequence[int] = (20, 40, 60, 80, 100),
+    alpha: float = ALPHA,
+    spending: str = "pocock",
+    margin: float = 0.1,
+    first_seed: int | None = None,
+    reason: str = "",
+    runs: str | PathLike[str] = "runs",
+) -> StudyOutcome:
+    """Write a study with looks, which compares entries with as many seeds as it takes. Trains nothing.
+
+    Parameters
+    ----------
+    path:
+        The file, NAME.toml. It can be edited until its first seed begins.
+    entries:
+        Two or more: `"mlp width=64"`, `"vqc-native qubits=10"`; tuned: `"mlp preset=FILE.toml"`.
+    task, algorithm, preset, epochs:
+        As for `train`; algorithm and preset are those of entries that name none.
+    looks:
+        Seeds of each entry at each look.
+    alpha, spending:
+        Probability of any false difference over all pairs and looks, and how it is spent over the looks.
+    margin:
+        Entries that differ by less count as equal: 0.1 is 10 percent.
+    first_seed:
+        Where the study's seeds begin; None takes the first block from 10,000 that is unused in `runs`.
+    reason:
+        Why the first look comes before 20 seeds, if it does.
+
+    Raises
+    ------
+    OptionError, UnknownNameError
+        If the file is there already, or a name or number cannot be used.
+    """
+    file = Path(path)
+    if file.suffix != ".toml":
+        raise OptionError(f"{file}: a study file's name ends in .toml")
+    if file.exists():
+        raise OptionError(f"{file} is there already: choose another name, or delete it")
+    study = with_looks.new(
+        file.stem,
+        task,
+        entries,
+        Path(runs),
+        algorithm=algorithm,
+        preset=preset,
+        first_seed=first_seed,
+        epochs=epochs,
+        looks=list(looks),
+        alpha=alpha,
+        spending=spending,
+        margin=margin,
+        reason=reason,
+    )
+    outcome = StudyOutcome(study, study.read())
+    write_atomically(file, study_files.dumps(study.file).encode())
+    return outcome
+
+
+def read_study(
+    name: str, *, runs: str | PathLike[str] = "runs", published: bool = False
+) -> study_runner.Overview | StudyOutcome:
+    """Read how far a study is: what is trained and missing of it, or what its looks have decided. Trains nothing.
+
+    Parameters
+    ----------
+    name:
+        A study (`qrlsuite list studies`), a study file's path, or a folder with a published study.
+    runs:
+        The results folder. A published study with looks that has not begun there is read as it was published.
+    published:
+        Count the published seeds and pairs of entries, too.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, TaskError
+        If there is no such study, or it is malformed.
+    StoreError
+        If its results are damaged, or were changed after a look.
+    """
+    study, folder = studies.find(name), Path(runs)
+    if study.file.looks is not None:
+        return studies.read_outcome(name, folder)
+    where, members = Where.create(), study.members()
+    items = study_runner.find_pending(members, folder, where, speed.known(folder), None, None)
+    pairs = studies.decided_pairs(studies.read(folder, members, published).values())
+    counts = studies.published_seeds(items) if published else None
+    return study_runner.Overview(study, items, where.workers, pairs, counts)
+
+
 def run_study(
     name: str,
     *,
@@ -772,21 +817,24 @@ def run_study(
     same: str | None = None,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
-) -> StudyRun:
+) -> StudyRun | StudyOutcome:
     """Train a study's missing seeds, the cheapest entry first, and draw its pictures.
 
-    Entries are those that `train` trains, in the same folders: nothing is trained twice.
+    Entries are those that `train` trains, in the same folders: nothing is trained twice. A study with looks has seeds
+    of its own, which are trained look by look, until every pair is decided or the last look was taken. Interrupt it at
+    any time: the same call continues, and ends with the same decisions.
 
     Parameters
     ----------
     name:
-        A study (`qrlsuite study list`), or a study file's path.
+        A study (`qrlsuite list studies`), or a study file's path.
     options:
         Options for every entry that has them, in the place of the study's own.
     models:
         Models in the place of others: `{"vqc-pennylane": "vqc-native"}`.
     only:
-        Only entries whose group, label or task has this word or one of these; or entries by name.
+        Only entries whose group, label or task has this word or one of these; or entries by name. Like `options`,
+        `models`, `seeds` and `epochs`, only of a study without looks.
     seeds, epochs:
         As for `train`; None takes each task's protocol.
     minutes:
@@ -798,8 +846,10 @@ def run_study(
 
     Returns
     -------
-    StudyRun
-        With `pictures`, each with a matplotlib `figure`; an `overview` of the entries; and `as_dict()`.
+    StudyRun, or StudyOutcome of a study with looks
+        With `pictures`, each with a matplotlib `figure`; an `overview` of the entries; and `as_dict()`. With looks:
+        `pairs`, each with its `verdict`, `difference` (mean time below threshold of the second over that of the first,
+        minus 1), `interval`, `p` and `levels` of each look; `finished`; `submitted`; and `as_dict()`.
 
     Raises
     ------
@@ -820,20 +870,37 @@ def run_study(
     budget = _seconds(minutes)
     where = _where(engine, workers, device, fresh, same)
     seed_numbers = None if seeds is None else read_seeds(seeds)
-    study = study_files.load(name)
-    studies.check(study)
+    study = studies.find(name)
     names = [only] if isinstance(only, str) else only
-    members = study_runner.select(study, from_mapping(options), models, names)
     folder = Path(runs)
+    if study.file.looks is not None:
+        chosen = {
+            "options": options,
+            "models": models,
+            "only": names,
+            "seeds": seeds,
+            "epochs": epochs,
+            "fresh": fresh,
+        }
+        if given := [option for option, value in chosen.items() if value]:
+            raise OptionError(
+                f"study '{name}' has looks, which fix what is trained: leave {', '.join(given)} out"
+            )
+        subject = StudyWithLooks(study, folder)
+        known = speed.known(subject.folder, folder)
+        return study_runner.take_looks(
+            subject, study_runner.Session(subject.folder, where, known, budget, not progress, "call")
+        )
+    members = study_runner.select(study, from_mapping(options), models, names)
     speeds = speed.known(folder)
     missing.require_same_code(folder, [member.entry for member in members], where)
-    items = study_runner.survey(members, folder, where, speeds, seed_numbers, epochs)
+    items = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
     if budget is not None:
         study_runner.check_budget(items, budget, where.workers)
     session = study_runner.Session(folder, where, speeds, budget, not progress, "call")
     session.run(items)
-    drawn = studies.write(study, members, folder, format)
-    after = study_runner.survey(members, folder, where, speeds, seed_numbers, epochs)
+    drawn = studies.write(study.name, studies.draw(study, members, folder), folder, format)
+    after = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
     overview = study_runner.Overview(study, after, where.workers)
     return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
 

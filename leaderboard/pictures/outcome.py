@@ -1,4 +1,4 @@
-"""A decision plan: its pairs, with intervals and verdicts, or its entries by mean time below threshold."""
+"""A study with looks: its pairs, with intervals and verdicts, or its entries by mean time below threshold."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def draw(outcome: StudyOutcome) -> Figure:
     Raises
     ------
     OptionError
-        If the plan has taken no look yet.
+        If the study has taken no look yet.
     """
-    study, decision = outcome.study, outcome.decision
+    study, decision = outcome.study, outcome.state.decision
     if not any(pair.p for pair in decision.pairs):
-        raise OptionError(f"{study.file.name} has taken no look yet: there is nothing to draw")
+        raise OptionError(f"{study.name} has taken no look yet: there is nothing to draw")
     groups = outcomes.by_question(study, decision.pairs)
     rows: list[str | PairDecision] = []
     for question, pairs in groups:
@@ -62,7 +62,7 @@ def draw(outcome: StudyOutcome) -> Figure:
         if isinstance(row, PairDecision):
             ends += _row(axes, height, row)
     low, high = min(ends) / 1.1, max(ends) * 1.1
-    margin = study.file.margin
+    margin = study.looks.margin
     axes.axvspan(1 / (1 + margin), 1 + margin, color="#000000", alpha=0.07, lw=0)
     axes.axvline(1, color="#404040", lw=0.8)
     axes.set_xscale("log")
@@ -80,7 +80,7 @@ def draw(outcome: StudyOutcome) -> Figure:
     for each, (label, color, marker) in LOOKS.items():
         if any(pair.decided is each for pair in decision.pairs):
             axes.plot([], [], marker, color=color, label=label, ls="none")
-    confidence = 100 * (1 - study.file.alpha)
+    confidence = 100 * (1 - study.looks.alpha)
     _finish(
         figure,
         outcome,
@@ -98,16 +98,16 @@ def draw(outcome: StudyOutcome) -> Figure:
 def draw_entries(outcome: StudyOutcome) -> Figure:
     """Draw each entry that a look has reached by its mean time below threshold M, the shortest first.
 
-    An entry called `X, tuned` shares the row of the plan's entry X.
+    An entry called `X, tuned` shares the row of the entry X.
 
     Raises
     ------
     OptionError
-        If the plan has taken no look yet.
+        If the study has taken no look yet.
     """
     study, times, looked = outcome.study, outcome.mean_times(), outcome.looked
     if not times:
-        raise OptionError(f"{study.file.name} has taken no look yet: there is nothing to draw")
+        raise OptionError(f"{study.name} has taken no look yet: there is nothing to draw")
     rows: dict[str, list[str]] = {}
     for name in sorted(times, key=lambda name: times[name].mean):
         base = name.removesuffix(TUNED)
@@ -115,7 +115,7 @@ def draw_entries(outcome: StudyOutcome) -> Figure:
     figure = Figure(figsize=(8.0, 1.5 + 0.26 * len(rows)), layout="constrained")
     axes = figure.subplots()
     models = list(dict.fromkeys(entry.model.name for entry in study.entries.values()))
-    tuned = {name for name, planned in zip(study.entries, study.file.entries) if planned.tuning is not None}
+    tuned = {name for name, table in zip(study.entries, study.file.entries) if table.tuning is not None}
     for height, (row, names) in enumerate(rows.items()):
         for name in names:
             look = style.style(models.index(study.entries[name].model.name))
@@ -171,8 +171,8 @@ def _at_right(axes: Axes, height: int, text: str) -> None:
 def _finish(figure: Figure, outcome: StudyOutcome, *footnotes: str) -> None:
     """Add legend, title and remarks."""
     figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
-    task = next(iter(outcome.study.entries.values())).task.name
-    figure.suptitle(style.plain(f"{task}: {outcome.study.file.name}"), x=0.01, ha="left", fontsize="medium")
+    task = outcome.study.task
+    figure.suptitle(style.plain(f"{task}: {outcome.study.name}"), x=0.01, ha="left", fontsize="medium")
     style.footnotes(figure, *footnotes)
 
 

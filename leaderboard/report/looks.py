@@ -1,4 +1,4 @@
-"""Decision plans as the page shows them: verdicts, looks, and p against the levels that it was compared with."""
+"""Studies with looks as the page shows them: verdicts, looks, and p against the levels that it was compared with."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from qrlsuite.studies.outcome import (
     StudyOutcome,
     difference_text,
     needs_text,
-    question,
     reason_note,
     versus,
 )
@@ -56,7 +55,7 @@ class LookLine:
 
 
 @dataclass(frozen=True)
-class DecisionPicture:
+class LooksPicture:
     """p of every pair at each look, upwards by -log10, and the levels: SVG coordinates.
 
     Attributes
@@ -76,8 +75,8 @@ class DecisionPicture:
 
 
 @dataclass(frozen=True)
-class PlanView:
-    """A plan, ready for the template."""
+class StudyView:
+    """A study with looks, ready for the template."""
 
     name: str
     question: str
@@ -85,12 +84,12 @@ class PlanView:
     note: str
     pairs: tuple[PairLine, ...]
     looks: tuple[LookLine, ...]
-    picture: DecisionPicture
+    picture: LooksPicture
 
 
-def view(outcome: StudyOutcome) -> PlanView:
-    """Return a plan with its decisions for the template."""
-    study, plan = outcome.study, outcome.study.plan
+def view(outcome: StudyOutcome) -> StudyView:
+    """Return a study with its decisions for the template."""
+    study = outcome.study
     plain = outcome.as_dict()
     pairs = tuple(
         PairLine(
@@ -101,51 +100,55 @@ def view(outcome: StudyOutcome) -> PlanView:
             seeds=pair.n_runs,
             difference=difference_text(pair, study.grid)[0].replace("-", "−"),
             interval=difference_text(pair, study.grid)[1].replace("-", "−"),
-            needs=needs_text(study, facts["needs"]).replace("<=", "≤"),
+            needs=needs_text(outcome, facts["needs"]).replace("<=", "≤"),
         )
         for index, (pair, facts) in enumerate(zip(outcome.pairs, plain["pairs"]))
     )
-    return PlanView(
-        name=clean(study.file.name),
-        question=clean(question(study)),
+    return StudyView(
+        name=clean(study.name),
+        question=clean(study.file.summary, 300),
         facts=tuple((term, clean(value, 600)) for term, value in _facts(outcome, plain)),
         note=clean(reason_note(study), 600),
         pairs=pairs,
-        looks=tuple(_look(outcome, index) for index in range(len(plan.looks))),
+        looks=tuple(_look(outcome, index) for index in range(len(study.design.looks))),
         picture=_picture(outcome),
     )
 
 
 def _facts(outcome: StudyOutcome, plain: dict[str, Any]) -> list[tuple[str, str]]:
     study = outcome.study
-    entry = next(iter(study.entries.values()))
-    steps = study.file.epochs * entry.task.file.protocol.interactions
+    entry, looks, ended = next(iter(study.entries.values())), study.looks, outcome.state.ended
+    steps = study.epochs * entry.task.file.protocol.interactions
     saved, used = plain["seeds_saved"], sum(each["seeds"] for each in plain["entries"])
-    if study.ended:
-        state = f"ended {_minute(study.ended)}, with open pairs"
+    if ended:
+        state = f"ended {_minute(ended)}, with open pairs"
     elif outcome.finished:
         state = "finished"
     else:
-        state = f"goes on: next look at {max(outcome.decision.wanted.values())} seeds"
+        state = f"goes on: next look at {max(outcome.state.decision.wanted.values())} seeds"
     return [
         ("State", state),
         ("Task", f"{entry.task.name}, {steps} environment steps"),
-        ("Plan written", f"{study.file.written.astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC"),
-        *([("First seed begun", _minute(study.begun_at))] if study.begun_at else []),
-        ("Hash of the plan", study.file.hash),
+        *(
+            [("Study written", f"{looks.written.astimezone(datetime.UTC):%Y-%m-%d %H:%M} UTC")]
+            if looks.written
+            else []
+        ),
+        *([("First seed begun", _minute(outcome.state.begun_at))] if outcome.state.begun_at else []),
+        ("Hash of the study", study.hash),
         (
             "Seeds",
-            f"{format_seeds(study.file.block)}, {used} used" + (f", {saved} saved" if saved > 0 else ""),
+            f"{format_seeds(looks.block)}, {used} used" + (f", {saved} saved" if saved > 0 else ""),
         ),
-        ("Any false difference", f"with probability {study.file.alpha:g} ({study.file.spending} spending)"),
-        ("Equal", f"within {100 * study.file.margin:g} percent"),
+        ("Any false difference", f"with probability {looks.alpha:g} ({looks.spending} spending)"),
+        ("Equal", f"within {100 * looks.margin:g} percent"),
     ]
 
 
 def _look(outcome: StudyOutcome, index: int) -> LookLine:
-    plan, taken = outcome.study.plan, outcome.study.taken
-    seeds = plan.looks[index]
-    spent = 2 * plan.spending.spent([seeds / plan.looks[-1]], plan.alpha / 2)[0]
+    design, taken = outcome.study.design, outcome.state.taken
+    seeds = design.looks[index]
+    spent = 2 * design.spending.spent([seeds / design.looks[-1]], design.alpha / 2)[0]
     cells = []
     for pair in outcome.pairs:
         has_p = index < len(pair.p)
@@ -155,39 +158,39 @@ def _look(outcome: StudyOutcome, index: int) -> LookLine:
         seeds=seeds,
         taken=_minute(taken[seeds]) if seeds in taken else "–",
         spent=f"{spent:.3f}",
-        level=f"{plan.level(index, len(plan.family)):.4f}",
+        level=f"{design.level(index, len(design.family)):.4f}",
         p=tuple(cells),
     )
 
 
-def _picture(outcome: StudyOutcome) -> DecisionPicture:
-    plan = outcome.study.plan
-    looks = range(len(plan.looks))
-    strict = [plan.level(look, len(plan.family)) for look in looks]
-    loose = [plan.level(look, 1) for look in looks]
+def _picture(outcome: StudyOutcome) -> LooksPicture:
+    design = outcome.study.design
+    looks = range(len(design.looks))
+    strict = [design.level(look, len(design.family)) for look in looks]
+    loose = [design.level(look, 1) for look in looks]
     smallest = min([*strict, *(p for pair in outcome.pairs for p in pair.p)])
     top = max(3, math.ceil(-math.log10(smallest) + 0.2))
 
     def x(seeds: float) -> float:
-        return round(LEFT + (WIDTH - LEFT - RIGHT) * seeds / plan.looks[-1], 1)
+        return round(LEFT + (WIDTH - LEFT - RIGHT) * seeds / design.looks[-1], 1)
 
     def y(p: float) -> float:
         return round(HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * -math.log10(p) / top, 1)
 
     def points(levels: Sequence[float], order: Sequence[int]) -> str:
-        return " ".join(f"{x(plan.looks[look])},{y(levels[look])}" for look in order)
+        return " ".join(f"{x(design.looks[look])},{y(levels[look])}" for look in order)
 
     lines = []
     for color, pair in enumerate(outcome.pairs):
         dots = tuple(
             (x(seeds), y(p), pair.differs and look == len(pair.p) - 1)
-            for look, (seeds, p) in enumerate(zip(plan.looks, pair.p))
+            for look, (seeds, p) in enumerate(zip(design.looks, pair.p))
         )
         if dots:
             lines.append((color, " ".join(f"{a},{b}" for a, b, _ in dots), dots))
-    return DecisionPicture(
+    return LooksPicture(
         band=f"{points(strict, looks)} {points(loose, looks[::-1])}",
-        seeds=tuple((x(seeds), seeds) for seeds in plan.looks),
+        seeds=tuple((x(seeds), seeds) for seeds in design.looks),
         powers=tuple(
             (y(10.0**-power), "1" if power == 0 else f"{10.0**-power:g}") for power in range(top + 1)
         ),

@@ -31,7 +31,7 @@ LONGEST_REASON = 600
 def render(
     board: Leaderboard,
     title: str = "Sample complexity leaderboard",
-    plans: Sequence[StudyOutcome] = (),
+    studies: Sequence[StudyOutcome] = (),
     across: AcrossBoard | None = None,
     costs: CostBoard | None = None,
 ) -> str:
@@ -46,8 +46,8 @@ def render(
         As `qrlsuite.leaderboard.board.build` returns it.
     title:
         The page's heading.
-    plans:
-        Decision plans, for a section of their own.
+    studies:
+        Studies with looks, for a section of their own.
     across:
         A comparison over several tasks, for a section of its own.
     costs:
@@ -70,7 +70,7 @@ def render(
             headline=sections.headline(boards, shown),
             sections=boards,
             entries=shown,
-            plans=[looks_report.view(plan) for plan in plans],
+            studies=[looks_report.view(study) for study in studies],
             across=across,
             costs=() if costs is None else costs.sections,
             tasks=len({section.task for section in board.sections}),

@@ -1,4 +1,4 @@
-"""Which published entries and plans a checkout changes: git is asked without a shell, and no name is believed.
+"""Which published entries and studies a checkout changes: git is asked without a shell, and no name is believed.
 
 A change that others propose has folders of any name, and where a name reaches a shell, it is a program. So git is
 started with a list of words, its answer is split at null bytes, and a name that no published file has is refused.
@@ -13,17 +13,17 @@ from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard.shelf.published import CURVES, SEEDS
-from qrlsuite.leaderboard.shelf.published_studies import LOG, PLAN
+from qrlsuite.studies.looks import FILE, LOG
 
 PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
 """Where a repository keeps what is published."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9+._-]*")
-_OF_ENTRY, _OF_PLAN = ("entry.json", CURVES, SEEDS), (PLAN, LOG)
+_OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS), (FILE, LOG)
 
 
 def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
-    """Return the folders of entries, and of plans, in which a checkout differs from a commit; both sorted.
+    """Return the folders of entries, and of studies, in which a checkout differs from a commit; both sorted.
 
     Files that git does not track yet count, those that it ignores do not. What is gone is left out; an entry of which
     one file is gone is not.
@@ -54,8 +54,8 @@ def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
             raise QrlSuiteError(f"{name!r}: {problem}; refused, nothing was verified")
         if not problem and path.parent.is_dir():
             folders.add(path.parent)
-    plans = {folder for folder in folders if folder.parent == root / PLACES[2]}
-    return sorted(folders - plans), sorted(plans)
+    studies = {folder for folder in folders if folder.parent == root / PLACES[2]}
+    return sorted(folders - studies), sorted(studies)
 
 
 def _commit(base: str, root: Path) -> str:
@@ -90,9 +90,13 @@ def _problem(root: Path, name: str) -> str | None:
         return f"{strange!r} is no published name: those are of a-z, 0-9, '+', '.', '_' and '-'"
     if any((root / part).is_symlink() for part in [name, *map(str, Path(name).parents)]):
         return "it is a link, or behind one"
-    of_plan = place == PLACES[2]
-    files = {2: () if of_plan else _OF_ENTRY, 3: _OF_ENTRY if of_plan else (), 1: _OF_PLAN if of_plan else ()}
+    of_study = place == PLACES[2]
+    files = {
+        2: () if of_study else _OF_ENTRY,
+        3: _OF_ENTRY if of_study else (),
+        1: _OF_STUDY if of_study else (),
+    }
     if parts[-1] in files.get(len(parts) - 1, ()):
         return None
     entry = f"TASK/ENTRY/ with {', '.join(_OF_ENTRY)}"
-    return f"{place} holds {f'NAME/ with {PLAN}, {LOG} and NAME/{entry}' if of_plan else entry} alone"
+    return f"{place} holds {f'NAME/ with {FILE}, {LOG} and NAME/{entry}' if of_study else entry} alone"

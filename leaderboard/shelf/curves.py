@@ -67,7 +67,7 @@ class EntryResults(Shown):
     tuning:
         How the settings were found, where their preset says so, see `qrlsuite.experiment.preset.EntryTuning`.
     plan:
-        Hash of the decision plan that trained it; None for a number of seeds that was fixed in advance.
+        Hash of the study with looks that trained it; None for a number of seeds that was fixed in advance.
     source:
         Whether the curves were read from a results folder or from a published entry.
     color:

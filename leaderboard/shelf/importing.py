@@ -97,20 +97,20 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
     Parameters
     ----------
     plan:
-        Hash of the decision plan that the results folder belongs to, if it does.
+        Hash of the study with looks that the results folder belongs to, if it does.
 
     Raises
     ------
     StoreError
         If the entry was made under another definition of its task, is damaged, was not trained by this suite or
-        belongs to a decision plan; or if the seeds are being trained here.
+        belongs to a study with looks; or if the seeds are being trained here.
     """
     exported = published.read(source.path) if published.is_published(source.path) else None
     entry = source.entry()  # computes the hash anew
     if entry.plan != plan:
         raise StoreError(
-            f"{source.path} belongs to a decision plan, whose number of seeds depends on what they showed: it is "
-            "continued by the plan alone"
+            f"{source.path} belongs to a study with looks, whose number of seeds depends on what they showed: it is "
+            "continued by the study alone"
         )
     store = EntryStore.find(runs, entry)
     if store.path.resolve() == source.path.resolve():

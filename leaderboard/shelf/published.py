@@ -97,7 +97,7 @@ class PublishedEntry:
     def chosen_seeds(self) -> str:
         """Why no board ranks an entry whose seeds may have been chosen; empty where they are 0 to N - 1.
 
-        A decision plan has a block of its own, and takes no seeds beside it.
+        A study with looks has a block of its own, and takes no seeds beside it.
         """
         if "plan" in self.record or self.seeds == tuple(range(len(self.seeds))):
             return ""

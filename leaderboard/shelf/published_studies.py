@@ -1,39 +1,36 @@
-"""Published decision plans: the plan, its log of looks, and the learning curves of its entries.
+"""Published studies with looks: the study, its log of looks, and the learning curves of its entries.
 
-    <name>/plan.toml                the plan as it was when its first seed began
+    <name>/plan.toml                the study as it was when its first seed began
            looks.jsonl              when the first seed was begun and each look taken, and what it found
            <task>/<entry>/...       as published entries, see `qrlsuite.leaderboard.shelf.published`
 
-Verdicts are not stored: they are computed from the plan and the curves.
+Verdicts are not stored: they are computed from the study and the curves.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
-from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard.shelf import collect, importing, published
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
-from qrlsuite.statistics import LearningCurves
-from qrlsuite.studies import looks
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import FILE, LOG, Run, StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome, in_folder
+from qrlsuite.studies.study import Study, dumps
+from qrlsuite.studies.study import load as load_file
 
 PUBLISHED = Path(__file__).parents[1] / "plans"
-"""The plans that come with the suite."""
-
-PLAN, LOG = "plan.toml", "looks.jsonl"
+"""The studies with looks that come with the suite."""
 
 
 class PublishedStudy(StudyWithLooks):
-    """A published plan with its results.
+    """A published study with its results.
 
     Parameters
     ----------
@@ -43,61 +40,63 @@ class PublishedStudy(StudyWithLooks):
     Raises
     ------
     QrlSuiteError
-        If the plan or an entry is damaged.
+        If the study or an entry is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(looks.load(folder / PLAN), str(folder / PLAN), folder.parent)
+        super().__init__(load(folder), folder.parent)
         self.folder = folder
         self._published: dict[str, PublishedEntry] = {}
         for name, entry in self.entries.items():
             if (path := EntryStore.find(folder, entry).path).is_dir():
                 self._published[name] = published.read(path)
-                if (length := self._published[name].curves.shape[1]) < self.file.epochs:
-                    raise StoreError(f"{path} has {length} epochs, and its plan {self.file.epochs}")
+                if (length := self._published[name].curves.shape[1]) < self.epochs:
+                    raise StoreError(f"{path} has {length} epochs, and its study {self.epochs}")
 
     @property
     def begun(self) -> bool:
-        """A published plan has begun."""
+        """A published study has begun."""
         return True
 
-    def _records(self, entry: Entry) -> Iterator[tuple[int, Mapping[str, Any]]]:
-        for name, each in self._published.items():
-            if self.entries[name] == entry:
-                yield from ((seed, each.record) for seed in each.seeds if seed in self.file.block)
+    def check(self) -> bool:
+        """Return True: the published file is the study as it was when its first seed began."""
+        return True
 
-    def seeds(self, name: str) -> list[int]:
-        """Return the seeds of an entry, from the block's first on without a gap."""
-        held = set(self._published[name].seeds) if name in self._published else set()
-        block = self.file.block
-        return list(range(block.start, next((seed for seed in block if seed not in held), block.stop)))
-
-    def hours(self, name: str) -> float:
-        """Return the core-hours that an entry's seeds have taken."""
-        return float(self._published[name].hours.sum()) if name in self._published else 0.0
+    def runs_of(self, name: str) -> Iterator[Run]:
+        """Yield the seeds of an entry."""
+        if (each := self._published.get(name)) is not None:
+            for seed, curve, hours in zip(each.seeds, each.curves, each.hours):
+                yield Run(seed, each.record, curve[: self.epochs], float(hours))
 
     def executions(self, name: str) -> float:
         """Return the circuit executions of an entry's seeds, mean per seed; 0 where it has none."""
         return float(self._published[name].executions.mean()) if name in self._published else 0.0
 
-    def curves(self) -> dict[str, LearningCurves]:
-        """Return the learning curves of the published seeds; entries without any are absent."""
-        curves = {}
-        for name, each in self._published.items():
-            rows = [each.seeds.index(seed) for seed in self.seeds(name)]
-            if rows:
-                values = each.curves[rows, : self.file.epochs]
-                curves[name] = LearningCurves(values, each.task_file.protocol.interactions, name)
-        return curves
+
+def names() -> list[str]:
+    """Return the names of the studies that come with the suite."""
+    return sorted(path.parent.name for path in PUBLISHED.glob(f"*/{FILE}"))
+
+
+def folder_of(name: str) -> Path | None:
+    """Return the folder of a published study, given as that folder or by the name of one that comes with the suite."""
+    known = [Path(name), *([PUBLISHED / name] if len(Path(name).parts) == 1 else [])]
+    return next(filter(is_published, known), None)
+
+
+def load(folder: Path) -> Study:
+    """Read the study that a folder holds, without its results."""
+    study = load_file(str(folder / FILE))
+    return replace(study, source=str(folder / FILE))
 
 
 def is_published(path: Path) -> bool:
-    """Return whether a folder holds a published plan."""
-    return (path / PLAN).is_file()
+    """Return whether a folder holds a published study."""
+    return (path / FILE).is_file()
 
 
 def read(folder: Path) -> StudyOutcome:
-    """Return what a published plan has decided.
+    """Return what a published study has decided.
 
     Raises
     ------
@@ -106,62 +105,61 @@ def read(folder: Path) -> StudyOutcome:
     """
     if not is_published(folder):
         raise StoreError(
-            f"{folder} holds no {PLAN}: give a plan's file, or a folder that `decide export` wrote"
+            f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
         )
     study = PublishedStudy(folder)
-    return StudyOutcome(study, study.decision())
+    return StudyOutcome(study, study.read())
 
 
 def collected(
     runs: Path, tasks: Sequence[str] = (), published: bool = False
 ) -> tuple[list[StudyOutcome], list[str]]:
-    """Return what the plans of a results folder have decided, and a line for each that is unreadable.
+    """Return what the studies with looks of a results folder have decided, and a line for each unreadable one.
 
     Parameters
     ----------
     tasks:
-        Only plans of these tasks; all where empty.
+        Only studies of these tasks; all where empty.
     published:
-        With the plans that come with the suite, but for those of which the folder has a copy of its own.
+        With those that come with the suite, but for those of which the folder has a copy of its own.
     """
     outcomes, refused = in_folder(runs, tasks)
-    known = {outcome.study.file.hash for outcome in outcomes}
-    for path in sorted(PUBLISHED.glob(f"*/{PLAN}")) if published else []:
+    known = {outcome.study.hash for outcome in outcomes}
+    for name in names() if published else []:
         try:
-            outcome = read(path.parent)
+            outcome = read(PUBLISHED / name)
         except QrlSuiteError as error:
             refused.append(str(error))
             continue
-        task = next(iter(outcome.study.entries.values())).task.name
-        if outcome.study.file.hash not in known and (not tasks or task in tasks):
+        if outcome.study.hash not in known and (not tasks or outcome.study.task in tasks):
             outcomes.append(outcome)
     return outcomes, refused
 
 
 def export(study: StudyWithLooks, out: Path) -> Path:
-    """Write a plan and its finished seeds to `out/<name>`; returns that folder.
+    """Write a study and its finished seeds to `out/<name>`; returns that folder.
 
-    Written again while the plan goes on, it holds more seeds. Nothing there is replaced by less, and the plan's own
+    Written again while the study goes on, it holds more seeds. Nothing there is replaced by less, and the study's own
     file stays as it is: it may have been published before its first seed.
 
     Raises
     ------
     QrlSuiteError
-        If the plan has not begun, another plan is in its place, or files cannot be written.
+        If the study has not begun, another one is in its place, or files cannot be written.
     """
-    study.check()
-    if not study.begun:
-        raise OptionError(f"{study.source}: the plan has not begun, so there is nothing to export")
-    folder = out / study.file.name
+    state = study.read()
+    if not state.begun:
+        raise OptionError(f"{study.source}: the study has not begun, so there is nothing to export")
+    folder = out / study.name
     if not is_published(folder):
-        write_atomically(folder / PLAN, looks.dumps(study.file).encode())
-    elif (there := looks.load(folder / PLAN).hash) != study.file.hash:
+        write_atomically(folder / FILE, dumps(study.file).encode())
+    elif (there := StudyWithLooks(load(folder), out).hash) != study.hash:
         raise OptionError(
-            f"{folder} holds another plan ({there}, this one is {study.file.hash}): choose another --out"
+            f"{folder} holds another study ({there}, this one is {study.hash}): choose another --out"
         )
     for name, entry in study.entries.items():
-        held = collect.read_entry(EntryStore.find(study.folder, entry)) if study.seeds(name) else None
-        finished = None if held is None else held.reaching(study.file.epochs)
+        held = collect.read_entry(EntryStore.find(study.folder, entry)) if state.seeds[name] else None
+        finished = None if held is None else held.reaching(study.epochs)
         if finished is not None:
             export_entry(finished, folder)
     if (log := study.folder / LOG).exists():
@@ -171,19 +169,20 @@ def export(study: StudyWithLooks, out: Path) -> Path:
 
 
 def import_study(folder: Path, runs: Path) -> list[Imported]:
-    """Copy the seeds of a published plan to a results folder, where `decide run` goes on with it.
+    """Copy the seeds of a published study to a results folder, where `study run` goes on with it.
 
     Raises
     ------
     QrlSuiteError
-        If another plan of its name has begun there, or an entry is damaged.
+        If another study of its name has begun there, or an entry is damaged.
     """
     source = PublishedStudy(folder)
-    study = StudyWithLooks(source.file, source.source, runs)
+    study = StudyWithLooks(load(folder), runs)
     study.begin()
-    done = [
-        importing.import_seeds(store, study.folder, source.file.hash) for store in importing.sources(folder)
-    ]
-    if (folder / LOG).exists() and not study.taken:  # the seeds were begun where they were trained
-        shutil.copyfile(folder / LOG, study.folder / LOG)
+    done = [importing.import_seeds(store, study.folder, source.hash) for store in importing.sources(folder)]
+    log = study.folder / LOG
+    if (
+        folder / LOG
+    ).exists() and b'"look"' not in log.read_bytes():  # the seeds were begun where they were trained
+        shutil.copyfile(folder / LOG, log)
     return done

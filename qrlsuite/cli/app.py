@@ -73,8 +73,7 @@ BUILT_IN = {
         LazyCommand("show", "Show options, protocols, circuits, provenance.", f"{_ROOM}.show:show"),
         LazyCommand("check", "Check plugins against every rule of the suite.", f"{_ROOM}.check:check"),
         LazyCommand("doctor", "Collect what a bug report needs.", f"{_ROOM}.doctor:doctor"),
-        LazyCommand("study", "Run a paper's experiments by name.", f"{_ROOM}.study:app"),
-        LazyCommand("decide", "Compare entries with as many seeds as it takes.", f"{_ROOM}.decide:app"),
+        LazyCommand("study", "Run a paper's experiments, or your own, by name.", f"{_ROOM}.study:app"),
         LazyCommand("power", "Say how many seeds find a difference.", f"{_ROOM}.power:power"),
         LazyCommand("new", "Write a new plugin package.", f"{_ROOM}.new:app"),
     )
@@ -84,6 +83,17 @@ RENAMED = {
     "status": "qrlsuite runs",
     "calibrate": "python benchmarks/calibration.py",
     "leaderboard verify": "qrlsuite verify",
+    "decide new": "qrlsuite study new",
+    "decide run": "qrlsuite study run",
+    "decide end": "qrlsuite study end",
+    "decide plot": "qrlsuite study draw",
+    "decide show": "qrlsuite show",
+    "decide status": "qrlsuite show",
+    "decide export": "qrlsuite export",
+    "decide": "qrlsuite study",
+    "study list": "qrlsuite list studies",
+    "study show": "qrlsuite show study",
+    "study status": "qrlsuite show study",
 }
 """Commands of earlier versions, one word or two, and what does their work now."""
 

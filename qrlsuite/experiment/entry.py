@@ -34,7 +34,7 @@ class Entry:
     tuning:
         How the settings were found, where their preset says so; not part of the identity either.
     plan:
-        Hash of the decision plan that trains it, where one does; not part of the identity either.
+        Hash of the study with looks that trains it, where one does; not part of the identity either.
     """
 
     task: Task

@@ -212,7 +212,7 @@ def _refusal(store: EntryStore, group: SameCode, current: CodeIdentity) -> str:
             "registered under another name"
         )
     else:
-        anew = "Restore that code, or write another plan"
+        anew = "Restore that code, or write another study"
     return (
         f"{store.path} has seeds {seeds} of '{record['label']}' that another code has begun: {change}. Nothing was "
         f'trained. {anew}; and --same "REASON" says that nothing changed in effect'
@@ -355,8 +355,8 @@ def set_aside(
     Raises
     ------
     StoreError
-        If somebody trains the entry, a queue or a decision plan has it, seeds of both codes are in it, its new place is
-        taken, or it cannot be moved.
+        If somebody trains the entry, a queue or a study with looks has it, seeds of both codes are in it, its new place
+        is taken, or it cannot be moved.
     """
     changed = others(store, current)
     if not changed:
@@ -365,7 +365,7 @@ def set_aside(
     target = store.path.with_name(f"{store.path.name}@{changed[0].mark}")
     if store.record().get("plan") is not None:
         raise StoreError(
-            f"{store.path} is of a decision plan that has begun: its seeds stay; write another plan"
+            f"{store.path} is of a study with looks that has begun: its seeds stay; write another study"
         )
     if len(changed) > 1 or len(of_seeds(store)) > 1:
         seeds = format_seeds(changed[0].seeds)

@@ -1,4 +1,4 @@
-"""How many runs it takes to tell two entries apart: by rule `times`, all at once or as a decision plan.
+"""How many runs it takes to tell two entries apart: by rule `times`, all at once or with looks.
 
 Entries are drawn from smoothed models of pilot runs, or of a published entry that is alike (`SmoothedRuns`), and
 judged as they would be. What comes out holds for entries like the pilot, within the simulation's error.
@@ -36,7 +36,7 @@ class Need:
     fixed:
         Runs of each entry if all are made before they are compared; None if more than allowed.
     looks:
-        Numbers of runs at which a decision plan of the same power looks; empty if more than allowed.
+        Looks of a study of the same power; empty if more than allowed.
     mean_runs:
         Runs of each entry that the plan needs on average; NaN without a plan.
     """

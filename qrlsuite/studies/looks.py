@@ -1,13 +1,14 @@
-"""Decision plans: which of several entries needs fewer steps, with as many seeds as it takes.
+"""Studies with looks: which of several entries needs fewer steps, with as many seeds as it takes.
 
-A plan is a TOML file that fixes, before the first seed is trained, who is compared, at which numbers of seeds the
-results are looked at, and at which error (`qrlsuite.statistics.sequential`). Its results lie in a folder of their own:
+The table `[looks]` of a study file fixes, before the first seed is trained, which pairs are compared, at which numbers
+of seeds the results are looked at, and at which error (`qrlsuite.statistics.sequential`). The seeds are the study's
+own, in a folder of its own:
 
-    <runs>/decisions/<name>/plan.toml           the plan as it was when its first seed began
+    <runs>/decisions/<name>/plan.toml           the study as it was when its first seed began
                             looks.jsonl         when the first seed was begun and each look taken, and what it found
-                            <task>/<entry>/...  as in any results folder; each seed's record has the plan's hash
+                            <task>/<entry>/...  as in any results folder; each seed's record has the study's hash
 
-What is decided follows from the plan and the curves alone. The log is not read to decide anything: it says when each
+What is decided follows from the study and the curves alone. The log is not read to decide anything: it says when each
 look was taken, and reveals curves that were changed after it. Leaderboards do not read this folder: seeds whose number
 depends on what they showed have no p-value of a fixed number of seeds.
 """
@@ -15,20 +16,18 @@ depends on what they showed have no p-value of a fixed number of seeds.
 from __future__ import annotations
 
 import datetime
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import pydantic
-import tomli_w
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from numpy.typing import NDArray
 
-from qrlsuite import notation, options, specs
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError
+from qrlsuite import notation, options
+from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
@@ -36,167 +35,363 @@ from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_lines, write_atomically
 from qrlsuite.statistics import DecisionPlan, Grid, LearningCurves, decide
 from qrlsuite.statistics.sequential import Decision
-from qrlsuite.studies.study import setting
+from qrlsuite.studies.study import (
+    EntriesSection,
+    LooksSection,
+    Member,
+    Study,
+    StudyFile,
+    dumps,
+    load,
+    question_of,
+    setting,
+)
 from qrlsuite.tuning.search import FOLDER as TUNING
 
 FOLDER = "decisions"
-"""Plans' results lie in folders of their own below the results folder, so that leaderboards do not rank them."""
-
-FIRST_SEED = 10_000
-"""Where blocks of seeds begin unless told otherwise: no protocol asks for as many."""
+"""Below the results folder: studies with looks have a folder each, so that leaderboards do not rank their seeds."""
+FILE, LOG = "plan.toml", "looks.jsonl"
 
 
-class _PlanTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+@dataclass(frozen=True)
+class Run:
+    """A seed of a study.
+
+    Attributes
+    ----------
+    curve:
+        Shape (T,); None where it has not reached the study's last epoch.
+    """
+
+    seed: int
+    record: Mapping[str, Any]
+    curve: NDArray[np.float64] | None
+    hours: float
 
 
-class PlannedEntry(_PlanTable):
-    """An entry of a plan; the keys mean what they mean in a study's entries."""
+@dataclass(frozen=True, eq=False)
+class StudyState:
+    """What the folder of a study with looks held when it was read, and what is decided by it.
 
-    model: Annotated[str, Field(min_length=1)]
-    algorithm: Annotated[str, Field(min_length=1)]
-    preset: str | None = None
-    options: Annotated[
-        dict[str, Any], Field(description='options as in --set: qubits, "environment.degree", "algorithm.lr"')
-    ] = {}
-    hash: Annotated[str, Field(description="of the entry that these options make: it cannot become another")]
-    name: Annotated[
-        str | None,
-        Field(pattern=r"^[\w(][\w ,.:=+/()-]*$", max_length=60, description="what verdicts call it"),
-    ] = None
-    tuning: Annotated[
-        EntryTuning | None, Field(description="how its options were found, where a preset file gave them")
-    ] = None
+    Attributes
+    ----------
+    begun_at, ended:
+        When the first seed was begun, and when the study was ended before all was decided, by its log.
+    taken:
+        When each look was taken, by its number of seeds.
+    seeds:
+        Of each entry the seeds that have finished, from the block's first on without a gap.
+    curves:
+        Their learning curves; entries without any are absent.
+    hours:
+        Of each entry the core-hours of all its seeds, unfinished ones too.
+    """
 
-
-class Question(_PlanTable):
-    """What a plan asks, and the pairs of entries whose verdicts answer it."""
-
-    text: Annotated[str, Field(min_length=1, max_length=200)]
-    pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]
-
-
-class PlanFile(_PlanTable):
-    """A whole plan file."""
-
-    format_version: Literal[1]
-    name: Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64, description="of the results' folder")]
-    written: AwareDatetime
-    task: Annotated[str, Field(min_length=1)]
-    epochs: Annotated[
-        int, Field(ge=1, description="of every seed: the horizon at which entries are compared")
-    ]
-    rule: Literal["times", "times-skewed"]
-    epsilons: Annotated[
-        list[float] | None,
-        Field(min_length=1, description="thresholds 1 - epsilon on a score with maximum 1"),
-    ] = None
-    thresholds: Annotated[list[float] | None, Field(min_length=1, description="thresholds on the return")] = (
-        None
-    )
-    alpha: float
-    spending: str
-    looks: Annotated[list[int], Field(min_length=1, description="seeds of each entry at each look")]
-    margin: Annotated[float, Field(description="a smaller difference counts as none: 0.1 is 10 percent")]
-    first_seed: Annotated[int, Field(ge=0, description="where the plan's own block of seeds begins")]
-    reason: Annotated[str, Field(description="why the first look comes before 20 seeds")] = ""
-    questions: Annotated[
-        list[Question], Field(description="which pairs are compared; every pair of entries without them")
-    ] = []
-    entries: list[PlannedEntry]
-
-    @pydantic.model_validator(mode="after")
-    def _one_grid(self) -> PlanFile:
-        if (self.epsilons is None) == (self.thresholds is None):
-            raise ValueError("give either epsilons (score with maximum 1) or thresholds (no known maximum)")
-        return self
+    begun: bool
+    begun_at: str | None
+    ended: str | None
+    taken: Mapping[int, str]
+    seeds: Mapping[str, Sequence[int]]
+    curves: Mapping[str, LearningCurves]
+    hours: Mapping[str, float]
+    decision: Decision
 
     @property
-    def hash(self) -> str:
-        """Sixteen hexadecimal digits over everything that the file says."""
-        content = self.model_dump(mode="json")
-        if not self.questions:  # no key of version 0.1.0, whose plans keep their hash
-            del content["questions"]
-        for entry in content["entries"]:
-            for key in ("name", "tuning"):
-                if entry[key] is None:
-                    del entry[key]
-        return digest(content)
-
-    @property
-    def block(self) -> range:
-        """The seeds that the plan may train, of every entry."""
-        return range(self.first_seed, self.first_seed + self.looks[-1])
+    def missing(self) -> dict[str, int]:
+        """How many seeds each open entry lacks for the next look; none where it has them."""
+        lacking = {name: count - len(self.seeds[name]) for name, count in self.decision.wanted.items()}
+        return {name: count for name, count in lacking.items() if count > 0}
 
 
-def parse(text: str, source: str) -> PlanFile:
-    """Parse a plan file; entries and numbers are checked by `StudyWithLooks`.
+class StudyWithLooks:
+    """A study with looks and its results folder.
+
+    Attributes
+    ----------
+    file:
+        The study with every entry by itself, and all that is fixed written out.
+    looks:
+        Its table.
+    hash:
+        Sixteen hexadecimal digits over all that decides.
+    entries:
+        The entries by the name that verdicts use, in the study's order.
+    design:
+        What is tested when.
+    questions:
+        For each pair the question that it answers; empty where the study asks none.
+    folder:
+        Where its results are, or will be.
 
     Raises
     ------
-    TaskError
-        Listing every problem with its path in the file.
+    QrlSuiteError
+        If a name, an option or a number cannot be used, or an entry is no longer the one that was fixed.
     """
-    try:
-        return PlanFile.model_validate(options.read_toml(text))
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"{source}: not valid TOML: {error}") from None
-    except pydantic.ValidationError as error:
-        raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, PlanFile))) from None
+
+    def __init__(self, study: Study, runs: Path) -> None:
+        if study.file.looks is None:
+            raise OptionError(f"study '{study.name}' has no looks: add a table [looks] to {study.source}")
+        self.source, self.runs = study.source, runs
+        self.folder = runs / FOLDER / study.name
+        self.file, members = _fixed(study)
+        self.looks = self.file.looks or LooksSection()
+        self.hash = _hash(self.file)
+        self.epochs = self.looks.epochs or 0
+        tables = self.file.entries
+        names = tuple(table.name or name for table, name in zip(tables, _names([m.entry for m in members])))
+        own = [
+            replace(m.entry, plan=self.hash, tuning=table.tuning.plain() if table.tuning else m.entry.tuning)
+            for m, table in zip(members, tables)
+        ]
+        self.entries: dict[str, Entry] = dict(zip(names, own))
+        self.questions = [asked.text for asked in self.looks.questions for _ in asked.pairs]
+        try:
+            self.design = self._design(names)
+            grid = Grid.relative if self.looks.epsilons is not None else Grid.absolute
+            self.grid = grid(
+                self.looks.epsilons or self.looks.thresholds or [], [0.5]
+            )  # no rule here needs delta
+        except OptionError as error:
+            raise OptionError(f"{self.source}: {error}") from None
+        self._check_block()
+
+    def _design(self, names: tuple[str, ...]) -> DecisionPlan:
+        looks = self.looks
+        return DecisionPlan(
+            names,
+            tuple(looks.looks),
+            looks.alpha,
+            looks.spending,  # type: ignore[arg-type]  # checked there
+            looks.margin,
+            pairs=tuple(pair for asked in looks.questions for pair in asked.pairs) or None,
+            reason=looks.reason,
+            rule=looks.rule,
+        )
+
+    @property
+    def name(self) -> str:
+        """The study's name."""
+        return self.file.name
+
+    @property
+    def task(self) -> str:
+        """The name of the task on which all entries are compared."""
+        return next(iter(self.entries.values())).task.name
+
+    def _check_block(self) -> None:
+        """Refuse seeds that belong to others."""
+        block = self.looks.block
+        protocol = max(entry.task.file.protocol.seeds for entry in self.entries.values())
+        if block.start < protocol:
+            raise OptionError(
+                f"{self.source}: first_seed = {block.start}: seeds 0:{protocol} are the protocol's, which may have "
+                f"been looked at; begin at {protocol} or later"
+            )
+        if block.stop > TUNING_SEEDS:
+            raise OptionError(
+                f"{self.source}: first_seed = {block.start}: seeds from {TUNING_SEEDS} up are those of tuning; the "
+                f"block has to end below"
+            )
+
+    @property
+    def begun(self) -> bool:
+        """Whether a seed was begun: from then on the study is fixed."""
+        return any(self.folder.glob("*/*/seed-*"))
+
+    def check(self) -> bool:
+        """Refuse a study that was changed after it began, or whose seeds were trained before; returns whether it began.
+
+        Raises
+        ------
+        OptionError
+            Saying what was changed, or which seeds were trained.
+        """
+        if not self.begun:
+            for name, seeds, path in self.trained_before():
+                raise OptionError(
+                    f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a study "
+                    f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
+                )
+            return False
+        kept = StudyWithLooks(load(str(self.folder / FILE)), self.runs)
+        if kept.hash != self.hash:
+            before, after = _content(kept.file), _content(self.file)
+            changes = [
+                f"{key} (was {_short(before.get(key))}, is {_short(after.get(key))})"
+                for key in {**before, **after}
+                if before.get(key) != after.get(key)
+            ]
+            raise OptionError(
+                f"{self.source}: {', '.join(changes)} changed after the study began. End this study and write "
+                f"a new one with other seeds (the study as it began: {self.folder / FILE})"
+            )
+        return True
+
+    def trained_before(self) -> list[tuple[str, list[int], Path]]:
+        """Return seeds of the block that were trained elsewhere below the results folder: entry, seeds, folder."""
+        others = [self.runs, self.runs / TUNING]
+        studies = self.runs / FOLDER
+        if studies.is_dir():
+            others += sorted(path for path in studies.iterdir() if path.is_dir() and path != self.folder)
+        trained = []
+        for name, entry in self.entries.items():
+            for other in others:
+                path = other / entry.task.name / entry.name
+                if path.is_dir():
+                    seeds = [seed for seed in EntryStore(path).seeds() if seed in self.looks.block]
+                    trained += [(name, seeds, path)] if seeds else []
+        return trained
+
+    def _next_block(self) -> int:
+        return self.looks.first_seed + max(1000, len(self.looks.block))
+
+    def begin(self) -> None:
+        """Keep the study as it is now, before its first seed.
+
+        Raises
+        ------
+        QrlSuiteError
+            As `check`; or if it was ended, or the folder cannot be written.
+        """
+        begun = self.check()
+        log = read_lines(self.folder / LOG)
+        if (when := _first(log, "ended")) is not None:
+            raise OptionError(
+                f"{self.source}: the study was ended on {when}; a new one needs a name of its own"
+            )
+        if not begun:
+            write_atomically(self.folder / FILE, dumps(self.file).encode())
+            if _first(log, "begun", self.hash) is None:
+                append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash}))
+
+    def end(self) -> None:
+        """Close the study for good, with its open pairs open.
+
+        Raises
+        ------
+        QrlSuiteError
+            As `read`; or if it has not begun, was ended before, or has nothing open.
+        """
+        state = self.read()
+        if not state.begun:
+            raise OptionError(f"{self.source}: the study has not begun, so there is nothing to end")
+        if state.ended is not None:
+            raise OptionError(f"{self.source}: the study was ended on {state.ended} already")
+        if state.decision.finished:
+            raise OptionError(f"{self.source}: every pair is closed, so there is nothing to end")
+        append(self.folder / LOG, json_line({"ended": _now()}))
+
+    def runs_of(self, name: str) -> Iterator[Run]:
+        """Yield the seeds of an entry that were begun."""
+        store = EntryStore.find(self.folder, self.entries[name])
+        for seed in store.seeds() if store.path.is_dir() else []:
+            folder = store.seed(seed)
+            record = folder.record()
+            if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= self.epochs:
+                run = folder.read()
+                yield Run(seed, record, run.curve[: self.epochs], run.seconds / 3600)
+            else:
+                yield Run(seed, record or {}, None, folder.seconds() / 3600)
+
+    def read(self) -> StudyState:
+        """Read the folder once, and decide by it; writes nothing.
+
+        Raises
+        ------
+        QrlSuiteError
+            As `check`; if a seed was not trained by this study; or if a look finds something else than it did when it
+            was taken.
+        """
+        begun, log = self.check(), read_lines(self.folder / LOG)
+        seeds, curves, hours = dict[str, list[int]](), dict[str, LearningCurves](), dict[str, float]()
+        for name, entry in self.entries.items():
+            runs = list(self.runs_of(name))
+            for run in runs:
+                if run.seed in self.looks.block and run.record and run.record.get("plan") != self.hash:
+                    raise StoreError(
+                        f"{EntryStore.find(self.folder, entry).seed(run.seed).path}: seed {run.seed} of '{name}' was "
+                        f"not trained by study {self.hash}; delete that folder, and the study trains it"
+                    )
+            done = {run.seed: run.curve for run in runs if run.curve is not None}
+            gap = next((seed for seed in self.looks.block if seed not in done), self.looks.block.stop)
+            seeds[name] = list(range(self.looks.block.start, gap))
+            hours[name] = sum(run.hours for run in runs)
+            if seeds[name]:
+                values = np.stack([done[seed] for seed in seeds[name]])
+                curves[name] = LearningCurves(values, entry.task.file.protocol.interactions, name)
+        decision = decide(self.design, curves, self.grid)
+        self._compare(decision, log)
+        return StudyState(
+            begun=begun,
+            begun_at=_first(log, "begun", self.hash),
+            ended=_first(log, "ended"),
+            taken=dict(
+                sorted({line["look"]: str(line["time"]) for line in reversed(log) if "look" in line}.items())
+            ),
+            seeds=seeds,
+            curves=curves,
+            hours=hours,
+            decision=decision,
+        )
+
+    def _compare(self, decision: Decision, log: Sequence[Mapping[str, Any]]) -> None:
+        """Refuse curves by which a look finds something else than the log says."""
+        for line in _lines(self.design, decision):
+            for before in log:
+                if before.get("look") != line["look"]:
+                    continue
+                for now, then in zip(line["pairs"], before.get("pairs", [])):
+                    if now["decided"] != then.get("decided"):
+                        raise StoreError(
+                            f"{self.folder / LOG}: the look at {line['look']} seeds found '{then.get('decided')}' for "
+                            f"{' and '.join(now['pair'])}, and the curves there now give '{now['decided']}': results "
+                            "were changed since; restore them"
+                        )
+
+    def look(self) -> StudyState:
+        """Take every look for which the seeds are there, and note when.
+
+        Raises
+        ------
+        QrlSuiteError
+            As `read`, or if the log cannot be written.
+        """
+        state = self.read()
+        new = {
+            line["look"]: line
+            for line in _lines(self.design, state.decision)
+            if line["look"] not in state.taken
+        }
+        taken = dict(state.taken)
+        for look, line in new.items():
+            taken[look] = _now()
+            append(self.folder / LOG, json_line({"time": taken[look], "plan": self.hash, **line}))
+        return replace(state, taken=taken)
 
 
-def load(path: Path) -> PlanFile:
-    """Read a plan file.
-
-    Raises
-    ------
-    TaskError
-        If it cannot be read or is malformed.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TaskError(f"plan {path} cannot be read: {error}") from None
-    return parse(text, path.name)
-
-
-def dumps(file: PlanFile) -> str:
-    """Return a plan file's text."""
-    content = file.model_dump(exclude_none=True)
-    for key in ("reason", "questions"):
-        if not content[key]:
-            del content[key]
-    head = "# Fixed when its first seed is trained: see `qrlsuite decide --help`.\n"
-    return head + tomli_w.dumps(content)
-
-
-def write(
+def new(
     name: str,
     task: str,
-    names: Sequence[str],
+    entries: Sequence[str],
     runs: Path,
     *,
     algorithm: str | None = None,
     preset: str | None = None,
-    epochs: int | None = None,
-    looks: Sequence[int] = (20, 40, 60, 80, 100),
-    alpha: float = 0.05,
-    spending: str = "pocock",
-    margin: float = 0.10,
     first_seed: int | None = None,
-    reason: str = "",
+    **looks: Any,
 ) -> StudyWithLooks:
-    """Return a new plan, dated now; writes nothing.
+    """Return a new study with looks, dated now; writes nothing.
 
     Parameters
     ----------
-    names:
-        For each entry its model and settings, or its label: `mlp width=64`, `ddqn mlp width=64`. A setting
-        `preset=FILE.toml` gives those of a preset file, with the record of how they were found.
-    epochs:
-        Of every seed; None for the task's protocol.
+    entries:
+        Each as `[ALGORITHM] MODEL NAME=VALUE ...`. A setting `preset=FILE.toml` gives the values of a preset file, with
+        the record of how they were found.
     first_seed:
         None for the first block from 10,000 of which no seed was trained below `runs`.
+    looks:
+        What else `LooksSection` has; None takes the default.
 
     Raises
     ------
@@ -204,72 +399,106 @@ def write(
         If there are fewer than two entries, they would end at different horizons, or a name, an option or a number
         cannot be used.
     """
-    drafts = [_read_entry(text, algorithm, preset) for text in names]
-    entries = [draft.resolve(task) for draft in drafts]
-    if len(entries) < 2:
-        raise OptionError(f"{len(entries)} of two or more entries: write each as 'MODEL NAME=VALUE ...'")
-    lengths = {entry.label: epochs or entry.task.epochs(entry.algorithm.name) for entry in entries}
-    if len(set(lengths.values())) > 1:
-        steps = entries[0].task.file.protocol.interactions
-        ends = ", ".join(f"'{label}' at {count * steps} steps" for label, count in lengths.items())
-        raise OptionError(f"the entries end at different horizons: {ends}; give --epochs for all of them")
-    ranking = entries[0].task.file.ranking
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    looks |= {"written": now, "first_seed": first_seed}
     try:
-        file = PlanFile(
+        file = StudyFile(
             format_version=1,
             name=name,
-            written=now,
-            task=task,
-            epochs=next(iter(lengths.values())),
-            rule="times",
-            epsilons=ranking.epsilons,
-            thresholds=ranking.thresholds,
-            alpha=alpha,
-            spending=spending,
-            looks=list(looks),
-            margin=margin,
-            first_seed=FIRST_SEED if first_seed is None else first_seed,
-            reason=reason,
-            entries=[draft.planned(task, entry) for draft, entry in zip(drafts, entries)],
+            summary=question_of([]),
+            looks=LooksSection(**{key: value for key, value in looks.items() if value is not None}),
+            entries=[_written(text, task, algorithm, preset) for text in entries],
         )
     except pydantic.ValidationError as error:
-        raise OptionError("; ".join(options.file_problems(error, PlanFile))) from None
-    study = StudyWithLooks(file, "the plan", runs)
+        raise OptionError("; ".join(options.file_problems(error, StudyFile))) from None
+    study = StudyWithLooks(Study(file, "the study"), runs)
     while first_seed is None and study.trained_before():
-        moved = file.model_copy(update={"first_seed": _next_block(study.file)})
-        study = StudyWithLooks(moved, "the plan", runs)
+        moved = study.looks.model_copy(update={"first_seed": study._next_block()})
+        study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
+    study.file = study.file.model_copy(update={"summary": question_of(list(study.entries))})
     return study
 
 
-@dataclass(frozen=True)
-class _WrittenEntry:
-    """An entry of a new plan as it was written."""
+def _written(text: str, task: str, algorithm: str | None, preset: str | None) -> EntriesSection:
+    """Read the notation of an entry of a new study; what the text leaves open is as given beside it."""
+    entry = notation.parse_entry(text)
+    return EntriesSection(
+        task=task,
+        model=entry.model,
+        algorithm=entry.algorithm or algorithm,
+        preset=entry.preset or preset,
+        options={each.full_name: each.value for each in entry.settings},
+    )
 
-    algorithm: str | None
-    model: str
-    preset: str | None
-    options: dict[str, Any]
 
-    def resolve(self, task: str, preset: bool = True) -> Entry:
-        """Build the entry, or the one that these options make without the preset."""
-        settings = [setting("", word, value) for word, value in self.options.items()]
-        return resolve(task, self.model, self.algorithm, settings, self.preset if preset else None)
+def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
+    """Return a study with every entry by itself, its hash, and all that is compared written out; and its entries.
 
-    def planned(self, task: str, entry: Entry) -> PlannedEntry:
-        """Return what the plan says of the entry: a preset file's values and record, so that it can change later."""
-        named, values = self.preset, self.options
-        if named is not None and named.endswith(".toml"):
-            usual = replace(self, algorithm=entry.algorithm.name).resolve(task, preset=False)
-            named, values = None, {**values, **_difference(entry, usual)}
-        return PlannedEntry(
-            model=entry.model.name,
-            algorithm=entry.algorithm.name,
-            preset=named,
-            options=values,
-            hash=entry.hash,
-            tuning=None if entry.tuning is None or named is not None else EntryTuning(**entry.tuning),
+    Raises
+    ------
+    QrlSuiteError
+        If an entry is not the one that was fixed, there are fewer than two, two are the same, or they have no common
+        task or horizon.
+    """
+    members, source = study.members(), study.source
+    if len(members) < 2:
+        labels = [member.table.name or member.entry.label for member in members]
+        raise OptionError(f"{source}: entries = {labels}: a study with looks needs two or more entries")
+    for index, (table, entry) in enumerate((member.table, member.entry) for member in members):
+        if table.hash not in (None, entry.hash):
+            raise OptionError(
+                f"{source}: entries.{index}.hash is '{table.hash}', these options make '{entry.hash}' here: it is "
+                "another entry than was fixed; write a new study with `qrlsuite study new`"
+            )
+        for before, other in enumerate(members[:index]):
+            if other.entry.hash == entry.hash:
+                raise OptionError(
+                    f"{source}: entries.{before} and entries.{index} are the same, '{entry.label}': leave one out"
+                )
+    looks = study.file.looks or LooksSection()
+    entries = [member.entry for member in members]
+    if len(tasks := sorted({entry.task.hash: entry.task.name for entry in entries}.values())) > 1:
+        raise OptionError(f"{source}: entries of {' and '.join(tasks)}: a study with looks has one task")
+    fixed: dict[str, Any] = {"epochs": looks.epochs or _common_epochs(source, entries)}
+    if looks.epsilons is None and looks.thresholds is None:
+        ranking = entries[0].task.file.ranking
+        fixed |= {"epsilons": ranking.epsilons, "thresholds": ranking.thresholds}
+    alone = Counter(member.group for member in members)
+    tables = [_fixed_table(member, named=alone[member.group] == 1) for member in members]
+    return study.file.model_copy(update={"looks": looks.model_copy(update=fixed), "entries": tables}), members
+
+
+def _common_epochs(source: str, entries: Sequence[Entry]) -> int:
+    lengths = {entry.label: entry.task.epochs(entry.algorithm.name) for entry in entries}
+    if len(set(lengths.values())) > 1:
+        steps = entries[0].task.file.protocol.interactions
+        ends = ", ".join(f"'{label}' at {count * steps} steps" for label, count in lengths.items())
+        raise OptionError(
+            f"{source}: the entries end at different horizons: {ends}; give epochs (--epochs) for all of them"
         )
+    return next(iter(lengths.values()))
+
+
+def _fixed_table(member: Member, named: bool) -> EntriesSection:
+    """Return what the study says of an entry: a preset file's values and record, so that the file can change later."""
+    table, entry = member.table, member.entry
+    if table.hash is not None:
+        return table
+    preset, values, tuning = table.preset, table.options, entry.tuning
+    if preset is not None and preset.endswith(".toml"):
+        settings = [setting("options", word, value) for word, value in values.items()]
+        usual = resolve(str(table.task), str(table.model), entry.algorithm.name, settings)
+        preset, values = None, {**values, **_difference(entry, usual)}
+    return table.model_copy(
+        update={
+            "name": table.name if named else None,
+            "algorithm": entry.algorithm.name,
+            "preset": preset,
+            "options": values,
+            "hash": entry.hash,
+            "tuning": None if tuning is None or preset is not None else EntryTuning(**tuning),
+        }
+    )
 
 
 def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
@@ -286,308 +515,28 @@ def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
     }
 
 
-def _read_entry(text: str, algorithm: str | None, preset: str | None) -> _WrittenEntry:
-    """Read an entry's notation; what the text leaves open is as given beside it."""
-    written = notation.parse_entry(text)
-    values = {each.full_name: each.value for each in written.settings}
-    return _WrittenEntry(
-        written.algorithm or algorithm, written.model, written.preset or preset or None, values
-    )
+def _content(file: StudyFile) -> dict[str, Any]:
+    """Return all that decides, in the layout of version 0.1, whose studies keep their hash."""
+    looks = (file.looks or LooksSection()).model_dump(mode="json")
+    if not looks["questions"]:
+        del looks["questions"]
+    keys = {"model", "algorithm", "preset", "options", "hash", "name", "tuning"}
+    entries = [table.model_dump(mode="json", include=keys) for table in file.entries]
+    for entry in entries:
+        for key in ("name", "tuning"):
+            if entry[key] is None:
+                del entry[key]
+    return {"format_version": 1, "name": file.name, "task": file.entries[0].task, **looks, "entries": entries}
 
 
-def _next_block(file: PlanFile) -> int:
-    return file.first_seed + max(1000, len(file.block))
+def _hash(file: StudyFile) -> str:
+    return digest(_content(file))
 
 
-class StudyWithLooks:
-    """A decision plan with its results folder.
-
-    Parameters
-    ----------
-    file:
-        The plan.
-    source:
-        Where it came from, for messages.
-    runs:
-        The results folder.
-
-    Attributes
-    ----------
-    entries:
-        The entries by the name that verdicts use, in the plan's order.
-    plan:
-        What is tested when.
-    questions:
-        For each of the plan's pairs the question that it answers; empty where the plan asks none.
-    folder:
-        Where its results are, or will be.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a name, an option or a number of the plan cannot be used, or an entry is no longer the one that was planned.
-    """
-
-    def __init__(self, file: PlanFile, source: str, runs: Path) -> None:
-        self.file, self.source, self.runs = file, source, runs
-        self.folder = runs / FOLDER / file.name
-        planned: list[Entry] = []
-        for index, each in enumerate(file.entries):
-            settings = [setting("options", word, value) for word, value in each.options.items()]
-            try:
-                entry = resolve(file.task, each.model, each.algorithm, settings, each.preset)
-            except QrlSuiteError as error:
-                raise type(error)(f"{source}: entries.{index}: {error}") from None
-            if entry.hash != each.hash:
-                raise OptionError(
-                    f"{source}: entries.{index}.hash is '{each.hash}', these options make '{entry.hash}' here: it is "
-                    "another entry than was planned; write a new plan with `qrlsuite decide new`"
-                )
-            for before, other in enumerate(planned):
-                if other.hash == entry.hash:
-                    raise OptionError(
-                        f"{source}: entries.{before} and entries.{index} are the same, '{entry.label}': leave one out"
-                    )
-            tuning = entry.tuning if each.tuning is None else each.tuning.plain()
-            planned.append(replace(entry, plan=file.hash, tuning=tuning))
-        names = tuple(each.name or name for each, name in zip(file.entries, _names(planned)))
-        self.entries = dict(zip(names, planned))
-        self.questions = [asked.text for asked in file.questions for _ in asked.pairs]
-        pairs = tuple(pair for asked in file.questions for pair in asked.pairs)
-        grid = Grid.relative if file.epsilons is not None else Grid.absolute
-        try:
-            self.plan = DecisionPlan(
-                names,
-                tuple(file.looks),
-                file.alpha,
-                file.spending,  # type: ignore[arg-type]  # checked there
-                file.margin,
-                pairs=pairs or None,
-                reason=file.reason,
-                rule=file.rule,
-            )
-            self.grid = grid(file.epsilons or file.thresholds or [], [0.5])  # rule `times` needs no delta
-        except OptionError as error:
-            raise OptionError(f"{source}: {error}") from None
-        self._check_block()
-
-    def _check_block(self) -> None:
-        """Refuse seeds that belong to others."""
-        block = self.file.block
-        protocol = max(entry.task.file.protocol.seeds for entry in self.entries.values())
-        if block.start < protocol:
-            raise OptionError(
-                f"{self.source}: first_seed = {block.start}: seeds 0:{protocol} are the protocol's, which may have "
-                f"been looked at; begin at {protocol} or later"
-            )
-        if block.stop > TUNING_SEEDS:
-            raise OptionError(
-                f"{self.source}: first_seed = {block.start}: seeds from {TUNING_SEEDS} up are those of tuning; the "
-                f"block has to end below"
-            )
-
-    @property
-    def begun(self) -> bool:
-        """Whether a seed of the plan was begun: from then on it is fixed."""
-        return any(self.folder.glob("*/*/seed-*"))
-
-    def check(self) -> None:
-        """Refuse a plan that was changed after it began, and seeds that were trained outside of it.
-
-        Raises
-        ------
-        OptionError
-            If the plan was changed, or seeds of its block were trained before it began.
-        StoreError
-            If its folder holds seeds that the plan did not train.
-        """
-        if not self.begun:
-            for name, seeds, path in self.trained_before():
-                raise OptionError(
-                    f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a plan "
-                    f"needs seeds that nobody has seen; with first_seed = {_next_block(self.file)} it has others"
-                )
-            return
-        kept = load(self.folder / "plan.toml")
-        if kept.hash != self.file.hash:
-            before, after = kept.model_dump(mode="json"), self.file.model_dump(mode="json")
-            keys = [key for key in before if before[key] != after[key]]
-            changes = [f"{key} (was {_short(before[key])}, is {_short(after[key])})" for key in keys]
-            raise OptionError(
-                f"{self.source}: {', '.join(changes)} changed after the plan began. End this plan and write "
-                f"a new one with other seeds (the plan as it began: {self.folder / 'plan.toml'})"
-            )
-        for name, entry in self.entries.items():
-            for seed, record in self._records(entry):
-                if record.get("plan") != self.file.hash:
-                    raise StoreError(
-                        f"{EntryStore.find(self.folder, entry).seed(seed).path}: seed {seed} of '{name}' was not "
-                        f"trained by plan {self.file.hash}; delete that folder, and the plan trains it"
-                    )
-
-    def trained_before(self) -> list[tuple[str, list[int], Path]]:
-        """Return seeds of the block that were trained elsewhere below the results folder: entry, seeds, folder."""
-        others = [self.runs, self.runs / TUNING]
-        plans = self.runs / FOLDER
-        if plans.is_dir():
-            others += sorted(path for path in plans.iterdir() if path.is_dir() and path != self.folder)
-        trained = []
-        for name, entry in self.entries.items():
-            for other in others:
-                path = other / entry.task.name / entry.name
-                if path.is_dir():
-                    seeds = [seed for seed in EntryStore(path).seeds() if seed in self.file.block]
-                    trained += [(name, seeds, path)] if seeds else []
-        return trained
-
-    def begin(self) -> None:
-        """Keep the plan as it is now, before its first seed.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `check`; or if the plan was ended, or the folder cannot be written.
-        """
-        self.check()
-        if (when := self.ended) is not None:
-            raise OptionError(
-                f"{self.source}: the plan was ended on {when}; a new one needs a name of its own"
-            )
-        if not self.begun:
-            write_atomically(self.folder / "plan.toml", dumps(self.file).encode())
-            if self.begun_at is None:
-                append(self._log, json_line({"begun": _now(), "plan": self.file.hash}))
-
-    def end(self) -> None:
-        """Close the plan for good, with its open pairs open.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `check`; or if it has not begun, was ended before, or has nothing open.
-        """
-        self.check()
-        if not self.begun:
-            raise OptionError(f"{self.source}: the plan has not begun, so there is nothing to end")
-        if (when := self.ended) is not None:
-            raise OptionError(f"{self.source}: the plan was ended on {when} already")
-        if self.decision().finished:
-            raise OptionError(f"{self.source}: every pair is closed, so there is nothing to end")
-        append(self._log, json_line({"ended": _now()}))
-
-    @property
-    def _log(self) -> Path:
-        return self.folder / "looks.jsonl"
-
-    @property
-    def begun_at(self) -> str | None:
-        """When its first seed was begun, by the log; None if it was not, or by a version that did not note it."""
-        lines = (line for line in read_lines(self._log) if "begun" in line)
-        return next((str(line["begun"]) for line in lines if line["plan"] == self.file.hash), None)
-
-    @property
-    def ended(self) -> str | None:
-        """When the plan was ended before all was decided; None if it was not."""
-        return next((str(line["ended"]) for line in read_lines(self._log) if "ended" in line), None)
-
-    @property
-    def taken(self) -> dict[int, str]:
-        """When each look was taken, by its number of seeds."""
-        times: dict[int, str] = {}
-        for line in read_lines(self._log):
-            if "look" in line:
-                times.setdefault(line["look"], str(line["time"]))
-        return times
-
-    def _records(self, entry: Entry) -> Iterator[tuple[int, Mapping[str, Any]]]:
-        store = EntryStore.find(self.folder, entry)
-        for seed in store.seeds() if store.path.is_dir() else []:
-            record = store.seed(seed).record() if seed in self.file.block else None
-            if record is not None:
-                yield seed, record
-
-    def seeds(self, name: str) -> list[int]:
-        """Return the seeds of an entry that have finished, from the block's first on without a gap."""
-        entry = self.entries[name]
-        block = self.file.block
-        done = EntryStore.find(self.folder, entry).finished(block, self.file.epochs)
-        gap = next((seed for seed in block if seed not in done), block.stop)
-        return list(range(block.start, gap))
-
-    def hours(self, name: str) -> float:
-        """Return the core-hours that an entry's seeds have taken so far, unfinished ones too."""
-        store = EntryStore.find(self.folder, self.entries[name])
-        if not store.path.is_dir():
-            return 0.0
-        return sum(store.seed(seed).seconds() for seed in store.seeds()) / 3600
-
-    def curves(self) -> dict[str, LearningCurves]:
-        """Return the learning curves of the finished seeds; entries without any are absent."""
-        curves = {}
-        for name, entry in self.entries.items():
-            store = EntryStore.find(self.folder, entry)
-            values = [store.seed(seed).read().curve[: self.file.epochs] for seed in self.seeds(name)]
-            if values:
-                steps = entry.task.file.protocol.interactions
-                curves[name] = LearningCurves(np.stack(values), steps, name)
-        return curves
-
-    def decision(self) -> Decision:
-        """Return what is decided by the plan and the curves so far; writes nothing.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `check`; or if a look finds something else than it did when it was taken.
-        """
-        self.check()
-        result = decide(self.plan, self.curves(), self.grid)
-        for line in _lines(self.plan, result):
-            for before in read_lines(self._log):
-                if before.get("look") != line["look"]:
-                    continue
-                for now, then in zip(line["pairs"], before.get("pairs", [])):
-                    if now["decided"] != then.get("decided"):
-                        raise StoreError(
-                            f"{self._log}: the look at {line['look']} seeds found '{then.get('decided')}' for "
-                            f"{' and '.join(now['pair'])}, and the curves there now give '{now['decided']}': results "
-                            "were changed since; restore them"
-                        )
-        return result
-
-    def look(self) -> Decision:
-        """Take every look for which the seeds are there, and note when; returns what is decided.
-
-        Raises
-        ------
-        QrlSuiteError
-            As `decision`, or if the log cannot be written.
-        """
-        result = self.decision()
-        taken = self.taken
-        for line in _lines(self.plan, result):
-            if line["look"] not in taken:
-                append(self._log, json_line({"time": _now(), "plan": self.file.hash, **line}))
-        return result
-
-    def wanted(self, decision: Decision) -> dict[str, list[int]]:
-        """Return the seeds that each open entry needs for the next look, those that are there included."""
-        first = self.file.first_seed
-        return {name: list(range(first, first + count)) for name, count in decision.wanted.items()}
-
-    def missing(self, decision: Decision) -> dict[str, int]:
-        """Return how many seeds each open entry lacks for the next look; none where it has them."""
-        return {
-            name: count - have
-            for name, count in decision.wanted.items()
-            if (have := len(self.seeds(name))) < count
-        }
-
-
-def _lines(plan: DecisionPlan, decision: Decision) -> list[dict[str, Any]]:
+def _lines(design: DecisionPlan, decision: Decision) -> list[dict[str, Any]]:
     """Return what each look found: for every pair that was open, its p and how it was closed."""
     lines = []
-    for index, look in enumerate(plan.looks):
+    for index, look in enumerate(design.looks):
         pairs = [
             {
                 "pair": [pair.first, pair.second],
@@ -611,6 +560,12 @@ def _names(entries: Sequence[Entry]) -> list[str]:
         chosen = (names[index] for names in (short, labels) if Counter(names)[names[index]] == 1)
         result.append(next(chosen, entry.name))
     return result
+
+
+def _first(log: Sequence[Mapping[str, Any]], key: str, hash_: str | None = None) -> str | None:
+    """Return when the log first says that something happened, to the study of a hash where one is given."""
+    lines = (line for line in log if key in line and hash_ in (None, line.get("plan")))
+    return next((str(line[key]) for line in lines), None)
 
 
 def _short(value: Any) -> str:

@@ -1,32 +1,31 @@
-"""What a decision plan has come to: run it, and show it on a screen, on a page and as plain values."""
+"""What a study with looks has come to, on a screen, on a page and as plain values."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.engine import missing
-from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted, hours_range, hours_text, steps_text
 from qrlsuite.statistics.grid import Grid
 from qrlsuite.statistics.planning import runs_at_difference
-from qrlsuite.statistics.sequential import Decided, Decision, PairDecision
+from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
 from qrlsuite.studies import looks
-from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.looks import StudyState, StudyWithLooks
+from qrlsuite.studies.study import load
 
 Pair = TypeVar("Pair")
 """What is known of a pair: its decision, or more."""
@@ -37,31 +36,29 @@ Hours = tuple[float, float]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StudyOutcome(Shown):
-    """A plan with what it has decided so far.
+    """A study with looks and what it has decided so far.
 
     Attributes
     ----------
-    study:
-        The plan in its results folder.
-    decision:
-        Every pair with its verdict, p at each look, difference and interval.
+    state:
+        What its folder holds; its `decision` has every pair with its verdict, p at each look, difference and interval.
     submitted:
         One line for each entry whose seeds were handed to a queue.
     """
 
     study: StudyWithLooks
-    decision: Decision
+    state: StudyState
     submitted: tuple[str, ...] = ()
 
     @property
     def pairs(self) -> tuple[PairDecision, ...]:
-        """The planned pairs; `verdict` says in words what was decided of each."""
-        return self.decision.pairs
+        """The pairs that are compared; `verdict` says in words what was decided of each."""
+        return self.state.decision.pairs
 
     @property
     def finished(self) -> bool:
         """Whether every pair is decided or its last look was taken."""
-        return self.decision.finished
+        return self.state.decision.finished
 
     @property
     def looked(self) -> dict[str, int]:
@@ -80,29 +77,53 @@ class StudyOutcome(Shown):
         looked = self.looked
         return {
             name: mean_time(replace(curves, values=curves.values[: looked[name]]), self.study.grid)
-            for name, curves in self.study.curves().items()
+            for name, curves in self.state.curves.items()
             if looked[name]
         }
 
+    def hours(self, seeds: Mapping[str, int]) -> Hours | None:
+        """Return the core-hours of seeds of several entries together; None where one is unknown.
+
+        They are measured on an entry's own seeds, else estimated.
+        """
+        known = [self._hours(name, count) for name, count in seeds.items()]
+        if None in known:
+            return None
+        low, high = (sum(each[end] for each in known if each is not None) for end in (0, 1))
+        return low, high
+
+    def _hours(self, name: str, seeds: int) -> Hours | None:
+        if done := len(self.state.seeds[name]):
+            own = seeds * self.state.hours[name] / done
+            return own, own
+        estimate = speed.known(self.study.folder, self.study.runs).estimate(self.study.entries[name], None)
+        span = estimate.range(abs(seeds) * self.study.epochs)
+        if span is None:
+            return None
+        low, high = (math.copysign(end / 3600, seeds) for end in span)
+        return low, high
+
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
-        study, decision = self.study, self.decision
-        missing = study.missing(decision)
+        study, state, decision = self.study, self.state, self.state.decision
         protocol = {name: entry.task.file.protocol.seeds for name, entry in study.entries.items()}
-        used = {name: len(study.seeds(name)) for name in study.entries}
+        used = {name: len(state.seeds[name]) for name in study.entries}
         closed = [name for name in study.entries if name not in decision.wanted]
         saved = {name: protocol[name] - used[name] for name in closed if used[name]}
         times = self.mean_times()
         return {
-            "plan": study.file.name,
-            "hash": study.file.hash,
+            "name": study.name,
+            "summary": study.file.summary,
+            "hash": study.hash,
+            "task": study.task,
+            "looks": study.looks.model_dump(mode="json") | {"levels": self.levels()},
+            "begun": state.begun,
             "finished": decision.finished,
-            "begun_at": study.begun_at,
-            "ended": study.ended,
-            "looks_taken": study.taken,
-            "reason": study.file.reason or None,
+            "begun_at": state.begun_at,
+            "ended": state.ended,
+            "looks_taken": dict(state.taken),
             "pairs": [
-                {"question": asked or None, **_pair_as_dict(study, decision, pair)}
+                {"question": asked or None, **self._pair(pair)}
                 for asked, pairs in by_question(study, decision.pairs)
                 for pair in pairs
             ],
@@ -111,18 +132,60 @@ class StudyOutcome(Shown):
                     "name": name,
                     "entry": entry.name,
                     "seeds": used[name],
-                    "core_hours": study.hours(name),
+                    "core_hours": state.hours[name],
                     "mean_time": times[name].mean if name in times else None,
                     "mean_time_interval": list(times[name].interval) if name in times else None,
                     "wanted": decision.wanted.get(name),
-                    "missing": missing.get(name, 0),
+                    "missing": state.missing.get(name, 0),
                 }
                 for name, entry in study.entries.items()
             ],
-            "next_core_hours": total_hours(study, missing),
+            "next_core_hours": self.hours(state.missing),
             "protocol_seeds": sum(protocol.values()),
             "seeds_saved": sum(saved.values()),
-            "core_hours_saved": total_hours(study, saved),
+            "core_hours_saved": self.hours(saved),
+            "core_hours_at_most": self.hours(dict.fromkeys(study.entries, study.design.looks[-1])),
+            "submitted": list(self.submitted),
+        }
+
+    def levels(self) -> list[dict[str, Any]]:
+        """Return at which p a pair differs at each look while all are open, and is equal by each one-sided test."""
+        design = self.study.design
+        return [
+            {
+                "seeds": seeds,
+                "differs": design.level(look, len(design.family)),
+                "equal": design.equal_level(look),
+            }
+            for look, seeds in enumerate(design.looks)
+        ]
+
+    def _pair(self, pair: PairDecision) -> dict[str, Any]:
+        decision = self.state.decision
+        needs = None
+        if pair.decided is None:
+            look = len(pair.p)
+            undecided = sum(not each.differs for each in decision.pairs)
+            needs = {
+                "seeds": self.study.design.looks[look],
+                "level": self.study.design.level(look, undecided),
+                "seeds_at_this_difference": runs_at_difference(decision, pair),
+            }
+        finite = _finite(pair)
+        return {
+            "first": pair.first,
+            "second": pair.second,
+            "verdict": pair.verdict,
+            "decided": None if pair.decided is None else str(pair.decided),
+            "seeds": pair.n_runs,
+            "p": list(pair.p),
+            "levels": list(pair.levels),
+            "difference": pair.difference if finite else None,
+            "interval": list(pair.interval) if finite else None,
+            "leading_threshold": self.study.grid.thresholds[pair.leading] if finite else None,
+            "leading_difference": _number(pair.leading_difference) if finite else None,
+            "leading_interval": [_number(end) for end in pair.leading_interval] if finite else None,
+            "needs": needs,
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -130,19 +193,19 @@ class StudyOutcome(Shown):
         yield from self.parts()
 
     def parts(self) -> Iterator[Text | Table]:
-        """Return what a screen shows: a question, a table of pairs, and lines about looks, needs and cost."""
-        study, decision, facts = self.study, self.decision, self.as_dict()
-        yield Text(f"{study.file.name}: {question(study)}", style="bold")
-        if not study.begun:
-            yield Text("not begun")
-        for asked, pairs in by_question(study, list(zip(decision.pairs, facts["pairs"]))):
+        """Return what a screen shows: what is asked; the design while it can be changed, then pairs and needs; cost."""
+        study, state, facts = self.study, self.state, self.as_dict()
+        yield Text(f"{study.name}: {study.file.summary}", style="bold")
+        if not state.begun:
+            yield from map(Text, self._design())
+        for asked, pairs in by_question(study, list(zip(self.pairs, facts["pairs"]))):
             if asked:
                 yield Text(asked, style="bold")
-            yield _table(study, pairs)
-        if any(pair.p for pair in decision.pairs):
+            yield _table(self, pairs)
+        if any(pair.p for pair in self.pairs):
             yield Text(
                 "B against A: how many more steps B needs, on average over the thresholds (+52% = B is slower), with "
-                f"a repeated confidence interval that holds at every look ({100 * (1 - study.file.alpha):g} percent "
+                f"a repeated confidence interval that holds at every look ({100 * (1 - study.looks.alpha):g} percent "
                 "for all pairs together). Each threshold is tested separately: where this interval contains 0, the "
                 "threshold that decided follows with its own. An early stop overstates the difference."
             )
@@ -150,137 +213,81 @@ class StudyOutcome(Shown):
             yield Text(
                 "steps below threshold: of a run of the entry, mean over seeds and thresholds, at its last look"
             )
-        if study.begun_at:
-            yield Text(f"first seed begun {study.begun_at}")
+        if state.begun_at:
+            yield Text(f"first seed begun {state.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
         if note := reason_note(study):
             yield Text(note)
-        if study.ended:
-            yield Text(f"ended {study.ended}: open pairs stay open")
-        elif not decision.finished:
+        yield from map(Text, self._cost(facts))
+
+    def _design(self) -> Iterator[str]:
+        """Say what is fixed when the first seed is trained."""
+        study, looks = self.study, self.study.looks
+        family = len(study.design.family)
+        written = f"written {looks.written:%Y-%m-%d %H:%M} UTC, " if looks.written else ""
+        yield f"{written}hash {study.hash}, not begun: it can be edited until its first seed begins"
+        first = next(iter(study.entries.values()))
+        yield f"task {study.task}, {study.epochs} epochs ({study.epochs * first.task.file.protocol.interactions} steps)"
+        yield (
+            f"seeds {format_seeds(looks.block)}; any false difference with probability {looks.alpha:g} "
+            f"({counted(family, 'pair')}, {looks.spending} spending); equal within {100 * looks.margin:g} percent"
+        )
+        for level in self.levels():
+            equal = "" if level["equal"] is None else f"; equal at p <= {level['equal']:.4f} on both sides"
+            yield (
+                f"look at {level['seeds']} seeds: different at p <= {level['differs']:.4f}"
+                + (" while all pairs are open" if family > 1 else "")
+                + equal
+            )
+
+    def _cost(self, facts: Mapping[str, Any]) -> Iterator[str]:
+        """Say what was used and saved, and what comes next."""
+        if not self.state.begun:
+            most = facts["core_hours_at_most"]
+            cost = (
+                "unknown before a first epoch is trained"
+                if most is None
+                else f"{hours_range(*most)} core-hours"
+            )
+            yield f"at most {len(self.study.entries) * self.study.design.looks[-1]} seeds: {cost}"
+            return
+        if self.state.ended:
+            yield f"ended {self.state.ended}: open pairs stay open"
+        elif not self.finished:
             lacking = sum(each["missing"] for each in facts["entries"])
-            cost = _about(facts["next_core_hours"])
-            yield Text(f"next look: {counted(lacking, 'seed')} missing{cost}")
+            yield f"next look: {counted(lacking, 'seed')} missing{_about(facts['next_core_hours'])}"
         used, spent = (sum(each[key] for each in facts["entries"]) for key in ("seeds", "core_hours"))
         saved, hours = facts["seeds_saved"], facts["core_hours_saved"]
         more = hours and (min(map(abs, hours)), max(map(abs, hours)))
-        yield Text(
+        yield (
             f"used {counted(used, 'seed')}, {hours_text(spent)} core-hours; the protocol has "
             f"{facts['protocol_seeds']} seeds: {abs(saved)} {'saved' if saved >= 0 else 'more than that'} on "
             f"entries that are decided{_about(more) if saved else ''}"
         )
 
 
-def run(
-    study: StudyWithLooks,
-    where: Where,
-    quiet: bool = False,
-    again: Literal["command", "call"] = "command",
-    looked: Callable[[StudyOutcome], None] | None = None,
-) -> StudyOutcome:
-    """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
-
-    Parameters
-    ----------
-    where:
-        The engine.
-    quiet, again:
-        As for `RunDisplay`.
-    looked:
-        Called after each look.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the plan cannot be used or go on, or training failed; finished epochs are kept.
-    KeyboardInterrupt
-        When it was interrupted and every worker has saved and ended.
-    """
-    missing.require_same_code(study.folder, list(study.entries.values()), where)
-    study.begin()
-    submitted: list[str] = []
-    decision = study.look()
-    while wanted := study.wanted(decision):
-        for name, seeds in wanted.items():
-            work = missing.find(study.folder, study.entries[name], where, seeds, study.file.epochs)
-            if not work.groups and not work.busy:
-                continue
-            outcome = missing.train(work, where, RunDisplay(work, where.workers, quiet, again))
-            submitted += [outcome.submitted] if outcome.submitted is not None else []
-        decision = study.look()
-        if study.missing(decision) and study.wanted(decision) == wanted:
-            break  # a queue or another process has the seeds
-        if looked is not None:
-            looked(StudyOutcome(study, decision))
-    return StudyOutcome(study, decision, tuple(submitted))
-
-
-def read(path: Path, runs: Path) -> StudyOutcome:
-    """Return what a plan has decided so far; trains and writes nothing.
-
-    Raises
-    ------
-    QrlSuiteError
-        If the plan or its results cannot be used.
-    """
-    study = StudyWithLooks(looks.load(path), str(path), runs)
-    return StudyOutcome(study, study.decision())
-
-
 def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome], list[str]]:
-    """Return what the plans that have begun in a results folder have decided, and a line for each that is unreadable.
+    """Return what the studies that have begun in a results folder have decided, and a line for each unreadable one.
 
     Parameters
     ----------
     tasks:
-        Only plans of these tasks; all where empty.
+        Only studies of these tasks; all where empty.
     """
     outcomes, refused = [], []
-    for path in sorted((runs / looks.FOLDER).glob("*/plan.toml")):
+    for path in sorted((runs / looks.FOLDER).glob(f"*/{looks.FILE}")):
         try:
-            outcome = read(path, runs)
+            study = StudyWithLooks(load(str(path)), runs)
+            if study.begun and (not tasks or study.task in tasks):
+                outcomes.append(StudyOutcome(study, study.read()))
         except QrlSuiteError as error:
             refused.append(str(error))
-            continue
-        task = next(iter(outcome.study.entries.values())).task.name
-        if outcome.study.begun and (not tasks or task in tasks):
-            outcomes.append(outcome)
     return outcomes, refused
 
 
-def hours(study: StudyWithLooks, name: str, seeds: int) -> Hours | None:
-    """Return the core-hours of so many seeds of an entry: measured on its own, else estimated; None where unknown."""
-    done = len(study.seeds(name))
-    if done:
-        own = seeds * study.hours(name) / done
-        return own, own
-    estimate = speed.known(study.folder, study.runs).estimate(study.entries[name], None)
-    span = estimate.range(abs(seeds) * study.file.epochs)
-    if span is None:
-        return None
-    low, high = (math.copysign(end / 3600, seeds) for end in span)
-    return low, high
-
-
-def total_hours(study: StudyWithLooks, seeds: Mapping[str, int]) -> Hours | None:
-    """Return the core-hours of seeds of several entries together; None where one is unknown."""
-    known = [each for name, count in seeds.items() if (each := hours(study, name, count)) is not None]
-    if len(known) < len(seeds):
-        return None
-    return sum(low for low, _ in known), sum(high for _, high in known)
-
-
-def question(study: StudyWithLooks) -> str:
-    """Return what a plan asks: `which needs fewer steps, A, B or C?`, or the number of its questions."""
-    if study.questions:
-        return f"{counted(len(study.file.questions), 'question')}, {counted(len(study.plan.family), 'pair')}"
-    names = list(study.entries)
-    return f"which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
-
-
 def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str, list[Pair]]]:
-    """Return each question of a plan with what is known of its pairs, in order; an empty text where none is asked."""
+    """Return each question of a study with what is known of its pairs, in order; an empty text where none is asked."""
     texts = study.questions or [""] * len(pairs)
     return [
         (text, [pair for _, pair in group])
@@ -289,12 +296,12 @@ def by_question(study: StudyWithLooks, pairs: Sequence[Pair]) -> list[tuple[str,
 
 
 def reason_note(study: StudyWithLooks) -> str:
-    """Return a warning with the reason given where a plan looks below 20 seeds; else an empty text."""
-    if study.plan.looks[0] >= 20:
+    """Return a warning with the reason given where a study looks below 20 seeds; else an empty text."""
+    if study.design.looks[0] >= 20:
         return ""
     return (
         "NOTE: it looks below 20 seeds, where rare failures that have not occurred yet decide too much. Reason "
-        f"given: {study.file.reason}"
+        f"given: {study.looks.reason}"
     )
 
 
@@ -329,15 +336,15 @@ def _leading_text(pair: PairDecision, grid: Grid) -> str:
     return f"; at {grid.thresholds[pair.leading]:g}: {percent(pair.leading_difference)}, {ends}"
 
 
-def needs_text(study: StudyWithLooks, needs: Mapping[str, Any] | None) -> str:
+def needs_text(outcome: StudyOutcome, needs: Mapping[str, Any] | None) -> str:
     """Say what an open pair needs, as `as_dict` gives it."""
-    if needs is None or study.ended:
+    if needs is None or outcome.state.ended:
         return ""
     requirement = f"p <= {needs['level']:.2g} at {needs['seeds']} seeds"
     about = needs["seeds_at_this_difference"]
     if about is None:
         return requirement
-    last = study.plan.looks[-1]
+    last = outcome.study.design.looks[-1]
     seeds = f"about {about}" if about <= 10 * last else f"over {10 * last}"
     return f"{requirement}; {seeds} if the difference stays as it is now"
 
@@ -354,36 +361,7 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _pair_as_dict(study: StudyWithLooks, decision: Decision, pair: PairDecision) -> dict[str, Any]:
-    plan = decision.plan
-    needs = None
-    if pair.decided is None:
-        look = len(pair.p)
-        undecided = sum(not each.differs for each in decision.pairs)
-        needs = {
-            "seeds": plan.looks[look],
-            "level": plan.level(look, undecided),
-            "seeds_at_this_difference": runs_at_difference(decision, pair),
-        }
-    finite = _finite(pair)
-    return {
-        "first": pair.first,
-        "second": pair.second,
-        "verdict": pair.verdict,
-        "decided": None if pair.decided is None else str(pair.decided),
-        "seeds": pair.n_runs,
-        "p": list(pair.p),
-        "levels": list(pair.levels),
-        "difference": pair.difference if finite else None,
-        "interval": list(pair.interval) if finite else None,
-        "leading_threshold": study.grid.thresholds[pair.leading] if finite else None,
-        "leading_difference": _number(pair.leading_difference) if finite else None,
-        "leading_interval": [_number(end) for end in pair.leading_interval] if finite else None,
-        "needs": needs,
-    }
-
-
-def _table(study: StudyWithLooks, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
+def _table(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
     for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
         table.add_column(column, overflow="fold")
@@ -392,9 +370,9 @@ def _table(study: StudyWithLooks, pairs: Sequence[tuple[PairDecision, Mapping[st
             versus(pair),
             pair.verdict,
             str(pair.n_runs),
-            *difference_text(pair, study.grid),
+            *difference_text(pair, outcome.study.grid),
             f"{pair.p[-1]:.2g}" if pair.p else "",
-            needs_text(study, facts["needs"]),
+            needs_text(outcome, facts["needs"]),
         )
         table.add_row(*(Text(cell) for cell in cells))
     return table

@@ -1,4 +1,4 @@
-"""Runs a study: finds missing seeds, trains the cheapest entry first, keeps to a time budget."""
+"""Runs a study: finds missing seeds, trains the cheapest entry first, keeps to a time budget, takes looks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.text import Text
 
 from qrlsuite import registry
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.missing import find, train
+from qrlsuite.engine.missing import find, require_same_code, train
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing
@@ -23,6 +23,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
 from qrlsuite.results.text import counted, duration, duration_range, hours_range
+from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.study import Member, Study
 
 
@@ -91,6 +93,8 @@ class Overview(Shown):
 
     Attributes
     ----------
+    pairs:
+        Of the pairs of entries those that are decided, and all that can be tested yet.
     published:
         Of each entry, by its name, the seeds that come with the suite; None leaves them out.
     """
@@ -98,6 +102,7 @@ class Overview(Shown):
     study: Study
     items: Sequence[PendingEntry]
     workers: int
+    pairs: tuple[int, int] = (0, 0)
     published: Mapping[str, int] | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -105,12 +110,16 @@ class Overview(Shown):
         costs = [item.seconds for item in self.items]
         known = [cost for cost in costs if cost is not None]
         return {
-            **self.study.file.model_dump(mode="json", exclude={"format_version", "entries", "pictures"}),
+            **self.study.file.model_dump(
+                mode="json", exclude={"format_version", "entries", "pictures", "looks"}
+            ),
             "entries": [
                 item.as_dict()
                 | ({} if self.published is None else {"published": self.published[item.missing.entry.name]})
                 for item in self.items
             ],
+            "decided": self.pairs[0],
+            "pairs": self.pairs[1],
             "workers": self.workers,
             "core_hours_left": sum(known) / 3600,
             "core_hours_range": [seconds / 3600 for seconds in _total(self.items)],
@@ -134,6 +143,11 @@ class Overview(Shown):
             yield Text(f"left: {_left(lacking, self.workers)}")
             for basis in dict.fromkeys(item.estimate.basis for item in lacking):
                 yield Text(f"  {basis}: {BASES[basis]}")
+        if self.pairs[1]:
+            yield Text(
+                f"{self.pairs[0]} of {counted(self.pairs[1], 'pair')} decided: of entries with 20 seeds or more, by "
+                "mean time below threshold at an error of 5%"
+            )
         if file.core_hours is not None:
             yield Text(f"the paper's software needed about {file.core_hours:,.0f} core-hours for all of it")
         yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
@@ -177,99 +191,6 @@ def _left(items: Sequence[PendingEntry], workers: int) -> str:
     )
 
 
-@dataclass(frozen=True, repr=False)
-class Status(Shown):
-    """A table of studies: what is trained of each, how many of its pairs are decided, and what the rest takes.
-
-    Attributes
-    ----------
-    rows:
-        A study, its entries, and of its pairs of entries those that are decided, and all that can be tested yet.
-    published:
-        As for `Overview`.
-    """
-
-    rows: Sequence[tuple[Study, Sequence[PendingEntry], tuple[int, int]]]
-    workers: int
-    published: Mapping[str, int] | None = None
-
-    def _published(self, items: Sequence[PendingEntry]) -> dict[str, int]:
-        """Return how many entries and seeds of a study come with the suite; nothing where that is left out."""
-        if self.published is None:
-            return {}
-        counts = [self.published[item.missing.entry.name] for item in items]
-        return {"published": sum(map(bool, counts)), "published_seeds": sum(counts)}
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            "studies": [
-                {
-                    "name": study.name,
-                    "entries": len(items),
-                    "complete": sum(item.complete for item in items),
-                    "seeds": sum(len(item.missing.seeds) for item in items),
-                    "finished": sum(item.finished for item in items),
-                    **self._published(items),
-                    "pairs": pairs,
-                    "decided": decided,
-                    "core_hours_range": [seconds / 3600 for seconds in _total(items)],
-                    "complete_estimate": all(item.seconds is not None for item in items),
-                }
-                for study, items, (decided, pairs) in self.rows
-            ],
-            "core_hours_range": [seconds / 3600 for seconds in _total(self._once())],
-            "complete_estimate": all(item.seconds is not None for item in self._once()),
-            "workers": self.workers,
-        }
-
-    def _once(self) -> list[PendingEntry]:
-        """Return the entries of all studies, each once."""
-        return list({item.missing.store.path: item for _, items, _ in self.rows for item in items}.values())
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show a row per study, and the sum, in which an entry of several studies counts once."""
-        table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-        with_published = ("published",) if self.published is not None else ()
-        for column in (
-            "study",
-            "entries complete",
-            "seeds",
-            *with_published,
-            "pairs decided",
-            "core-hours left",
-        ):
-            table.add_column(column, justify="left" if column == "study" else "right", overflow="fold")
-        for study, items, (decided, pairs) in self.rows:
-            table.add_row(
-                study.name,
-                f"{sum(item.complete for item in items)} of {len(items)}" if items else "-",
-                f"{sum(item.finished for item in items)} of {sum(len(item.missing.seeds) for item in items)}"
-                if items
-                else "-",
-                *([] if self.published is None else [_seeds_of_entries(**self._published(items))]),
-                f"{decided} of {pairs}" if pairs else "-",
-                _hours_left(items),
-            )
-        yield table
-        yield Text(f"left, each entry once: {_left(self._once(), self.workers)}")
-        yield Text("pairs: of entries with 20 seeds or more, by mean time below threshold at an error of 5%")
-
-
-def _seeds_of_entries(published: int, published_seeds: int) -> str:
-    if not published:
-        return "-"
-    return f"{counted(published_seeds, 'seed')} of {counted(published, 'entry')}"
-
-
-def _hours_left(items: Sequence[PendingEntry]) -> str:
-    if not any(item.missing.groups for item in items):
-        return "-"
-    low, high = _total(items)
-    unknown = sum(item.seconds is None for item in items)
-    return hours_range(low / 3600, high / 3600) + (f" and {unknown} unknown" if unknown else "")
-
-
 def select(
     study: Study,
     settings: Sequence[Setting] = (),
@@ -306,7 +227,7 @@ def _mentions(member: Member, word: str) -> bool:
     return word == entry.name or any(word in text for text in (member.group, entry.label, entry.task.name))
 
 
-def survey(
+def find_pending(
     members: Sequence[Member],
     runs: Path,
     where: Where,
@@ -492,3 +413,40 @@ class Session:
             remaining = [seed for seed in work.seeds if seed not in stuck]
             rest = find(self.runs, work.entry, self.where, remaining, work.epochs)
         return PendingEntry(rest, item.groups, self.speeds.estimate(work.entry, rest.together))
+
+
+def take_looks(
+    study: StudyWithLooks, session: Session, looked: Callable[[StudyOutcome], None] | None = None
+) -> StudyOutcome:
+    """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
+
+    Parameters
+    ----------
+    session:
+        In the study's folder.
+    looked:
+        Called after each look.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, with everything saved.
+    QrlSuiteError
+        If the study cannot be used or go on, or training failed; finished epochs are kept.
+    """
+    require_same_code(study.folder, list(study.entries.values()), session.where)
+    study.begin()
+    state = study.look()
+    while wanted := state.decision.wanted:
+        seeds = range(study.looks.first_seed, study.looks.first_seed + max(wanted.values()))
+        members = [
+            Member(name, study.entries[name], table) for name, table in zip(study.entries, study.file.entries)
+        ]
+        open_ = [member for member in members if member.group in wanted]
+        session.run(find_pending(open_, study.folder, session.where, session.speeds, seeds, study.epochs))
+        state = study.look()
+        if state.missing and state.decision.wanted == wanted:
+            break  # a queue or another process has the seeds, or the budget is used up
+        if looked is not None:
+            looked(StudyOutcome(study, state))
+    return StudyOutcome(study, state, tuple(session.submitted))

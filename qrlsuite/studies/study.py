@@ -1,7 +1,8 @@
 """Studies as data: one TOML file names the entries of an experiment, the pictures of it, and what a paper reports.
 
 A study trains nothing of its own: its entries are those that `qrlsuite run` would train, in the same folders, so
-that entries which several studies share are trained once.
+that entries which several studies share are trained once. A study with a table `[looks]` compares its entries with as
+many seeds as it takes, on seeds of its own: see `qrlsuite.studies.looks`.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+import tomli_w
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
+from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.options import Setting
+from qrlsuite.results.text import counted
 from qrlsuite.studies.sizes import nearest_size
 
 Name = Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]
@@ -44,7 +48,14 @@ class MatchSection(_StudyTable):
 class EntriesSection(_StudyTable):
     """A group of entries: every combination of its tasks, models and grid."""
 
-    name: Annotated[Name, Field(description="by which pictures and other groups refer to it")]
+    name: Annotated[
+        str | None,
+        Field(
+            pattern=r"^[\w(][\w ,.:=+/()-]*$",
+            max_length=64,
+            description="by which pictures, pairs and other groups refer to it",
+        ),
+    ] = None
     task: str | Annotated[list[str], Field(min_length=1)]
     model: str | Annotated[list[str], Field(min_length=1)]
     algorithm: str | None = None
@@ -57,6 +68,64 @@ class EntriesSection(_StudyTable):
         Field(description="options that take each of several values"),
     ] = {}
     match: MatchSection | None = None
+    hash: Annotated[
+        str | None,
+        Field(description="with looks: of the entry that the options make, which cannot be another"),
+    ] = None
+    tuning: Annotated[
+        EntryTuning | None,
+        Field(description="with looks: how the options were found, where a preset file gave them"),
+    ] = None
+
+
+class Question(_StudyTable):
+    """What a study with looks asks, and the pairs of entries whose verdicts answer it."""
+
+    text: Annotated[str, Field(min_length=1, max_length=200)]
+    pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]
+
+
+class LooksSection(_StudyTable):
+    """When entries are compared, at which error and on which seeds: fixed once the first seed is begun."""
+
+    looks: Annotated[list[int], Field(min_length=1, description="seeds of each entry at each look")] = [
+        20,
+        40,
+        60,
+        80,
+        100,
+    ]
+    alpha: Annotated[
+        float, Field(description="probability of any false difference, over all pairs and looks")
+    ] = 0.05
+    spending: Annotated[str, Field(description="how alpha is spent over the looks")] = "pocock"
+    margin: Annotated[float, Field(description="a smaller difference counts as none: 0.1 is 10 percent")] = (
+        0.1
+    )
+    first_seed: Annotated[int, Field(ge=0, description="where the study's own block of seeds begins")] = (
+        10_000
+    )
+    epochs: Annotated[
+        int | None, Field(ge=1, description="of every seed: the horizon at which entries are compared")
+    ] = None
+    rule: Literal["times", "times-skewed"] = "times"
+    epsilons: Annotated[
+        list[float] | None,
+        Field(min_length=1, description="thresholds 1 - epsilon on a score with maximum 1"),
+    ] = None
+    thresholds: Annotated[list[float] | None, Field(min_length=1, description="thresholds on the return")] = (
+        None
+    )
+    reason: Annotated[str, Field(description="why the first look comes before 20 seeds")] = ""
+    written: AwareDatetime | None = None
+    questions: Annotated[
+        list[Question], Field(description="which pairs are compared; every pair of entries without them")
+    ] = []
+
+    @property
+    def block(self) -> range:
+        """The seeds that the study may train, of every entry."""
+        return range(self.first_seed, self.first_seed + self.looks[-1])
 
 
 class DeploymentSection(_StudyTable):
@@ -101,17 +170,20 @@ class StudyFile(_StudyTable):
     source: Annotated[str, Field(description="where it was published: section, figure")] = ""
     reports: Annotated[str, Field(description="what was reported there")] = ""
     core_hours: Annotated[float | None, Field(ge=0, description="what it cost there, in core-hours")] = None
+    looks: LooksSection | None = None
     entries: list[EntriesSection] = []
-    pictures: Annotated[list[PictureSection], Field(min_length=1)]
+    pictures: list[PictureSection] = []
 
     @model_validator(mode="after")
     def _groups_exist(self) -> StudyFile:
-        names = [group.name for group in self.entries]
+        names = [group.name for group in self.entries if group.name is not None]
         problems = [
             f"two groups are named '{name}'" for name in sorted({n for n in names if names.count(n) > 1})
         ]
+        if self.looks is None and not self.pictures:
+            problems.append("missing key 'pictures': a study without looks draws at least one")
         for index, group in enumerate(self.entries):
-            earlier = names[:index]
+            earlier = [before.name for before in self.entries[:index] if before.name is not None]
             if group.match is not None and group.match.group not in earlier:
                 problems.append(
                     f"entries.{index}.match.group = '{group.match.group}' is no earlier group"
@@ -134,10 +206,11 @@ class StudyFile(_StudyTable):
 
 @dataclass(frozen=True)
 class Member:
-    """An entry of a study, and the group that it belongs to."""
+    """An entry of a study, the group that it belongs to, and the group's table with what makes this entry alone."""
 
     group: str
     entry: Entry
+    table: EntriesSection
 
 
 @dataclass(frozen=True)
@@ -181,9 +254,10 @@ class Study:
         named = {name for group in self.file.entries for name in _listed(group.model)}
         for name in sorted(set(models) - named):
             raise OptionError(f"study '{self.name}' has no entry with model '{name}'{nearest(name, named)}")
-        by_group: dict[str, list[Member]] = {}
+        by_group: dict[str | None, list[Member]] = {}
+        every: list[Member] = []
         used: set[tuple[str | None, str]] = set()
-        for group in self.file.entries:
+        for index, group in enumerate(self.file.entries):
             members: dict[tuple[str, str], Member] = {}
             for draft in _drafts(group):
                 targets = (
@@ -191,17 +265,18 @@ class Study:
                 )
                 for target in targets:
                     try:
-                        entry = _entry(group, draft, settings, models, target, used)
+                        member = _member(group, draft, settings, models, target, used)
                     except QrlSuiteError as error:
-                        raise type(error)(f"{self.source}, group '{group.name}': {error}") from None
-                    members.setdefault((entry.task.name, entry.name), Member(group.name, entry))
+                        place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
+                        raise type(error)(f"{self.source}, {place}: {error}") from None
+                    members.setdefault((member.entry.task.name, member.entry.name), member)
             by_group[group.name] = list(members.values())
+            every += members.values()
         for setting in settings:
             if (setting.side, setting.name) not in used:
                 raise OptionError(
                     f"{setting.written}: no entry of study '{self.name}' has an option of that name"
                 )
-        every = [member for members_ in by_group.values() for member in members_]
         if len(every) > LARGEST:
             raise OptionError(f"study '{self.name}' has {len(every)} entries, more than {LARGEST}")
         return every
@@ -234,14 +309,14 @@ def _drafts(group: EntriesSection) -> Iterator[_Draft]:
             yield _Draft(task, model, (*fixed, *varied))
 
 
-def _entry(
+def _member(
     group: EntriesSection,
     draft: _Draft,
     settings: Sequence[Setting],
     models: Mapping[str, str],
     target: Entry | None,
     used: set[tuple[str | None, str]],
-) -> Entry:
+) -> Member:
     model = models.get(draft.model, draft.model)
     loaded = load_task(draft.task)
     algorithm = registry.algorithm(group.algorithm or loaded.file.default_algorithm)
@@ -250,21 +325,18 @@ def _entry(
     applicable = [s for s in settings if _has(sides, s)]
     used |= {(s.side, s.name) for s in applicable}
     all_settings = [*draft.settings, *applicable]
+
+    def entry(*more: Setting) -> Entry:
+        return resolve(draft.task, model, group.algorithm, [*all_settings, *more], group.preset)
+
     if target is not None and group.match is not None:
         option = group.match.option
         if not any(s.name == option and s.side in (None, "model") for s in applicable):
-            value = nearest_size(
-                lambda size: resolve(
-                    draft.task,
-                    model,
-                    group.algorithm,
-                    [*all_settings, Setting("model", option, size)],
-                    group.preset,
-                ),
-                target,
-            )
-            all_settings.append(Setting("model", option, value))
-    return resolve(draft.task, model, group.algorithm, all_settings, group.preset)
+            size = nearest_size(lambda size: entry(Setting("model", option, size)), target)
+            all_settings.append(Setting("model", option, size))
+    options_ = {s.full_name: s.value for s in all_settings}
+    alone = {"task": draft.task, "model": model, "options": options_, "grid": {}, "match": None}
+    return Member(group.name or "", entry(), group.model_copy(update=alone))
 
 
 def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:
@@ -291,9 +363,43 @@ def parse(text: str, source: str) -> Study:
     except tomllib.TOMLDecodeError as error:
         raise TaskError(f"{source}: not valid TOML: {error}") from None
     try:
-        return Study(StudyFile.model_validate(data), source)
+        return Study(StudyFile.model_validate(_with_table(data)), source)
     except pydantic.ValidationError as error:
         raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, StudyFile))) from None
+
+
+def _with_table(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a file's content, with a table `[looks]` of the keys that version 0.1 wrote beside the others."""
+    if not isinstance(data.get("looks"), list):
+        return data
+    looks = {key: data[key] for key in LooksSection.model_fields if key in data}
+    entries = [{"task": data.get("task"), **each} for each in data.get("entries", [])]
+    rest = {key: value for key, value in data.items() if key not in (*looks, "task", "entries")}
+    names = [str(each.get("name") or each.get("model")) for each in entries]
+    first, *more = [str(each.get("text")) for each in looks.get("questions", [])] or [question_of(names)]
+    summary = f"{first} And {counted(len(more), 'more question')}." if more else first
+    return {**rest, "summary": summary, "looks": looks, "entries": entries}
+
+
+def question_of(names: Sequence[str]) -> str:
+    """Return what is asked about all pairs of some entries."""
+    return (
+        f"Which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
+        if names
+        else "Which needs fewer steps?"
+    )
+
+
+def dumps(file: StudyFile) -> str:
+    """Return the text of a study file."""
+    content = file.model_dump(exclude_defaults=True, exclude_none=True)
+    if file.looks is not None:  # in full: what was fixed does not depend on a later version's defaults
+        looks = file.looks.model_dump(exclude_none=True)
+        content["looks"] = {key: value for key, value in looks.items() if value not in ("", [])}
+    for written, group in zip(content.get("entries", []), file.entries):
+        if group.tuning is not None:
+            written["tuning"] = group.tuning.model_dump(exclude_none=True)
+    return tomli_w.dumps(content)
 
 
 def load(name: str) -> Study:

@@ -24,7 +24,7 @@ def check(subject: Subject) -> list[Finding]:
     study = check_format(rules, spec, parse, "valid, and groups that pictures name exist")
     if study is None:
         return rules.findings
-    elsewhere = "`qrlsuite study list` and the pictures' files would have different names"
+    elsewhere = "`qrlsuite list studies` and the pictures' files would have different names"
     check_names(rules, spec, study.name, study.file.summary, elsewhere)
     usable = rules.run(
         "entries", "tasks, models and options exist, as a run needs them", lambda: _entries(study)
@@ -33,7 +33,11 @@ def check(subject: Subject) -> list[Finding]:
     if spec.speeds is not None:
         rules.run("speeds", "reference speeds can be read", lambda: _speeds(spec))
     if usable:
-        rules.run("pictures", "they exist and take the settings; `study show` shows it", lambda: _show(spec))
+        rules.run(
+            "pictures",
+            "they exist and take the settings; `qrlsuite show STUDY` shows it",
+            lambda: _show(spec),
+        )
     return rules.findings
 
 
@@ -46,7 +50,9 @@ def _all_shown(study: Study) -> None:
     if any(not picture.entries for picture in study.file.pictures):
         return
     shown = {group for picture in study.file.pictures for group in picture.entries}
-    hidden = [group.name for group in study.file.entries if group.name not in shown]
+    hidden = [
+        group.name or "a group without a name" for group in study.file.entries if group.name not in shown
+    ]
     require(
         not hidden,
         f"{', '.join(hidden)}: trained, and in no picture. Name the group among a picture's entries, or remove it",

@@ -18,19 +18,20 @@ from typer.testing import CliRunner, Result
 
 from qrlsuite import registry
 from qrlsuite.cli import main
-from qrlsuite.cli.app import build
+from qrlsuite.cli.app import RENAMED, build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import task
 from qrlsuite.leaderboard import studies
-from qrlsuite.leaderboard.shelf import published
+from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.leaderboard.studies import find
 from qrlsuite.results import speed
 from qrlsuite.results.speed import Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec, StudySpec
-from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check_budget, fitting, survey
+from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check_budget, find_pending, fitting
 from qrlsuite.studies.study import parse
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
@@ -121,7 +122,8 @@ def widths(tmp_path: Path) -> str:
 
 
 def say(*words: str) -> Result:
-    return CliRunner().invoke(build(), ["study", *words], catch_exceptions=False)
+    group = [] if words[0] in ("show", "list") else ["study"]
+    return CliRunner().invoke(build(), [*group, *words], catch_exceptions=False)
 
 
 def answer(*words: str) -> dict[str, Any]:
@@ -298,7 +300,7 @@ def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
         ("run", widths, "--dry-run"),
         ("run", widths, "--dry-run", "--budget", "1h"),
     ):
-        result = say(*words, "--engine", "here", "--runs", str(runs))
+        result = say(*words, "--runs", str(runs))
         assert result.exit_code == 0
         assert "vqc-native" in result.stdout
     assert not runs.exists()
@@ -358,7 +360,7 @@ def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp
 
 def items(widths: str, tmp_path: Path, speeds: Speeds) -> list[PendingEntry]:
     study = parse(Path(widths).read_text(), "widths.toml")
-    return survey(study.members(), tmp_path / "runs", Where(Here(), 2), speeds, range(4), 10)
+    return find_pending(study.members(), tmp_path / "runs", Where(Here(), 2), speeds, range(4), 10)
 
 
 def speeds(mlp: float | None, vqc: float | None) -> Speeds:
@@ -526,44 +528,32 @@ def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("two_studies")
-def test_the_status_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
-    words = ("--engine", "here", "--epochs", "3", "--runs", str(tmp_path / "runs"))
-    say("run", "widths", "--only", "mlp", "--seeds", "20", *words)
-    wide, widths = answer("status", "without-circuit", "widths", "--seeds", "20", *words)["studies"]
-    assert (wide["complete"], wide["entries"], wide["pairs"]) == (1, 1, 0)
-    assert (widths["complete"], widths["entries"], widths["finished"], widths["seeds"]) == (2, 3, 40, 60)
-    assert widths["pairs"] == 1
-    assert widths["decided"] == 0, "two networks that have hardly learned"
-    said = say("status", "--seeds", "20", *words).stdout
-    assert re.search(r"widths +2 of 3 +40 of 60 +0 of 1", said)
-    assert re.search(r"left, each entry once: .*, and 1 entry of unknown cost", said)
+def test_show_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    say(
+        "run", "widths", "--only", "mlp", "--seeds", "20", "--epochs", "3", "--engine", "here", "--runs", runs
+    )
+    widths = answer("show", "widths", "--runs", runs)
+    assert [entry["finished"] for entry in widths["entries"]] == [4, 4, 0], (
+        "of the four seeds of the protocol"
+    )
+    assert (widths["decided"], widths["pairs"]) == (0, 1), "two networks that have hardly learned"
+    assert "0 of 1 pair decided" in say("show", "widths", "--runs", runs).stdout
 
 
 def test_published_seeds_are_counted_beside_one_s_own(tmp_path: Path) -> None:
-    words = ("--engine", "here", "--runs", str(tmp_path / "runs"))
-    (ppo,) = answer("status", "ppo", "--published", *words)["studies"]
-    networks = published.folders()[1] / "beam6g"
-    seeds = [published.read(folder).seeds for folder in networks.glob("ppo-mlp-*")]
-    assert (ppo["published"], ppo["published_seeds"]) >= (3, 60)
-    assert ppo["published_seeds"] >= sum(map(len, seeds))
-    assert ppo["pairs"] >= 3
-    assert ppo["finished"] == ppo["complete"] == 0, "published seeds are nobody's own"
-    assert re.search(
-        rf"{ppo['published_seeds']} seeds of {ppo['published']} entries",
-        say("status", "ppo", "--published", *words).stdout,
-    )
-    shown = {
-        entry["label"]: entry["published"]
-        for entry in answer("show", "ppo", "--published", *words)["entries"]
-    }
+    words = ("show", "study", "ppo", "--runs", str(tmp_path / "runs"))
+    ppo = answer(*words, "--published")
+    shown = {entry["label"]: entry["published"] for entry in ppo["entries"]}
     assert shown["ppo mlp width=16"] == 20
-    longer = answer("show", "ppo", "--published", "--epochs", "501", *words)["entries"]
-    assert not any(entry["published"] for entry in longer), "none of them reached epoch 501"
-    (row,) = [
-        line for line in say("show", "ppo", "--published", *words).stdout.splitlines() if "width=16" in line
-    ]
+    assert ppo["pairs"] >= 3
+    assert not any(entry["finished"] for entry in ppo["entries"]), "published seeds are nobody's own"
+    (row,) = [line for line in say(*words, "--published").stdout.splitlines() if "width=16" in line]
     assert row.split()[:7] == ["beam6g", "ppo", "mlp", "width=16", "0/100", "20", "500"]
-    assert "published" not in answer("show", "ppo", *words)["entries"][0]
+    assert "published" not in answer(*words)["entries"][0]
+    members = find("ppo").members()
+    longer = find_pending(members, tmp_path, Where.create(), Speeds(), None, 501)
+    assert not any(studies.published_seeds(longer).values()), "none of them reached epoch 501"
 
 
 def test_which_pairs_count() -> None:
@@ -577,10 +567,8 @@ def test_which_pairs_count() -> None:
 
 
 def test_listing() -> None:
-    listed = say("list").stdout
-    assert all(name in listed for name in STUDIES)
-    rows = json.loads(say("list", "--json").stdout)
-    assert next(row for row in rows if row["name"] == "fig6")["core_hours"] == 2503
+    listed = say("list", "studies").stdout
+    assert all(name in listed for name in (*STUDIES, *published_studies.names()))
     shown = say("show", "fig7", "--runs", "nowhere").stdout
     assert "ddqn vqc-native qubits=14" in shown
     assert "0/100" in shown
@@ -598,8 +586,8 @@ def test_listing() -> None:
         (["run", "fig6", "--engine", "lokal"], "did you mean 'local'"),
         (["run", "fig6", "--model-map", "vqc-native"], "write MODEL=MODEL"),
         (["run", "fig6", "--model-map", "vqc-native=vqc-nativ"], "did you mean 'vqc-native'"),
-        (["show", "fig6", "--only", "nothing"], "study 'fig6' has no such entry"),
-        (["show", "fig6", "--seeds", "a:b"], "write a number (100)"),
+        (["run", "fig6", "--only", "nothing"], "study 'fig6' has no such entry"),
+        (["run", "fig6", "--seeds", "a:b"], "write a number (100)"),
         (["draw", "fig6"], "nothing is trained yet: qrlsuite study run fig6"),
         (["show", "bad.toml"], "pictures.0.kind: unknown picture 'bar'; did you mean 'bars'"),
         (["show", "worse.toml"], "worse.toml: pictures.0.settings"),
@@ -629,7 +617,7 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     Path("zero.toml").write_text(there.replace("[9]", "[9, 0]"))
     Path("option.toml").write_text(there.replace('"shots"', '"shot"'))
     before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr(sys, "argv", ["qrlsuite", "study", *words])
+    monkeypatch.setattr(sys, "argv", ["qrlsuite", *([] if words[0] == "show" else ["study"]), *words])
     with pytest.raises(SystemExit) as stopped:
         main()
     printed = capsys.readouterr()
@@ -640,6 +628,7 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     assert sorted(tmp_path.iterdir()) == before, "wrong input leaves nothing behind"
 
 
-def test_every_part_explains_itself() -> None:
-    for command in ("list", "show", "run", "draw"):
-        assert "Example" in say(command, "--help").stdout
+@pytest.mark.parametrize("old", list(RENAMED))
+def test_a_command_of_earlier_versions_names_the_new_one(old: str) -> None:
+    result = CliRunner().invoke(build(), [*old.split(), "width.toml"])
+    assert str(result.exception) == f"`qrlsuite {old}` is now `{RENAMED[old]}`"

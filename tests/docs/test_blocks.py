@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {
-    "decisions.md": "tests/cli/test_decide.py",
+    "decisions.md": "tests/cli/test_looks.py",
     "plugins.md": "test_plugins.py",
     "statistics.md": "tests/statistics/test_docs.py",
 }

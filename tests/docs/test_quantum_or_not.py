@@ -1,4 +1,4 @@
-"""docs/plans.md and docs/quantum-or-not.md say what the published plans say."""
+"""docs/plans.md and docs/quantum-or-not.md say what the published studies with looks say."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from pathlib import Path
 import pytest
 
 from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.results.store import read_lines
+from qrlsuite.studies.looks import FILE, LOG, StudyWithLooks
+from qrlsuite.studies.study import load as load_study
 from tests.docs import load
 
 DOCS = Path(__file__).parents[2] / "docs"
-PLANS = (DOCS / "plans.md").read_text()
+STUDIES = (DOCS / "plans.md").read_text()
 PROSE = " ".join((DOCS / "quantum-or-not.md").read_text().split())
 NAMES = sorted(folder.name for folder in published_studies.PUBLISHED.iterdir())
 
@@ -32,21 +35,41 @@ def test_a_table_that_was_empty_stands_apart_from_what_follows() -> None:
 
 
 def test_a_stale_table_is_replaced() -> None:
-    stale = PLANS.replace("| 313 |", "| 312 |", 1)
-    assert stale != PLANS
-    assert tables.filled(stale) == PLANS
+    stale = STUDIES.replace("| 313 |", "| 312 |", 1)
+    assert stale != STUDIES
+    assert tables.filled(stale) == STUDIES
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_plan_is_on_the_page(name: str) -> None:
-    file = tables.published(name).study.file
-    prose = " ".join(PLANS.split())
-    assert f"<!-- table: {name} verdicts -->" in PLANS
-    assert f"`{file.hash}`" in prose
+def test_every_published_study_is_on_the_page(name: str) -> None:
+    study = tables.published(name).study
+    prose = " ".join(STUDIES.split())
+    assert f"<!-- table: {name} verdicts -->" in STUDIES
+    assert f"`{study.hash}`" in prose
     assert f"{len(tables.published(name).pairs)} pairs" in prose
-    assert f"seeds {file.first_seed} to {file.first_seed + file.looks[-1] - 1}" in prose
-    *looks, last = file.looks
+    assert f"seeds {study.looks.block.start} to {study.looks.block.stop - 1}" in prose
+    *looks, last = study.looks.looks
     assert f"Looks after {', '.join(map(str, looks))} and {last} seeds" in prose
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hash_permutations_and_next_look_are_those_of_the_log(name: str, tmp_path: Path) -> None:
+    """Studies that version 0.1 wrote as plans keep all that decides, and go on with `study run`."""
+    outcome = tables.published(name)
+    log = read_lines(published_studies.PUBLISHED / name / LOG)
+    looks = [line for line in log if "look" in line]
+    assert {line["plan"] for line in log if "plan" in line} == {outcome.study.hash}
+    p = {(pair.first, pair.second): pair.p for pair in outcome.pairs}
+    for index, line in enumerate(looks):
+        for pair in line["pairs"]:
+            assert p[tuple(pair["pair"])][index] == pair["p"]
+    every = outcome.study.design.looks
+    expected = set() if outcome.finished else {every[len(looks)]}
+    assert set(outcome.state.decision.wanted.values()) == expected
+    own = StudyWithLooks(published_studies.load(published_studies.PUBLISHED / name), tmp_path)
+    own.begin()
+    assert StudyWithLooks(load_study(str(own.folder / FILE)), tmp_path).hash == outcome.study.hash
+    assert set(own.look().decision.wanted.values()) == {every[0]}
 
 
 def test_the_state() -> None:
@@ -61,17 +84,17 @@ def test_the_state() -> None:
     )
     seeds = sum(outcome.looked.values())
     hours = sum(each["core_hours"] for each in outcome.as_dict()["entries"])
-    assert f"The plan took {seeds} seeds and {hours:.1f} core-hours" in PROSE
+    assert f"The study took {seeds} seeds and {hours:.1f} core-hours" in PROSE
 
 
 @pytest.mark.parametrize(
-    ("plan", "sentence"),
+    ("study", "sentence"),
     [
         ("quantum-or-not", "{} core-hours for all"),
         ("quantum-or-not-cartpole", "whole runs of 500 epochs, in {} core-hours"),
     ],
 )
-def test_the_hours_of_tuning(plan: str, sentence: str) -> None:
-    tunings = [entry.tuning for entry in tables.published(plan).study.file.entries]
+def test_the_hours_of_tuning(study: str, sentence: str) -> None:
+    tunings = [entry.tuning for entry in tables.published(study).study.file.entries]
     hours = sum(each.core_hours or 0 for each in tunings if each is not None and each.value is not None)
     assert sentence.format(f"{hours:.1f}") in PROSE

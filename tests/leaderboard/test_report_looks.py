@@ -1,4 +1,4 @@
-"""The page's sections of decision plans and of several tasks."""
+"""The page's sections of studies with looks and of several tasks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from qrlsuite.leaderboard import across, board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
-from qrlsuite.studies import looks as with_looks
-from qrlsuite.studies import outcome as outcomes
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.looks import StudyWithLooks, new
+from qrlsuite.studies.outcome import in_folder
 from tests.conftest import TINY
 from tests.leaderboard import boards
 
@@ -27,14 +26,14 @@ STARTS = {"mlp width=16": 5, "mlp width=8": 5, "mlp width=4": 14}
 """The epoch from which the runs of an entry are good, one epoch earlier or later by turns."""
 
 
-def put(study: with_looks.StudyWithLooks, looks: int) -> StudyOutcome:
-    """Leave the seeds of some looks in the plan's folder as workers would, and take the looks."""
+def put(study: StudyWithLooks, looks: int) -> None:
+    """Leave the seeds of some looks in the study's folder as workers would, and take the looks."""
     study.begin()
-    decision = study.look()
+    state = study.look()
     for _ in range(looks):
-        for name, seeds in study.wanted(decision).items():
+        for name, count in state.decision.wanted.items():
             store = EntryStore.create(study.folder, study.entries[name])
-            for seed in seeds:
+            for seed in range(study.looks.first_seed, study.looks.first_seed + count):
                 start = STARTS[name] + (seed + name.count("8")) % 2
                 folder = store.seed(seed)
                 rows = [{"epoch": epoch, "scores": [float(epoch >= start)] * 5} for epoch in range(1, 21)]
@@ -42,24 +41,23 @@ def put(study: with_looks.StudyWithLooks, looks: int) -> StudyOutcome:
                 lines = (json_line({"epoch": epoch, "cpu": 1.8}) for epoch in range(1, 21))
                 write_atomically(folder.timings, b"".join(lines))
                 record = {"status": "finished", "epochs": 20, "parameters": {}, "provenance": []}
-                folder.write_record({"plan": study.file.hash, "seed": seed, **store.names, **record})
-        decision = study.look()
-    return StudyOutcome(study, decision)
+                folder.write_record({"plan": study.hash, "seed": seed, **store.names, **record})
+        state = study.look()
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results folder with a plan that is finished and one that is open; the task file lies beside it."""
-    folder = tmp_path_factory.mktemp("decisions")
+    """A results folder with a study that is finished and one that is open; the task file lies beside it."""
+    folder = tmp_path_factory.mktemp("studies")
     task = folder / "tiny.toml"
     task.write_text(TINY.replace("seeds = 4\nepochs = 3", "seeds = 100\nepochs = 20"))
-    put(with_looks.write("three", str(task), list(STARTS), folder / "runs"), looks=2)
-    put(with_looks.write("two", str(task), list(STARTS)[:2], folder / "runs"), looks=1)
+    put(new("three", str(task), list(STARTS), folder / "runs"), looks=2)
+    put(new("two", str(task), list(STARTS)[:2], folder / "runs"), looks=1)
     return folder / "runs"
 
 
-def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -> None:
-    found, refused = outcomes.in_folder(runs)
+def test_a_study_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -> None:
+    found, refused = in_folder(runs)
     assert refused == []
     three, two = (looks_report.view(outcome) for outcome in found)
     assert [line.verdict for line in three.pairs] == [
@@ -80,19 +78,19 @@ def test_a_plan_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) ->
     assert [decided for _, decided in three.looks[0].p] == [False, True, True]
     facts = dict(three.facts)
     assert facts["State"] == "finished"
-    assert facts["Hash of the plan"] == found[0].study.file.hash
-    assert facts["Plan written"].endswith(" UTC")
-    assert facts["First seed begun"] >= facts["Plan written"]
+    assert facts["Hash of the study"] == found[0].study.hash
+    assert facts["Study written"].endswith(" UTC")
+    assert facts["First seed begun"] >= facts["Study written"]
     assert facts["Seeds"] == "10000:10100, 100 used, 200 saved"
     assert dict(two.facts)["State"] == "goes on: next look at 40 seeds"
     assert "p ≤ 0.015 at 40 seeds" in two.pairs[0].needs
     assert len(three.picture.lines) == 3
     assert [len(dots) for _, _, dots in three.picture.lines] == [2, 1, 1]
-    other, _ = outcomes.in_folder(runs, ["beam6g"])
+    other, _ = in_folder(runs, ["beam6g"])
     assert other == []
 
 
-def test_the_command_puts_plans_on_the_page(runs: Path, tmp_path: Path) -> None:
+def test_the_command_puts_studies_on_the_page(runs: Path, tmp_path: Path) -> None:
     shutil.copytree(runs, tmp_path / "runs")
     changed = tmp_path / "runs" / "decisions" / "two" / "plan.toml"
     changed.write_text(changed.read_text().replace("alpha = 0.05", "alpha = 2"))
@@ -100,8 +98,8 @@ def test_the_command_puts_plans_on_the_page(runs: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(build(), words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "runs" / "leaderboard.html").read_text()
-    assert "three: which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in text
-    assert outcomes.in_folder(runs)[0][0].study.file.hash in text
+    assert "three: Which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in text
+    assert in_folder(runs)[0][0].study.hash in text
     assert re.search(r"plan.toml: alpha = 2.* is outside \(0, 1\)", text), "left out, with the reason"
 
 
@@ -116,16 +114,16 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
     for task in ("beam6g", "cartpole"):
         entries += [replace(each, task=task, task_hash=task) for each in boards.graded(2, seeds=30)]
     compared = across.compare(entries, ["beam6g", "cartpole"])
-    page = render(board.build(entries), plans=outcomes.in_folder(runs)[0], across=compared)
+    page = render(board.build(entries), studies=in_folder(runs)[0], across=compared)
     tab = opened(page, width=width)
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
-    assert tab.locator("nav a[href='#decisions']").count() == 1
-    plans = tab.locator("#decisions article")
-    assert plans.count() == 2
-    assert "mlp width=16 needs fewer" in plans.first.inner_text()
-    assert plans.first.locator("circle").count() == 4
-    assert plans.first.locator("circle.closed").count() == 2
-    looks = plans.first.locator("details")
+    assert tab.locator("nav a[href='#studies']").count() == 1
+    studies = tab.locator("#studies article")
+    assert studies.count() == 2
+    assert "mlp width=16 needs fewer" in studies.first.inner_text()
+    assert studies.first.locator("circle").count() == 4
+    assert studies.first.locator("circle.closed").count() == 2
+    looks = studies.first.locator("details")
     looks.locator("summary").click()
     assert "0.026" in looks.inner_text()
     table = tab.locator("#across tbody")

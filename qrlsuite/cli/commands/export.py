@@ -14,25 +14,33 @@ from qrlsuite.cli.arguments import AcrossOption, JsonOption, RunsOption, TaskOpt
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import across as several
-from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.shelf import collect, published_studies
 from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted
+from qrlsuite.studies.looks import StudyWithLooks
 
 
 def export(
     entries: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENTRY]...", help="Its name or label, or the beginning of one, after [TASK/]."
+            metavar="[ENTRY]...",
+            help="Its name or label, or the beginning of one, after [TASK/]; or a study with looks: STUDY.toml.",
         ),
     ] = None,
     task: TaskOption = None,
     everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Write to DIR/TASK/ENTRY/.")] = Path(
-        "leaderboard/entries"
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Write to DIR/TASK/ENTRY/, a study to DIR/NAME/; default: leaderboard/entries, leaderboard/plans.",
+        ),
+    ] = None,
     rliable: Annotated[
         Path | None,
         typer.Option(
@@ -50,8 +58,9 @@ def export(
 ) -> None:
     """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
 
-    Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some
-    seeds again.
+    Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some seeds again. A study
+    with looks is written with the curves of its seeds, so that others can compute its verdicts (`qrlsuite show
+    DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
 
     With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
     thresholds (in [0, 1], more is better), of every entry that was trained on all tasks of --across with the same
@@ -64,6 +73,15 @@ def export(
         return
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
+    names = list(dict.fromkeys(entries or []))
+    if with_looks := [name for name in names if name.endswith(".toml") or published_studies.folder_of(name)]:
+        if len(names) > len(with_looks):
+            raise OptionError(
+                "export entries and studies by commands of their own: they go to different folders"
+            )
+        _studies(with_looks, out or Path("leaderboard/plans"), runs, json_output)
+        return
+    out = out or Path("leaderboard/entries")
     lookup.check_tasks(runs, task)
     tasks = [task] if task else []
     if everything:
@@ -71,7 +89,7 @@ def export(
         for line in refused:
             typer.echo(f"left out: {line}", err=True)
     else:
-        selected = [collect.find(runs, name, tasks=tasks) for name in dict.fromkeys(entries or [])]
+        selected = [collect.find(runs, name, tasks=tasks) for name in names]
     written = []
     for entry in selected:
         try:
@@ -102,6 +120,18 @@ def export(
         typer.echo(json.dumps(written))
     else:
         typer.echo(f"next: {command('verify', str(out), '--rerun', '2')}")
+
+
+def _studies(names: list[str], out: Path, runs: Path, json_output: bool) -> None:
+    """Write studies with looks."""
+    folders = [published_studies.export(StudyWithLooks(studies.find(name), runs), out) for name in names]
+    if json_output:
+        typer.echo(json.dumps([{"folder": str(folder)} for folder in folders]))
+        return
+    for folder in folders:
+        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        typer.echo(f"wrote {folder} ({size / 1000:.0f} kB)")
+    typer.echo(f"next: {command('show', str(folders[-1]))}")
 
 
 def _rliable(

@@ -29,7 +29,7 @@ def import_entries(
         Path,
         typer.Argument(
             metavar="FOLDER",
-            help="A results folder, a folder that `export` or `decide export` wrote, or one entry's folder in it.",
+            help="A results folder, a folder that `export` wrote, or one entry's folder in it.",
         ),
     ],
     runs: RunsOption = Path("runs"),

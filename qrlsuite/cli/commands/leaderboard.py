@@ -67,7 +67,7 @@ def leaderboard(
         str | None,
         typer.Option(
             "--study",
-            help="Only the entries of this study (see `qrlsuite study list`), or of a study file.",
+            help="Only the entries of this study (see `qrlsuite list studies`), or of a study file.",
             autocompletion=names_of("studies"),
         ),
     ] = None,
@@ -117,8 +117,8 @@ def leaderboard(
     task's grid, by intervals of the sample complexity.
 
     With --published, your own copy of a published entry is shown too if it has fewer epochs. --across compares
-    entries that were trained on several tasks with the same options. The page also shows the plans of `qrlsuite
-    decide` in the results folder.
+    entries that were trained on several tasks with the same options. The page also shows the studies with
+    looks in the results folder.
 
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all. Entries whose record does not hold it, or not so that it can be compared, have no rank.
@@ -216,7 +216,7 @@ def _write(sheets: Sequence[Sheet], format_: Format) -> None:
 
 
 def _tasks_of(board: Leaderboard, task: str | None, study: str | None) -> list[str]:
-    """Return the tasks whose decision plans a page shows; none means all."""
+    """Return the tasks whose studies with looks a page shows; none means all."""
     if task is not None:
         return [task]
     return sorted({section.task for section in board.sections}) if study is not None else []
@@ -285,15 +285,15 @@ def _page(
     across: several.AcrossBoard | None = None,
     costs: CostBoard | None = None,
 ) -> bool:
-    """Write the page, with the decision plans of the tasks; returns whether there is anything to show."""
-    plans, unreadable = published_studies.collected(runs, tasks, published)
+    """Write the page, with the studies with looks of the tasks; returns whether there is anything to show."""
+    studies, unreadable = published_studies.collected(runs, tasks, published)
     for line in unreadable:
         typer.echo(f"left out: {line}", err=True)
-    if not board.sections and not plans:
+    if not board.sections and not studies:
         return False
     path = output or runs / "leaderboard.html"
     shown = replace(board, refused=(*board.refused, *unreadable))
-    write_atomically(path, report.render(shown, plans=plans, across=across, costs=costs).encode())
+    write_atomically(path, report.render(shown, studies=studies, across=across, costs=costs).encode())
     typer.echo(f"wrote {path}")
     return True
 

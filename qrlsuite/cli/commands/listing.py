@@ -52,10 +52,24 @@ def list_things(
             for k, r in known
             if kind is None or k == accepted[kind]
         ]
+        rows += _published_studies() if kind in (None, "studies") else []
     if json_output:
         typer.echo(json.dumps(rows))
         return
     _print(rows)
+
+
+def _published_studies() -> list[dict[str, str]]:
+    """Return the studies with looks that come with the suite; like a task, each is known by its file alone."""
+    from qrlsuite.leaderboard.shelf import published_studies
+
+    found = {
+        name: published_studies.load(published_studies.PUBLISHED / name) for name in published_studies.names()
+    }
+    return [
+        {"kind": "studies", "name": name, "summary": study.file.summary, "distribution": "qrlsuite"}
+        for name, study in found.items()
+    ]
 
 
 def _list_plugins(known: Registry, json_output: bool) -> None:

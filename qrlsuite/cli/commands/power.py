@@ -52,8 +52,8 @@ def power(
     """Say how many seeds it takes to find that another entry is 10, 25 or 50 percent slower than this one.
 
     For two entries, also say how many it takes to find the difference between them. Pairs are simulated from the
-    curves and judged by rule `times` at alpha = .05: all seeds at once, and by a plan as `qrlsuite decide` runs
-    it.
+    curves and judged by rule `times` at alpha = .05: all seeds at once, and with looks, as
+    `qrlsuite study new` writes them.
 
     Example: qrlsuite power "mlp width=64" --task beam6g --published
     """
@@ -161,7 +161,7 @@ def _show(
     draws: int,
 ) -> None:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in ("difference", "power", "seeds, all at once", "seeds by a plan: mean (most)", "its looks"):
+    for column in ("difference", "power", "seeds, all at once", "seeds with looks: mean (most)", "its looks"):
         table.add_column(column, justify="left" if column in ("difference", "its looks") else "right")
     before = None
     for row in rows:

@@ -14,25 +14,26 @@ from qrlsuite.circuit import drawing, export
 from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
-from qrlsuite.engine.terminal import printable_lines
+from qrlsuite.engine.terminal import printable_lines, table_console
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.catalog import describe, hooks
 from qrlsuite.leaderboard import pictures, rules
-from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf import collect, published_studies
 from qrlsuite.leaderboard.shelf import published as published_entries
 from qrlsuite.options import parse_setting
 from qrlsuite.results import codes, lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, write_atomically
 from qrlsuite.results.survey import outline
+from qrlsuite.studies.outcome import StudyOutcome
 
 
 def show(
     name: Annotated[
         str,
         typer.Argument(
-            help="A task, model, algorithm, environment, ansatz, or an entry: name, label or folder."
+            help="A task, model, algorithm, environment, ansatz, study, or an entry: name, label or folder."
         ),
     ],
     second: Annotated[
@@ -68,20 +69,29 @@ def show(
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Show options with their defaults and meaning, a task's protocol, or how an entry was made.
+    """Show options with their defaults and meaning, a task's protocol, how far a study is, or how an entry was made.
+
+    A study is given by name, or as its file or the folder of a published one. Of a study you see the seeds that are
+    finished and what the missing ones will take; of a study with looks what is decided, and what open pairs need.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp --qubits 4;
-    qrlsuite show ansatz iqp --format qasm3; qrlsuite show "cartpole/reinforce mlp" --published
+    qrlsuite show ansatz iqp --format qasm3; qrlsuite show fig7 --published;
+    qrlsuite show "cartpole/reinforce mlp" --published
     """
     manual = _hook(name, second)
     if manual is not None:
         typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
         return
     kind, target = _kind(name, second)
+    if kind in (None, "studies") and (target.endswith(".toml") or published_studies.folder_of(target)):
+        kind = "studies"
     known = registry.load()
     kinds = [k for k in registry.KINDS if (kind in (None, k)) and target in known.entries[k]]
     if target.startswith("gym:") and kind in (None, "tasks"):
         kinds = ["tasks"]
+    if kind == "studies" or kinds == ["studies"]:
+        _show_study(target, runs, published, json_output)
+        return
     if not kinds and kind is None:
         folder = _entry_folder(runs, target, published)
         if folder is not None:
@@ -90,6 +100,7 @@ def show(
             return
     if not kinds:
         names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
+        names += published_studies.names()
         more = "; --published looks among the published entries, too" if kind is None else ""
         raise UnknownNameError(f"nothing called '{target}'{nearest(target, names)}{more}")
     if len(kinds) > 1:
@@ -117,6 +128,19 @@ def show(
             return
         content["drawing"] = _draw(target, *size, settings or [], figure, content)
     typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
+
+
+def _show_study(name: str, runs: Path, published: bool, json_output: bool) -> None:
+    from qrlsuite import api  # what it needs is slow to import, and nothing else here needs it
+    from qrlsuite.cli.commands.study import print_outcome
+
+    found = api.read_study(name, runs=runs, published=published)
+    if json_output:
+        typer.echo(json.dumps(found.as_dict()))
+    elif isinstance(found, StudyOutcome):
+        print_outcome(found)
+    else:
+        table_console().print(found, soft_wrap=True)
 
 
 def _hook(first: str, second: str | None) -> dict[str, str] | None:

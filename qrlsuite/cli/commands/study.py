@@ -1,4 +1,4 @@
-"""`qrlsuite study`: run a paper's experiments by name, and draw their pictures."""
+"""`qrlsuite study`: run experiments by name, with or without looks, and draw their pictures."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from qrlsuite import options, registry
+from qrlsuite import api, options, registry
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -24,26 +26,30 @@ from qrlsuite.cli.training import (
     where_of,
 )
 from qrlsuite.engine.missing import require_same_code
-from qrlsuite.engine.terminal import table_console
+from qrlsuite.engine.terminal import command, table_console
+from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.studies import NOTHING, Drawn
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.results.text import counted, duration_range
+from qrlsuite.statistics.sequential import Decision, Spending
 from qrlsuite.studies import runner
-from qrlsuite.studies.study import Member, Study, load
+from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.outcome import StudyOutcome, versus
+from qrlsuite.studies.study import Member, Study
 
-app = typer.Typer(no_args_is_help=True, help="A paper's experiments by name: list, status, show, run, draw.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Run experiments by name, a paper's or your own; compare entries with as many seeds as it takes.",
+)
 
 ALL = "all"
 """In the place of a study's name: every registered one."""
 
 StudyArgument = Annotated[
-    str, typer.Argument(metavar="STUDY", help="A study (see `qrlsuite study list`) or a study file's path.")
-]
-SomeStudies = Annotated[
-    list[str] | None, typer.Argument(metavar="[STUDY]...", help="Studies, or files; default: all.")
+    str, typer.Argument(metavar="STUDY", help="A study (see `qrlsuite list studies`) or a study file's path.")
 ]
 StudyOrAll = Annotated[
     str, typer.Argument(metavar="STUDY", help="A study, a study file's path, or `all` that are registered.")
@@ -82,100 +88,80 @@ OutOption = Annotated[
 ]
 
 
-@app.command("list")
-def list_studies(json_output: JsonOption = False) -> None:
-    """List the studies: those of the suite, and those of plugins.
+@app.command()
+def new(
+    path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The file to write.")],
+    entries: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="ENTRY ENTRY ...",
+            help="Two or more: 'mlp width=64' 'vqc-native qubits=10'; tuned: 'mlp preset=FILE.toml'.",
+        ),
+    ],
+    task: Annotated[
+        str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
+    ],
+    algorithm: Annotated[
+        str | None,
+        typer.Option("--algorithm", help="The algorithm of entries that name none; default: the task's."),
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="Of entries that name none: one of the task's presets.")
+    ] = None,
+    epochs: EpochsOption = None,
+    looks: Annotated[
+        str, typer.Option("--looks", metavar="N,M,...", help="Seeds of each entry at each look.")
+    ] = "20,40,60,80,100",
+    alpha: Annotated[
+        float, typer.Option("--alpha", help="Probability of any false difference, over all pairs and looks.")
+    ] = 0.05,
+    spending: Annotated[Spending, typer.Option("--spending", help="How alpha is spent over the looks.")] = (
+        Spending.POCOCK
+    ),
+    margin: Annotated[
+        float, typer.Option("--margin", help="Entries that differ by less count as equal: 0.1 is 10 percent.")
+    ] = 0.1,
+    first_seed: Annotated[
+        int | None,
+        typer.Option(
+            "--first-seed",
+            min=0,
+            help="Where the study's seeds begin; default: the first unused block from 10000.",
+        ),
+    ] = None,
+    reason: Annotated[
+        str, typer.Option("--reason", help="Why the first look comes before 20 seeds, if it does.")
+    ] = "",
+    runs: RunsOption = Path("runs"),
+    json_output: JsonOption = False,
+) -> None:
+    """Write a study with looks: it compares entries with as many seeds as it takes. Trains nothing.
 
-    Example: qrlsuite study list
+    Every pair is compared. To compare only some pairs, add [[looks.questions]] with these pairs to the file.
+
+    Example: qrlsuite study new width.toml "mlp width=64" "mlp width=32" --task beam6g
     """
-    known = registry.load()
-    rows = []
-    for name in known.names("studies"):
-        origin = known.entries["studies"][name].distribution
-        file = load(name).file
-        rows.append(
-            {
-                "name": name,
-                "summary": file.summary,
-                "source": file.source,
-                "core_hours": file.core_hours,
-                "distribution": origin,
-            }
-        )
+    outcome = api.new_study(
+        path,
+        entries,
+        task=task,
+        algorithm=algorithm,
+        preset=preset,
+        epochs=epochs,
+        looks=_numbers(looks),
+        alpha=alpha,
+        spending=str(spending),
+        margin=margin,
+        first_seed=first_seed,
+        reason=reason,
+        runs=runs,
+    )
     if json_output:
-        typer.echo(json.dumps(rows))
+        typer.echo(json.dumps(outcome.as_dict()))
         return
-    width = max((len(str(row["name"])) for row in rows), default=0)
-    for row in rows:
-        origin = "" if row["distribution"] == "qrlsuite" else f"  [{row['distribution']}]"
-        typer.echo(f"{row['name']:<{width}}  {row['summary']}{origin}")
-
-
-@app.command()
-def show(
-    name: StudyArgument,
-    seeds: SeedsOption = None,
-    epochs: EpochsOption = None,
-    settings: SetOption = None,
-    models: MapOption = None,
-    only: OnlyOption = None,
-    engine: EngineOption = "local",
-    workers: WorkersOption = None,
-    published: PublishedOption = False,
-    runs: RunsOption = Path("runs"),
-    json_output: JsonOption = False,
-) -> None:
-    """Show a study's entries: finished seeds, missing seeds, and the time the missing ones will take.
-
-    Published seeds are counted beside those that you trained, which alone `qrlsuite study run` continues.
-
-    Example: qrlsuite study show fig7 --published
-    """
-    where = where_of(engine, workers)
-    study, members = _members(name, settings, models, only)
-    seed_numbers = None if seeds is None else parse_seeds(seeds)
-    items = runner.survey(members, runs, where, speed.known(runs), seed_numbers, epochs)
-    counts = studies.published_seeds(items) if published else None
-    overview = runner.Overview(study, items, where.workers, counts)
-    if json_output:
-        typer.echo(json.dumps(overview.as_dict()))
-    else:
-        table_console().print(overview, soft_wrap=True)
-
-
-@app.command()
-def status(
-    names: SomeStudies = None,
-    seeds: SeedsOption = None,
-    epochs: EpochsOption = None,
-    engine: EngineOption = "local",
-    workers: WorkersOption = None,
-    published: PublishedOption = False,
-    runs: RunsOption = Path("runs"),
-    json_output: JsonOption = False,
-) -> None:
-    """Show every study in a line: finished seeds, decided pairs of entries, and the core-hours of what is missing.
-
-    With --published, the published seeds have a column, and pairs of published entries count as well.
-
-    Example: qrlsuite study status --published
-    """
-    where = where_of(engine, workers)
-    seed_numbers = None if seeds is None else parse_seeds(seeds)
-    speeds = speed.known(runs)
-    rows = []
-    for name in names or registry.load().names("studies"):
-        study = _load(name)
-        members = study.members()
-        items = runner.survey(members, runs, where, speeds, seed_numbers, epochs)
-        rows.append((study, items, studies.decided_pairs(studies.read(runs, members, published).values())))
-    every = [item for _, items, _ in rows for item in items]
-    counts = studies.published_seeds(every) if published else None
-    overview = runner.Status(rows, where.workers, counts)
-    if json_output:
-        typer.echo(json.dumps(overview.as_dict()))
-    else:
-        table_console().print(overview, soft_wrap=True)
+    print_outcome(outcome)
+    typer.echo(f"wrote {path}")
+    typer.echo(f"next: {command('study', 'run', str(path), runs=runs)}")
 
 
 @app.command()
@@ -213,17 +199,25 @@ def run(
     any time, or give a --budget; the same command continues. `all` begins with the study that lacks least, so that
     the next answer comes as soon as it can.
 
+    A study with looks is trained look by look, until every pair is decided or the last look was taken. An entry stops
+    when all its pairs are closed.
+
     Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run all --budget 8h
     """
     _check_format(format_)
     where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
     limit = seconds(budget) if budget is not None else None
+    if name != ALL and studies.find(name).file.looks is not None:
+        _require_none(name, seeds=seeds, epochs=epochs, set=settings, model_map=models, only=only)
+        _require_none(name, fresh=fresh, dry_run=dry_run)
+        _take_looks(name, where, limit, runs, json_output)
+        return
     seed_numbers = None if seeds is None else parse_seeds(seeds)
     speeds = speed.known(runs)
     chosen = _chosen(name, settings, models, only)
 
     def items_of(members: Sequence[Member]) -> list[runner.PendingEntry]:
-        return runner.survey(members, runs, where, speeds, seed_numbers, epochs)
+        return runner.find_pending(members, runs, where, speeds, seed_numbers, epochs)
 
     if len(chosen) > 1:
         chosen.sort(key=lambda pair: runner.work_left(items_of(pair[1])))
@@ -246,9 +240,9 @@ def run(
             session.run(items_of(members))
         except KeyboardInterrupt:
             if not json_output:
-                _say(studies.write(study, members, runs, format_))
+                _say(studies.write(study.name, studies.draw(study, members, runs), runs, format_))
             raise typer.Exit(130) from None
-        drawn = studies.write(study, members, runs, format_)
+        drawn = studies.write(study.name, studies.draw(study, members, runs), runs, format_)
         if not json_output:
             _say(drawn)
             continue
@@ -290,13 +284,20 @@ def draw(
 ) -> None:
     """Draw a study's pictures from finished seeds; trains nothing.
 
-    The sample complexity of few seeds is another quantity than that of many: --seeds 20 draws equal numbers.
+    The sample complexity of few seeds is another quantity than that of many: --seeds 20 draws equal numbers. Of a study
+    with looks, every pair is drawn below its question, and every entry by its steps below threshold.
 
     Example: qrlsuite study draw degree --published --seeds 20 --format pdf
     """
     _check_format(format_)
-    study, members = _members(name, settings, models, only)
-    drawn = studies.write(study, members, runs, format_, published, seeds)
+    study = studies.find(name)
+    if study.file.looks is not None:
+        _require_none(name, seeds=seeds, set=settings, model_map=models, only=only)
+        pictures = studies.draw_outcome(studies.read_outcome(name, runs))
+    else:
+        members = runner.select(study, *_changes(settings, models), only or [])
+        pictures = studies.draw(study, members, runs, with_published=published, seeds=seeds)
+    drawn = studies.write(study.name, pictures, runs, format_)
     if not json_output:
         _say(drawn)
     if not any(each.path for each in drawn):
@@ -314,18 +315,83 @@ def _check_format(format_: str) -> None:
         raise OptionError(f"--format {format_}{nearest(format_, ['png', 'pdf', 'svg'])}")
 
 
-def _load(name: str) -> Study:
-    """Load a study whose pictures exist."""
-    study = load(name)
-    studies.check(study)
-    return study
+@app.command()
+def end(name: StudyArgument, runs: RunsOption = Path("runs")) -> None:
+    """End a study with looks before all is decided: open pairs stay open, and it cannot go on.
+
+    Example: qrlsuite study end width.toml
+    """
+    StudyWithLooks(studies.find(name), runs).end()
+    typer.echo(f"ended; what was decided stays: {command('show', name, runs=runs)}")
+
+
+def _require_none(name: str, **given: object) -> None:
+    """Refuse options that would change what a study with looks has fixed."""
+    for option, value in given.items():
+        if value:
+            raise OptionError(
+                f"study '{name}' has looks, which fix what is trained: leave --{option.replace('_', '-')} out; "
+                f"{command('show', name)} says what it needs"
+            )
+
+
+def _take_looks(name: str, where: Where, budget: float | None, runs: Path, json_output: bool) -> None:
+    """Train a study with looks, and say what every look decides."""
+    console = Console(stderr=True, quiet=json_output, highlight=False)
+    study = StudyWithLooks(studies.find(name), runs)
+    session = runner.Session(study.folder, where, speed.known(study.folder, runs), budget, quiet=json_output)
+    try:
+        outcome = runner.take_looks(study, session, lambda so_far: _say_look(so_far.state.decision, console))
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    if json_output:
+        typer.echo(json.dumps(outcome.as_dict()))
+        return
+    for line in outcome.submitted:
+        typer.echo(line)
+    print_outcome(outcome)
+    if missing := outcome.state.missing:
+        lacking = ", ".join(f"{counted(count, 'seed')} of {name}" for name, count in missing.items())
+        who = "others train" if budget is None else "the budget is used up, or others train"
+        typer.echo(f"{who} {lacking}: repeat this command when they have finished")
+    elif outcome.finished:
+        typer.echo(f"next: {command('study', 'draw', name, runs=runs)}")
+
+
+def print_outcome(outcome: StudyOutcome) -> None:
+    """Print what a study with looks has come to: tables as wide as there is room, sentences as they are."""
+    console = Console(highlight=False, soft_wrap=True, markup=False)
+    for part in outcome.parts():
+        (table_console() if isinstance(part, Table) else console).print(part)
+
+
+def _say_look(decision: Decision, console: Console) -> None:
+    """Say what the newest look decided, while more is trained."""
+    looks = max((len(pair.p) for pair in decision.pairs), default=0)
+    if not looks:
+        return
+    console.print(f"\n[bold]look at {decision.plan.looks[looks - 1]} seeds[/bold]")
+    for pair in decision.pairs:
+        if len(pair.p) == looks:
+            console.print(
+                f"{versus(pair)}: {pair.verdict} (p = {pair.p[-1]:.2g}, level {pair.levels[-1]:.2g})",
+                markup=False,
+                soft_wrap=True,
+            )
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise OptionError(f"--looks {text}: write numbers of seeds, for example --looks 20,40,60") from None
 
 
 def _members(
     name: str, settings: list[str] | None, models: list[str] | None, only: list[str] | None
 ) -> tuple[Study, list[Member]]:
     """Load a study and resolve its entries."""
-    study = _load(name)
+    study = studies.find(name)
     return study, runner.select(study, *_changes(settings, models), only or [])
 
 
@@ -355,7 +421,7 @@ def _chosen(
     if name != ALL:
         return [_members(name, settings, models, only)]
     changes, chosen, refusals = _changes(settings, models), [], []
-    for study in map(_load, registry.load().names("studies")):
+    for study in map(studies.find, registry.load().names("studies")):
         try:
             chosen.append((study, runner.select(study, *changes, only or [])))
         except OptionError as error:

@@ -48,12 +48,12 @@ def verify(
         typer.Option(
             "--base",
             metavar="REV",
-            help="Check what of leaderboard/ differs from this git commit, entries and plans, in place of PATH.",
+            help="Check what of leaderboard/ differs from this git commit, entries and studies, in place of PATH.",
         ),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check published entries and plans, and train some of their seeds again.
+    """Check published entries and studies, and train some of their seeds again.
 
     Files: hashes, names and labels are computed again; every seed must have every epoch, and scores in range.
     With --rerun, seeds of each entry are drawn after its files are read, and trained from nothing; what that costs is
@@ -63,7 +63,7 @@ def verify(
     circuit executions are counted again. Reports of one digest belong together: one failure among them stands. Exit
     code 1 if an entry fails.
 
-    With --base REV, what is checked are the entries and plans of the repository around this folder, below
+    With --base REV, what is checked are the entries and studies of the repository around this folder, below
     leaderboard/, that differ from a commit or are not committed; a file with a name that no published file has is
     refused.
 
@@ -72,14 +72,14 @@ def verify(
     if base is not None and paths:
         raise OptionError("give PATH or --base, not both")
     given = list(paths or published.folders())
-    plan_folders = [path for path in given if published_studies.is_published(path)]
+    study_folders = [path for path in given if published_studies.is_published(path)]
     if base is not None:
-        given, plan_folders = changed(base, Path.cwd())
+        given, study_folders = changed(base, Path.cwd())
     folders = [folder for path in given for folder in checks.find(path)]
-    checked_plans = [_plan(folder) for folder in plan_folders]
+    checked_studies = [_study(folder) for folder in study_folders]
     if not json_output:
-        for plan in checked_plans:
-            _say(plan["ok"], plan["plan"], plan["message"])
+        for study in checked_studies:
+            _say(study["ok"], study["study"], study["message"])
     wanted = _wanted(rerun)
     verdicts = []
     with Progress(
@@ -103,13 +103,13 @@ def verify(
             if not json_output:
                 _say(verdicts[-1].ok, verdicts[-1].name, _message(verdicts[-1]))
     if json_output:
-        typer.echo(json.dumps({"entries": [v.as_dict() for v in verdicts], "plans": checked_plans}))
+        typer.echo(json.dumps({"entries": [v.as_dict() for v in verdicts], "studies": checked_studies}))
     elif base is not None and not folders:
         typer.echo(f"no entry differs from {printable(base)}")
     else:
         good = sum(verdict.ok for verdict in verdicts)
         typer.echo(f"{good} of {len(verdicts)} entries ok")
-    if not all([*(verdict.ok for verdict in verdicts), *(plan["ok"] for plan in checked_plans)]):
+    if not all([*(verdict.ok for verdict in verdicts), *(study["ok"] for study in checked_studies)]):
         raise typer.Exit(1)
 
 
@@ -117,14 +117,14 @@ def _say(ok: bool, name: str, message: str) -> None:
     typer.echo(f"{'ok    ' if ok else 'FAILED'} {printable(f'{name}: {message}')}")
 
 
-def _plan(folder: Path) -> dict[str, Any]:
-    """Read a published plan, and say what is wrong with it."""
+def _study(folder: Path) -> dict[str, Any]:
+    """Read a published study, and say what is wrong with it."""
     try:
         outcome = published_studies.read(folder)
     except QrlSuiteError as error:
-        return {"plan": folder.name, "folder": str(folder), "ok": False, "message": str(error)}
-    message = f"plan sound: {len(outcome.pairs)} pairs, its verdicts computed again"
-    return {"plan": folder.name, "folder": str(folder), "ok": True, "message": message}
+        return {"study": folder.name, "folder": str(folder), "ok": False, "message": str(error)}
+    message = f"study sound: {len(outcome.pairs)} pairs, its verdicts computed again"
+    return {"study": folder.name, "folder": str(folder), "ok": True, "message": message}
 
 
 def _wanted(rerun: str) -> checks.Wanted:
