@@ -69,6 +69,11 @@ __all__ = [
 
 show_figures_in_notebook()
 
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
 

@@ -239,6 +239,7 @@ class RunDisplay:
         self.estimate = CostEstimate(missing.groups, missing.epochs, workers)
         self.workers = min(workers, max(1, len(missing.groups)))
         self.again = again
+        self.new_folder = not missing.runs.exists()
         self.bar = Bar(self.console)
         self.deadline: float | None = None
         """The moment, by `time.monotonic`, at which training is stopped."""
@@ -266,6 +267,13 @@ class RunDisplay:
             f"[bold]{escape(self.entry.label)}[/bold] on [bold]{task.name}[/bold]  "
             f"({escape(str(self.missing.store.path))})"
         )
+        if self.new_folder:
+            self.console.print(
+                f"results go to the new folder {self.missing.runs.absolute()}; "
+                f"{'--runs or QRLSUITE_RUNS' if self.again == 'command' else '`runs`'} names another",
+                markup=False,
+                soft_wrap=True,
+            )
         todo = sum(len(group.seeds) for group in self.groups)
         if busy:
             are = "is" if len(busy) == 1 else "are"
@@ -423,6 +431,7 @@ class RunDisplay:
         protocol_seeds = self.entry.task.file.protocol.seeds
         if summary["seeds"] < protocol_seeds:
             self.console.print(f"provisional: the task's protocol asks for {protocol_seeds} seeds")
+        self.console.print(f"results: {self.missing.store.path}", markup=False, soft_wrap=True)
         name = self.entry.task.name
         for arguments in (("leaderboard", "--task", name), ("plot", "curves", "--task", name)):
             self.console.print(

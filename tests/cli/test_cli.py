@@ -34,6 +34,8 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         done = qrlsuite("run", "--task", task, "--model", "mlp", "--set", f"width={width}", "--runs", runs)
         assert done.returncode == 0, done.stderr
         assert "4 seeds complete" in done.stderr
+        assert f"results: {runs}/" in done.stderr
+        assert (f"results go to the new folder {runs};" in done.stderr) == (width == "16")
     again = qrlsuite("run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs, "--json")
     assert json.loads(again.stdout)["seeds"] == 4
 

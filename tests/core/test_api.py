@@ -235,3 +235,7 @@ def test_importing_the_package_imports_no_library() -> None:
         "assert not {'torch', 'optuna'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_completion_offers_the_functions_alone() -> None:
+    assert dir(api) == sorted(api.__all__)
