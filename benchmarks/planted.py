@@ -53,7 +53,7 @@ def fit(name: str, starts: int, steps: int, seed: int = 0) -> tuple[int, list[fl
     """Return the number of parameters, and the share of right classes of unseen points after every start, ascending."""
     points, classes = examples(6000)
     model, options = MODELS[name]
-    spec = registry.model(model)
+    spec = registry.get(specs.ModelSpec, model)
     built = specs.resolve(spec.options)(**options)
     modules = [
         specs.resolve(spec.build)(2, 4, built, torch.Generator().manual_seed(1000 * seed + s))

@@ -20,7 +20,7 @@ from qrlsuite.testing.tracker import RECORD, RUN
 def measure(name: str, runs: int, epochs: int) -> tuple[float, float, float]:
     """Return processor seconds of the first run's beginning, of each other run, and of an epoch of a run."""
     with tempfile.TemporaryDirectory() as folder:
-        tracker = specs.resolve(registry.tracker(name).factory)(folder)
+        tracker = specs.resolve(registry.get(specs.TrackerSpec, name).factory)(folder)
         every = []
         for seed in range(runs):
             (own := Path(folder, "results", "task", "entry", f"seed-{seed:04d}")).mkdir(parents=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import RuleSpec, resolve
@@ -70,14 +70,14 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     name = DEFAULT if name == PAPER else name
     known = registry.load()
     try:
-        registered = known.get("rules", name)
+        registered = known.get(specs.RuleSpec, name)
     except UnknownNameError:
         if name in GONE:
             raise UnknownNameError(f"rule '{name}' is gone: take '{TIMES}'") from None
-        choices = [PAPER, *known.names("rules")]
+        choices = [PAPER, *known.names(specs.RuleSpec)]
         raise UnknownNameError(f"unknown rule '{name}'{nearest(name, choices)}") from None
-    spec = cast(RuleSpec, registered.spec)
-    origin = f"rule '{name}' of distribution '{registered.distribution}'"
+    spec = registered.spec
+    origin = f"{spec.title} of distribution '{registered.distribution}'"
     try:
         rule = resolve(spec.factory)()
     except Exception as error:

@@ -81,7 +81,7 @@ def find(name: str) -> Study:
     QrlSuiteError
         If it is malformed, or a picture of it is unknown or cannot have its settings.
     """
-    registered = registry.load().names("studies")
+    registered = registry.load().names(specs.StudySpec)
     if not name.endswith(".toml") and name not in registered:
         if (folder := published_studies.folder_of(name)) is None:
             files = [f"{name}.toml"] if Path(f"{name}.toml").exists() else []
@@ -135,7 +135,7 @@ def check(study: Study) -> None:
             rule = "needs" if kind.data == "deployed" else "takes no"
             raise OptionError(f"{location}.evaluation.deployed: picture '{picture.kind}' {rule} deployed")
         if deployed is not None:
-            backend = specs.resolve(registry.circuit_backend(deployed.backend).options)
+            backend = specs.resolve(registry.get(specs.CircuitBackendSpec, deployed.backend).options)
             for value in deployed.values:
                 options.build(backend, deployed.chosen(value), f"{location}.evaluation.deployed")
 

@@ -82,11 +82,9 @@ def _register(known: Registry) -> None:
 
     from qrlsuite import specs
 
-    for registered in known.entries["environments"].values():
+    for registered in known.of(specs.EnvironmentSpec).values():
         spec = registered.spec
-        if not isinstance(spec, specs.EnvironmentSpec) or spec.entry_point is None:
-            continue
-        if spec.gymnasium_id not in gymnasium.registry:
+        if spec.entry_point is not None and spec.gymnasium_id not in gymnasium.registry:
             gymnasium.register(spec.gymnasium_id, entry_point=spec.entry_point)
 
 

@@ -3,7 +3,7 @@
 `load()` reads the entry points of the group `qrlsuite`, built-ins and third parties alike. A plugin that does not
 fit this version of the suite, cannot be imported, implements a hook that does not exist, or whose hook raises, is
 reported by the name of its distribution and skipped as a whole; everything else works. A name registered twice is
-an error that names both distributions when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
+an error that names both places when it is looked up. With `qrlsuite --strict`, or `QRLSUITE_STRICT=1`, the
 first of these problems ends the command. `QRLSUITE_LOAD_PLUGINS=acme-qrl,other` loads the plugins of these
 distributions only, and an empty value those of the suite only.
 """
@@ -18,7 +18,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any, Generic, TypeVar
 
 import pluggy
 
@@ -32,21 +33,8 @@ STRICT = "QRLSUITE_STRICT"
 LOAD_PLUGINS = "QRLSUITE_LOAD_PLUGINS"
 """Environment variable: load the plugins of these distributions only, separated by commas, beside the suite's own."""
 
-KINDS: dict[str, type[specs.Spec]] = {
-    "environments": specs.EnvironmentSpec,
-    "models": specs.ModelSpec,
-    "algorithms": specs.AlgorithmSpec,
-    "tasks": specs.TaskSpec,
-    "ansatzes": specs.AnsatzSpec,
-    "circuit_backends": specs.CircuitBackendSpec,
-    "rules": specs.RuleSpec,
-    "engines": specs.EngineSpec,
-    "studies": specs.StudySpec,
-    "trackers": specs.TrackerSpec,
-}
-"""Kinds of registered things, in the plural: hook `register_<kind>`, and the spec that it takes."""
-
-SINGULAR = {kind: kind[:-1] for kind in KINDS} | {"ansatzes": "ansatz", "studies": "study"}
+S_co = TypeVar("S_co", bound=specs.Spec, covariant=True)
+S = TypeVar("S", bound=specs.Spec)
 
 
 class PluginWarning(UserWarning):
@@ -54,11 +42,12 @@ class PluginWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class Registered:
-    """A spec and the distribution that registered it."""
+class Registered(Generic[S_co]):
+    """A spec, the distribution that registered it, and the file and line where."""
 
-    spec: specs.Spec
+    spec: S_co
     distribution: str
+    place: str = ""
 
 
 @dataclass
@@ -95,22 +84,28 @@ class Registry:
     """All registered specs by kind and name, all plugins, and the problems met while loading them."""
 
     manager: pluggy.PluginManager
-    entries: dict[str, dict[str, Registered]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
-    duplicates: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+    entries: dict[type[specs.Spec], dict[str, Registered[Any]]] = field(
+        default_factory=lambda: {kind: {} for kind in specs.KINDS.values()}
+    )
+    duplicates: dict[tuple[type[specs.Spec], str], list[Registered[Any]]] = field(default_factory=dict)
     plugins: list[Plugin] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     strict: bool = False
 
-    def names(self, kind: str) -> list[str]:
+    def of(self, kind: type[S]) -> Mapping[str, Registered[S]]:
+        """Return what is registered of a kind, by name."""
+        return self.entries[kind]
+
+    def names(self, kind: type[specs.Spec]) -> list[str]:
         """Return the sorted names of a kind."""
         return sorted(self.entries[kind])
 
-    def __iter__(self) -> Iterator[tuple[str, Registered]]:
-        for kind, entries in self.entries.items():
+    def __iter__(self) -> Iterator[Registered[specs.Spec]]:
+        for entries in self.entries.values():
             for name in sorted(entries):
-                yield kind, entries[name]
+                yield entries[name]
 
-    def get(self, kind: str, name: str) -> Registered:
+    def get(self, kind: type[S], name: str) -> Registered[S]:
         """Look up a spec.
 
         Raises
@@ -122,13 +117,12 @@ class Registry:
         """
         owners = self.duplicates.get((kind, name))
         if owners:
-            raise PluginError(_duplicate(kind, name, owners))
+            raise PluginError(_duplicate(owners))
         try:
-            return self.entries[kind][name]
+            return self.of(kind)[name]
         except KeyError:
-            singular = SINGULAR[kind].replace("_", " ")
             raise UnknownNameError(
-                f"unknown {singular} '{name}'{nearest(name, self.entries[kind])}"
+                f"unknown {specs.title(kind, name)}{nearest(name, self.entries[kind])}"
             ) from None
 
     def add_plugin(self, plugin: Any, distribution: str) -> dict[str, list[str]]:
@@ -137,7 +131,7 @@ class Registry:
         Returns
         -------
         dict
-            Names that it registered, by kind.
+            Names that it registered, by kind in the plural.
 
         Raises
         ------
@@ -146,16 +140,15 @@ class Registry:
             over something that is not a spec.
         """
         name = f"{distribution}:{getattr(plugin, '__name__', plugin)}"
-        handed: list[tuple[str, specs.Spec]] = []
+        handed: list[Registered[Any]] = []
         try:
             self.manager.register(plugin, name=name)
             self._know_hooks(plugin)
             others = [p for p in self.manager.get_plugins() if p is not plugin]
-            hooks = {"register": KINDS} | {f"register_{kind}": {kind: KINDS[kind]} for kind in KINDS}
-            for hook, kinds in hooks.items():
+            for hook, kind in hookspecs.REGISTER.items():
                 try:
                     self.manager.subset_hook_caller(hook, others)(
-                        register=functools.partial(_collect, handed, kinds)
+                        register=functools.partial(_collect, handed, kind, distribution)
                     )
                 except Exception as error:
                     reason = str(error) if isinstance(error, PluginError) else words(error)
@@ -167,29 +160,27 @@ class Registry:
                 f"plugin '{name.partition(':')[2]}' of distribution '{distribution}': {error}"
             ) from error
         registered: dict[str, list[str]] = {}
-        for kind, spec in handed:
-            registered.setdefault(kind, []).append(spec.name)
-            self._add(kind, spec, distribution)
+        for each in handed:
+            registered.setdefault(each.spec.kinds, []).append(each.spec.name)
+            self._add(each)
         return registered
 
     def _know_hooks(self, plugin: Any) -> None:
         """Refuse implementations of hooks that do not exist (pluggy's `check_pending`, for one plugin)."""
-        known = [
-            name for name in vars(hookspecs) if hasattr(vars(hookspecs)[name], f"{hookspecs.PROJECT}_spec")
-        ]
         for caller in self.manager.get_hookcallers(plugin) or []:
             optional = all(i.optionalhook for i in caller.get_hookimpls() if i.plugin is plugin)
+            if caller.name in hookspecs.RENAMED:
+                raise PluginError(f"the hook '{caller.name}' is now {hookspecs.RENAMED[caller.name]}")
             if not caller.has_spec() and not optional:
-                raise PluginError(f"there is no hook '{caller.name}'{nearest(caller.name, known)}")
+                raise PluginError(f"there is no hook '{caller.name}'{nearest(caller.name, hookspecs.HOOKS)}")
 
-    def _add(self, kind: str, spec: specs.Spec, distribution: str) -> None:
-        known = self.entries[kind].get(spec.name)
-        if known is None:
-            self.entries[kind][spec.name] = Registered(spec, distribution)
-            return
-        owners = self.duplicates.setdefault((kind, spec.name), [known.distribution])
-        owners.append(distribution)
-        self.report(_duplicate(kind, spec.name, owners))
+    def _add(self, new: Registered[specs.Spec]) -> None:
+        kind, name = type(new.spec), new.spec.name
+        first = self.entries[kind].setdefault(name, new)
+        if first is not new:
+            owners = self.duplicates.setdefault((kind, name), [first])
+            owners.append(new)
+            self.report(_duplicate(owners))
 
     def report(self, problem: str) -> None:
         """Note a problem and warn of it.
@@ -205,21 +196,23 @@ class Registry:
         warnings.warn(problem, PluginWarning, stacklevel=3)
 
 
-def _collect(handed: list[tuple[str, specs.Spec]], kinds: Mapping[str, type[specs.Spec]], spec: Any) -> None:
-    """Collect a spec that a hook registers, under the kind that its type says."""
-    for kind, expected in kinds.items():
-        if type(spec) is expected:
-            handed.append((kind, spec))
-            return
-    accepted = next(iter(kinds.values())).__name__ if len(kinds) == 1 else "spec of `qrlsuite.specs`"
-    raise PluginError(f"register() needs a {accepted}, got {type(spec).__name__}")
+def _collect(
+    handed: list[Registered[Any]], kind: type[specs.Spec], distribution: str, spec: specs.Spec
+) -> None:
+    """Collect a spec that a hook registers."""
+    if type(spec) is not kind:
+        raise PluginError(f"register() needs a {kind.__name__}, got {type(spec).__name__}")
+    caller = sys._getframe(1)
+    handed.append(Registered(spec, distribution, f"{caller.f_code.co_filename}:{caller.f_lineno}"))
 
 
-def _duplicate(kind: str, name: str, owners: list[str]) -> str:
-    subject = f"{SINGULAR[kind].replace('_', ' ')} '{name}' is registered"
-    if len(set(owners)) == 1:
-        return f"{subject} twice by {owners[0]}: give one of them another name"
-    return f"{subject} by both {' and '.join(owners)}: uninstall one of them (pip uninstall {owners[-1]})"
+def _duplicate(owners: list[Registered[specs.Spec]]) -> str:
+    subject = f"{owners[0].spec.title} is registered"
+    distributions, places = [each.distribution for each in owners], [each.place for each in owners]
+    if len(set(distributions)) == 1:
+        return f"{subject} twice by {distributions[0]}, {' and '.join(places)}: give one of them another name"
+    both = " and ".join(f"{each.distribution} ({each.place})" for each in owners)
+    return f"{subject} by both {both}: uninstall one of them (pip uninstall {distributions[-1]})"
 
 
 def words(error: BaseException) -> str:
@@ -245,13 +238,13 @@ def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
     chosen = os.environ.get(LOAD_PLUGINS)
     if chosen is not None:
         allowed = [word.strip() for word in chosen.split(",") if word.strip()]
-        owners = {_canonical(owner): owner for owner, _ in points}
+        owners = {canonical(owner): owner for owner, _ in points}
         for word in allowed:
-            if _canonical(word) not in owners:
+            if canonical(word) not in owners:
                 raise PluginError(
                     f"{LOAD_PLUGINS}: no installed distribution '{word}' has plugins{nearest(word, owners)}"
                 )
-        kept = {"qrlsuite", *(owners[_canonical(word)] for word in allowed)}
+        kept = {"qrlsuite", *(owners[canonical(word)] for word in allowed)}
         points = {key: point for key, point in points.items() if key[0] in kept}
     return sorted(
         ((key[0], point) for key, point in points.items()),
@@ -259,7 +252,7 @@ def _entry_points() -> list[tuple[str, metadata.EntryPoint]]:
     )
 
 
-def _canonical(distribution: str) -> str:
+def canonical(distribution: str) -> str:
     """Return a distribution's name as package indexes compare it (PEP 503)."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
@@ -282,7 +275,8 @@ def create(
         If strict, and a plugin is broken.
     """
     manager = pluggy.PluginManager(hookspecs.PROJECT)
-    manager.add_hookspecs(hookspecs)
+    hooks: Any = SimpleNamespace(**hookspecs.HOOKS)
+    manager.add_hookspecs(hooks)
     registry = Registry(manager, strict=strict)
     for distribution, point in points():
         version = point.dist.version if point.dist is not None else ""
@@ -336,44 +330,9 @@ def load() -> Registry:
     return registry
 
 
-def environment(name: str) -> specs.EnvironmentSpec:
-    """Look up an environment by name."""
-    return cast(specs.EnvironmentSpec, load().get("environments", name).spec)
-
-
-def model(name: str) -> specs.ModelSpec:
-    """Look up a model by name."""
-    return cast(specs.ModelSpec, load().get("models", name).spec)
-
-
-def algorithm(name: str) -> specs.AlgorithmSpec:
-    """Look up an algorithm by name."""
-    return cast(specs.AlgorithmSpec, load().get("algorithms", name).spec)
-
-
-def task(name: str) -> specs.TaskSpec:
-    """Look up a task by name."""
-    return cast(specs.TaskSpec, load().get("tasks", name).spec)
-
-
-def study(name: str) -> specs.StudySpec:
-    """Look up a study by name."""
-    return cast(specs.StudySpec, load().get("studies", name).spec)
-
-
-def tracker(name: str) -> specs.TrackerSpec:
-    """Look up a tracker by name."""
-    return cast(specs.TrackerSpec, load().get("trackers", name).spec)
-
-
-def ansatz(name: str) -> specs.AnsatzSpec:
-    """Look up an ansatz by name."""
-    return cast(specs.AnsatzSpec, load().get("ansatzes", name).spec)
-
-
-def circuit_backend(name: str) -> specs.CircuitBackendSpec:
-    """Look up a circuit backend by name."""
-    return cast(specs.CircuitBackendSpec, load().get("circuit_backends", name).spec)
+def get(kind: type[S], name: str) -> S:
+    """Look up a spec in this process's registry: `get(ModelSpec, "mlp")`."""
+    return load().get(kind, name).spec
 
 
 def required_versions(distribution: metadata.Distribution | None) -> str:

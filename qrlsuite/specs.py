@@ -9,9 +9,9 @@ from __future__ import annotations
 import importlib
 import re
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from qrlsuite.errors import PluginError
+from qrlsuite.errors import PluginError, UnknownNameError, nearest
 
 NAME = re.compile(r"[a-z][a-z0-9]*(?:[-_.][a-z0-9]+)*")
 WHOLE_NAME = f"^(?:{NAME.pattern})$"
@@ -46,11 +46,16 @@ class Spec:
 
     Attributes
     ----------
+    kind, kinds:
+        Its kind in the singular and in the plural: `kinds` is in the name of the hook that registers it.
     name:
         Unique within its kind; lower case, matching `NAME`.
     summary:
         One line for `qrlsuite list`.
     """
+
+    kind: ClassVar[str]
+    kinds: ClassVar[str]
 
     name: str
     summary: str
@@ -63,6 +68,11 @@ class Spec:
             )
         if not isinstance(self.summary, str) or not self.summary.strip() or "\n" in self.summary:
             raise PluginError(f"'{self.name}': the summary must be one line of text")
+
+    @property
+    def title(self) -> str:
+        """The kind and the name in words: `circuit backend 'native'`."""
+        return title(type(self), self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +131,8 @@ class EnvironmentSpec(NumericSpec):
         What `qrlsuite plot` can draw of it.
     """
 
+    kind, kinds = "environment", "environments"
+
     options: str
     gymnasium_id: str
     entry_point: str | None = None
@@ -156,6 +168,8 @@ class ModelSpec(NumericSpec):
         Name of a model that computes the same function much faster; recommended where training takes hours.
     """
 
+    kind, kinds = "model", "models"
+
     family: Literal["classical", "quantum"]
     options: str
     build: str
@@ -186,6 +200,8 @@ class AlgorithmSpec(NumericSpec):
         an epoch has `rounds` steps of every environment. None where it is unknown.
     """
 
+    kind, kinds = "algorithm", "algorithms"
+
     options: str
     factory: str
     memory: str | None = None
@@ -194,6 +210,8 @@ class AlgorithmSpec(NumericSpec):
 @dataclass(frozen=True, slots=True)
 class TaskSpec(Spec):
     """A benchmark task: `path` names its TOML file."""
+
+    kind, kinds = "task", "tasks"
 
     path: str
 
@@ -210,6 +228,8 @@ class StudySpec(Spec):
         A TOML file of reference speeds (see `qrlsuite.results.speed`), for estimates before anything was measured.
     """
 
+    kind, kinds = "study", "studies"
+
     path: str
     speeds: str | None = None
 
@@ -217,6 +237,8 @@ class StudySpec(Spec):
 @dataclass(frozen=True, slots=True)
 class AnsatzSpec(NumericSpec):
     """A circuit family: `build(qubits, layers, options) -> qrlsuite.circuit.Circuit`."""
+
+    kind, kinds = "ansatz", "ansatzes"
 
     options: str
     build: str
@@ -237,6 +259,8 @@ class CircuitBackendSpec(NumericSpec):
         such a circuit is refused before it gets there.
     """
 
+    kind, kinds = "circuit_backend", "circuit_backends"
+
     options: str
     factory: str
     mean_field: bool = False
@@ -253,6 +277,8 @@ class RuleSpec(Spec):
         Reference to a class or function that, called without arguments, returns a rule: see
         `qrlsuite.statistics.SignificanceRule`.
     """
+
+    kind, kinds = "rule", "rules"
 
     factory: str
 
@@ -275,6 +301,8 @@ class EngineSpec(Spec):
         Whether groups run on other machines: this one's memory, devices and speed then say nothing about them.
     """
 
+    kind, kinds = "engine", "engines"
+
     factory: str
     options: str | None = None
     extras: dict[str, str] = field(default_factory=dict)
@@ -290,11 +318,55 @@ class TrackerSpec(Spec):
     ----------
     factory:
         Reference to `factory(target) -> tracker`, called once in every worker. `target` is the text after the
-        equals sign, or None. A tracker has any of the methods `run_started(run)`, `epoch_finished(run, record)`
-        and `run_finished(run)`, which are given what the hooks of these names are given.
+        equals sign, or None. For what a tracker is, see `qrlsuite.training.trackers`.
     extras:
         Packages that it needs: the pip command by the name of the module.
+    always:
+        Whether it watches every run, without being asked for.
     """
+
+    kind, kinds = "tracker", "trackers"
 
     factory: str
     extras: dict[str, str] = field(default_factory=dict)
+    always: bool = False
+
+
+KINDS: dict[str, type[Spec]] = {
+    spec.kinds: spec
+    for spec in (
+        EnvironmentSpec, ModelSpec, AlgorithmSpec, TaskSpec, AnsatzSpec, CircuitBackendSpec, RuleSpec, EngineSpec,
+        StudySpec, TrackerSpec,
+    )
+}  # fmt: skip
+"""Every kind by its plural: a spec that is listed here has a hook, a listing, a page and checks."""
+
+
+_MANUAL = "documentation: docs/api/hooks.md"
+RENAMED = {
+    "significance_test": "`rule`", "significance_tests": "`rules`", "SignificanceTestSpec": "RuleSpec",
+    "hook": _MANUAL, "hooks": _MANUAL,
+}  # fmt: skip
+"""Words of earlier versions."""
+
+
+def kind(word: str) -> type[Spec]:
+    """Return the kind that a word names, in the singular or the plural: `model`, `circuit-backends`."""
+    known = {name: spec for spec in KINDS.values() for name in (spec.kind, spec.kinds)}
+    name = word.replace("-", "_")
+    if name in RENAMED:
+        raise UnknownNameError(f"'{word}' is now {RENAMED[name]}")
+    if name not in known:
+        raise UnknownNameError(f"unknown kind '{word}'{nearest(word, known)}")
+    return known[name]
+
+
+def title(kind: type[Spec], name: str) -> str:
+    """Return what a thing is called in messages: `circuit backend 'native'`."""
+    return f"{kind.kind.replace('_', ' ')} '{name}'"
+
+
+def __getattr__(name: str) -> Any:
+    if name in RENAMED:  # for plugins of earlier versions
+        raise PluginError(f"qrlsuite.specs.{name} is now {RENAMED[name]}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

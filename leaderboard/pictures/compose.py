@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -16,7 +16,7 @@ from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.seeds import read_seeds
-from qrlsuite.specs import EnvironmentSpec, PictureSpec
+from qrlsuite.specs import PictureSpec
 
 
 @dataclass(frozen=True)
@@ -145,10 +145,9 @@ def summaries() -> dict[str, str]:
 def _environment_pictures() -> dict[str, dict[str, PictureSpec]]:
     """Return the pictures that environments bring: by picture, then by environment."""
     by_name: dict[str, dict[str, PictureSpec]] = {}
-    for registered in registry.load().entries["environments"].values():
-        spec = cast(EnvironmentSpec, registered.spec)
-        for picture in spec.pictures:
-            by_name.setdefault(picture.name, {})[spec.name] = picture
+    for registered in registry.load().of(specs.EnvironmentSpec).values():
+        for picture in registered.spec.pictures:
+            by_name.setdefault(picture.name, {})[registered.spec.name] = picture
     return by_name
 
 

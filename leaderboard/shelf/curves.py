@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
@@ -308,7 +308,7 @@ def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
 @functools.lru_cache(maxsize=256)
 def _registered(known: registry.Registry, name: str) -> Task | None:
     """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
-    if name not in known.entries["tasks"]:
+    if name not in known.of(specs.TaskSpec):
         return None
     try:
         return load_task(name)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import Entry
@@ -156,7 +156,7 @@ def _place_for(store: EntryStore, source: EntryStore, exported: bool, runs: Path
 def _require_same_task(entry: Entry, source: EntryStore, runs: Path) -> None:
     """Refuse an entry whose task is defined differently here, by its registered file or by the entries in `runs`."""
     name = entry.task.name
-    if name in registry.load().entries["tasks"]:
+    if name in registry.load().of(specs.TaskSpec):
         here = {tasks.load(name).hash}
     else:  # a task of the user's own file is known by its entries
         here = {str(o.record()["task_hash"]) for o in (entries(runs, name) if runs.is_dir() else [])}

@@ -31,7 +31,7 @@ from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet, probes, provenance
 from qrlsuite.results.store import EntryStore, round_means
-from qrlsuite.specs import NAME
+from qrlsuite.specs import NAME, AlgorithmSpec, EnvironmentSpec, ModelSpec
 
 PUBLISHED = Path(__file__).parents[1] / "entries"
 """The entries that come with the suite and stand on its boards."""
@@ -297,11 +297,11 @@ def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile
             folder,
             f"its task file has {name} = {value!r}, its task {task.get(name)!r}",
         )
-    known = registered().entries
+    known = registered()
     if not (
-        identity["algorithm"] in known["algorithms"]
-        and identity["model"] in known["models"]
-        and task_file.environment.name in known["environments"]
+        identity["algorithm"] in known.of(AlgorithmSpec)
+        and identity["model"] in known.of(ModelSpec)
+        and task_file.environment.name in known.of(EnvironmentSpec)
     ):
         usual = f"{identity['algorithm']} {identity['model']}"
         _require(record["label"].startswith(usual), folder, f"its label does not begin with {usual!r}")

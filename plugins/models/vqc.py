@@ -98,7 +98,9 @@ class VQCOptions:
         """Leave out what the hash does not cover, see `qrlsuite.options.Since`."""
         try:
             return (
-                without_later(specs.resolve(registry.ansatz(info.data["ansatz"]).options), values)
+                without_later(
+                    specs.resolve(registry.get(specs.AnsatzSpec, info.data["ansatz"]).options), values
+                )
                 if values
                 else {}
             )
@@ -128,7 +130,7 @@ class VQCOptions:
                 f"init_scale = {self.init_scale:g}: the circuit of ansatz '{self.ansatz}' multiplies no input by a "
                 "parameter"
             )
-        if circuit.mean_field and not registry.circuit_backend(self.backend).mean_field:
+        if circuit.mean_field and not registry.get(specs.CircuitBackendSpec, self.backend).mean_field:
             raise OptionError(mean_field_refusal(self.backend))
 
 
@@ -378,7 +380,7 @@ def build_circuit(options: VQCOptions) -> Circuit:
         If the ansatz has no such option or size.
     """
     ansatz_options: dict[str, Any] = dict(options.ansatz_options)
-    if "gate" in field_names(specs.resolve(registry.ansatz(options.ansatz).options)):
+    if "gate" in field_names(specs.resolve(registry.get(specs.AnsatzSpec, options.ansatz).options)):
         ansatz_options.setdefault("gate", options.gate)
     elif options.gate != "rot":
         raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")

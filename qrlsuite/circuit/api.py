@@ -109,7 +109,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
     if isinstance(layers, bool) or not isinstance(layers, int) or layers < 1:
         raise OptionError(f"layers = {layers!r}: a circuit has 1 layer or more")
-    spec = registry.ansatz(name)
+    spec = registry.get(specs.AnsatzSpec, name)
     chosen = option_values.build(specs.resolve(spec.options), options, f"ansatz '{name}'")
     circuit: Circuit = specs.resolve(spec.build)(qubits, layers, chosen)
     circuit.require_simulable()
@@ -175,7 +175,7 @@ def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[C
     from qrlsuite import options as option_values
     from qrlsuite import registry, specs
 
-    spec = registry.circuit_backend(name)
+    spec = registry.get(specs.CircuitBackendSpec, name)
     if circuit.mean_field and not spec.mean_field:
         raise OptionError(mean_field_refusal(name))
     if circuit.measures_products and not spec.products:
@@ -261,10 +261,10 @@ def expectations(
     OptionError
         For inputs or parameters that are missing, not finite or of a wrong shape; for wrong options.
     """
-    from qrlsuite import registry
+    from qrlsuite import registry, specs
 
     if backend is None:
-        backend = "native" if "native" in registry.load().names("circuit_backends") else "pennylane"
+        backend = "native" if "native" in registry.load().names(specs.CircuitBackendSpec) else "pennylane"
     exact = _dtype(inputs, dtype)
     x = _tensor(inputs, "inputs", exact)
     if x.dim() != 2 or x.shape[1] != circuit.inputs or x.shape[0] < 1:

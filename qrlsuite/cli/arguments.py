@@ -13,9 +13,9 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
     """Return what completes the beginning of a registered name: `kind` is as in `qrlsuite list`."""
 
     def complete(incomplete: str) -> list[str]:
-        from qrlsuite import registry
+        from qrlsuite import registry, specs
 
-        return [name for name in registry.load().names(kind) if name.startswith(incomplete)]
+        return [name for name in registry.load().names(specs.kind(kind)) if name.startswith(incomplete)]
 
     return complete
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.engine.terminal import command
 from qrlsuite.engine.work import Missing
 from qrlsuite.results.seeds import SeedGroup
@@ -379,7 +379,7 @@ class RunDisplay:
 
     def _faster(self) -> list[str]:
         faster = self.entry.model.faster
-        if faster in registry.load().names("models"):
+        if faster in registry.load().names(specs.ModelSpec):
             return [f"--model {faster} computes the same and trains many times faster"]
         return ["fewer --seeds or --epochs, or --engine slurm on a cluster; what is trained stays and counts"]
 

@@ -7,7 +7,7 @@ import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 from qrlsuite import options, registry, specs
 from qrlsuite.engine.work import Engine, EngineOutcome, Missing, Show, Work
@@ -70,7 +70,7 @@ class Where:
         """
         devices.check(device)  # the machine that trains checks whether it has this device
         built = build(engine, options or {})
-        spec = cast(specs.EngineSpec, registry.load().get("engines", engine).spec)
+        spec = registry.get(specs.EngineSpec, engine)
         return cls(built, built.workers(workers), device, spec.submits, engine, spec.remote or spec.submits)
 
     def run(self, several: Sequence[Missing], show: Show) -> EngineOutcome:
@@ -141,7 +141,7 @@ def build(name: str, option_values: Mapping[str, Any]) -> Engine:
     QrlSuiteError
         If a package that it needs is not installed; the message has the pip command.
     """
-    spec = cast(specs.EngineSpec, registry.load().get("engines", name).spec)
+    spec = registry.get(specs.EngineSpec, name)
     chosen_values = {key: value for key, value in option_values.items() if value is not None}
     if spec.options is None and chosen_values:
         raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(chosen_values))}")

@@ -114,23 +114,23 @@ class Entry:
         covered = {k: v for k, v in values.items() if k not in options.later(cls)}
         return options.plain(options.build(cls, covered, "preset"))
 
-    def registered(self) -> dict[str, registry.Registered]:
+    def registered(self) -> dict[str, registry.Registered[specs.NumericSpec]]:
         """Return what makes the entry's numbers, by role: environment, algorithm and model.
 
         Where the model has them, its `ansatz` and its circuit `backend`, too.
         """
         known = registry.load()
-        named = {
-            "environment": ("environments", self.task.environment.name),
-            "algorithm": ("algorithms", self.algorithm.name),
-            "model": ("models", self.model.name),
-            "ansatz": ("ansatzes", getattr(self.model_options, "ansatz", None)),
-            "backend": ("circuit_backends", getattr(self.model_options, "backend", None)),
+        named: dict[str, tuple[type[specs.NumericSpec], Any]] = {
+            "environment": (specs.EnvironmentSpec, self.task.environment.name),
+            "algorithm": (specs.AlgorithmSpec, self.algorithm.name),
+            "model": (specs.ModelSpec, self.model.name),
+            "ansatz": (specs.AnsatzSpec, getattr(self.model_options, "ansatz", None)),
+            "backend": (specs.CircuitBackendSpec, getattr(self.model_options, "backend", None)),
         }
         return {
-            role: known.entries[kind][name]
+            role: known.of(kind)[name]
             for role, (kind, name) in named.items()
-            if isinstance(name, str) and name in known.entries[kind]
+            if isinstance(name, str) and name in known.of(kind)
         }
 
     def distributions(self) -> list[str]:
@@ -183,9 +183,11 @@ def resolve(
     """
     written = entry if isinstance(entry, Written) else notation.parse_entry(entry)
     written = written.given(algorithm, tuple(settings), preset)
-    task, model = load(task_name), registry.model(written.model)
+    task, model = load(task_name), registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)
-    spec = registry.algorithm(written.algorithm or (file.algorithm if file else task.file.default_algorithm))
+    spec = registry.get(
+        specs.AlgorithmSpec, written.algorithm or (file.algorithm if file else task.file.default_algorithm)
+    )
     sides = option_sides(task, spec, model, written.settings, file.model_options if file else None)
     task.check_presets(spec.name, sides["algorithm"])
     source = _task_preset(task, None if file else written.preset, spec, model)
@@ -301,7 +303,7 @@ def option_sides(
         if setting.name == "ansatz" and setting.side in (None, "model"):
             chosen = setting.value
     if isinstance(chosen, str):  # what is none is refused where the model's options are built
-        theirs = specs.resolve(registry.ansatz(chosen).options)
+        theirs = specs.resolve(registry.get(specs.AnsatzSpec, chosen).options)
         left = [name for name in options.field_names(theirs) if name not in getattr(own, "passes_on", ())]
         sides["ansatz"] = make_dataclass(theirs.__name__, left)
         _require_not_of_another_ansatz(settings, sides, chosen)
@@ -318,8 +320,9 @@ def _require_not_of_another_ansatz(
             continue
         others = [
             f"'{name}'"
-            for name in registry.load().names("ansatzes")
-            if setting.name in options.field_names(specs.resolve(registry.ansatz(name).options))
+            for name in registry.load().names(specs.AnsatzSpec)
+            if setting.name
+            in options.field_names(specs.resolve(registry.get(specs.AnsatzSpec, name).options))
         ]
         if others:
             raise OptionError(
@@ -360,7 +363,7 @@ def from_record(record: Mapping[str, Any], source: str) -> Entry:
         raise StoreError(f"{source} is not an entry's record: {type(error).__name__}: {error}") from None
     task = Task(file, source)
     task.name = names[0]
-    algorithm, model = registry.algorithm(names[1]), registry.model(names[2])
+    algorithm, model = registry.get(specs.AlgorithmSpec, names[1]), registry.get(specs.ModelSpec, names[2])
     entry = Entry(
         task=task,
         algorithm=algorithm,

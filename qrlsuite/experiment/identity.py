@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from qrlsuite import circuit, options, registry, specs
 from qrlsuite.circuit.description import Circuit, canonical
@@ -38,15 +38,6 @@ _CODE = {
     "ansatz": ("options", "build"),
 }
 """The references of a spec to code that computes, by role."""
-
-ROLES = {
-    "environments": "environment",
-    "models": "model",
-    "algorithms": "algorithm",
-    "circuit_backends": "backend",
-    "ansatzes": "ansatz",
-}
-"""Roles by kind in the plural."""
 
 Part = Mapping[str, Any]
 
@@ -100,9 +91,7 @@ def of(entry: Entry) -> CodeIdentity:
 def numerics(entry: Entry) -> dict[str, int]:
     """Return the `numerics` of an entry's parts that are the suite's own, by role."""
     return {
-        role: cast(specs.NumericSpec, each.spec).numerics
-        for role, each in entry.registered().items()
-        if each.distribution == OURS
+        role: each.spec.numerics for role, each in entry.registered().items() if each.distribution == OURS
     }
 
 
@@ -111,7 +100,7 @@ def circuit_of(entry: Entry) -> Circuit | None:
     own = entry.model_options
     try:
         chosen = dict(getattr(own, "ansatz_options", {}))
-        known = options.field_names(specs.resolve(registry.ansatz(own.ansatz).options))
+        known = options.field_names(specs.resolve(registry.get(specs.AnsatzSpec, own.ansatz).options))
         for name in getattr(own, "passes_on", ()):
             if name in known:
                 chosen.setdefault(name, getattr(own, name))
@@ -120,21 +109,24 @@ def circuit_of(entry: Entry) -> Circuit | None:
         return None
 
 
-def of_registered(kind: str, name: str, drawn: Circuit | None = None) -> Part:
-    """Return the part of a registered thing, by its kind in the plural.
+def of_registered(kind: type[specs.NumericSpec], name: str, drawn: Circuit | None = None) -> Part:
+    """Return the part of a registered thing.
 
     Parameters
     ----------
     drawn:
         Of an ansatz: the circuit that it builds.
     """
-    return _part(ROLES[kind], registry.load().get(kind, name), drawn, None)
+    role = "backend" if kind is specs.CircuitBackendSpec else kind.kind
+    return _part(role, registry.load().get(kind, name), drawn, None)
 
 
-def _part(role: str, each: registry.Registered, drawn: Circuit | None, gym: str | None) -> Part:
+def _part(
+    role: str, each: registry.Registered[specs.NumericSpec], drawn: Circuit | None, gym: str | None
+) -> Part:
     part: dict[str, Any] = {"role": role, "name": each.spec.name, "distribution": each.distribution}
     if each.distribution == OURS:
-        part["numerics"] = cast(specs.NumericSpec, each.spec).numerics
+        part["numerics"] = each.spec.numerics
     if drawn is not None:
         return {**part, "circuit": hashlib.sha256(canonical(drawn).encode()).hexdigest()}
     if gym is not None and (module := _gymnasium_module(gym)) is not None:

@@ -222,7 +222,7 @@ class Task:
         self.source = source
         self.name = file.name
         try:
-            self.environment = registry.environment(file.environment.name)
+            self.environment = registry.get(specs.EnvironmentSpec, file.environment.name)
         except UnknownNameError as error:
             raise TaskError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
@@ -239,7 +239,7 @@ class Task:
         self.hash = digest(self.definition)
         if file.ranking.rule is not None:
             try:
-                registry.load().get("rules", file.ranking.rule)
+                registry.load().get(specs.RuleSpec, file.ranking.rule)
             except UnknownNameError as error:
                 raise TaskError(f"{source}: ranking.rule: {error}") from None
         epoch = file.protocol.interactions
@@ -388,7 +388,7 @@ def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any
     if name in below:
         raise TaskError(f"{source}: a task extends itself: {' -> '.join([*below, name])}")
     try:
-        path = Path(registry.task(name).path)
+        path = Path(registry.get(specs.TaskSpec, name).path)
     except UnknownNameError as error:
         raise TaskError(f"{source}: extends: {error}") from None
     return _merged(_whole(_read(path), path.name, (*below, name)), data)
@@ -426,7 +426,7 @@ def _environment_problems(section: Any) -> list[str]:
     except pydantic.ValidationError:
         return []  # named already
     try:
-        cls = specs.resolve(registry.environment(parsed.name).options)
+        cls = specs.resolve(registry.get(specs.EnvironmentSpec, parsed.name).options)
     except UnknownNameError as error:
         return [f"environment.name: {error}"]
     try:
@@ -454,5 +454,5 @@ def load(name: str) -> Task:
         from qrlsuite.gymlanes import quick_task
 
         return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
-    path = Path(name) if name.endswith(".toml") else Path(registry.task(name).path)
+    path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.TaskSpec, name).path)
     return parse(_read(path), path.name)

@@ -197,7 +197,7 @@ def _plugins(diagnosis: Diagnosis) -> None:
     }
     diagnosis.facts["plugins"] = ", ".join(others) or "the suite's own"
     diagnosis.facts["engines"] = ", ".join(
-        _engine(registered.spec) for _, registered in known if isinstance(registered.spec, EngineSpec)
+        _engine(registered.spec) for _, registered in sorted(known.of(EngineSpec).items())
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from qrlsuite import notation, registry
+from qrlsuite import notation, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed, nearest
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.results.store import EntryStore
@@ -84,7 +84,7 @@ def check_tasks(runs: Path, *tasks: str | None, also: Iterable[Path] = ()) -> No
     for name in tasks:
         if name is None or name in held:
             continue
-        known = registry.load().entries["tasks"]
+        known = registry.load().of(specs.TaskSpec)
         if name not in known:
             raise UnknownNameError(f"unknown task '{name}'{nearest(name, {*known, *held})}")
 

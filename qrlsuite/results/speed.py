@@ -202,9 +202,7 @@ def known(*folders: Path) -> Speeds:
         If a file of reference speeds is malformed.
     """
     references = [
-        registered.spec.speeds
-        for kind, registered in registry.load()
-        if kind == "studies" and isinstance(registered.spec, specs.StudySpec)
+        registered.spec.speeds for _, registered in sorted(registry.load().of(specs.StudySpec).items())
     ]
     speeds = gather(folders[0], dict.fromkeys(references))
     for folder in folders[1:]:

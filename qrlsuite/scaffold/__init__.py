@@ -217,7 +217,7 @@ def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object
 
 def _names(name: str, kind: Kind) -> tuple[str, str]:
     """Check a distribution's name; returns the module's name and the registered name."""
-    from qrlsuite import registry
+    from qrlsuite import registry, specs
 
     if not NAME.fullmatch(name) or len(name) > LONGEST:
         usable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")[:LONGEST].rstrip("-")
@@ -232,12 +232,16 @@ def _names(name: str, kind: Kind) -> tuple[str, str]:
         raise ScaffoldError(
             f"a module '{module}' is installed already: choose another name, for example acme-{name}"
         )
-    kinds = {many for many, single in registry.SINGULAR.items() if single == kind}
-    for many in kinds | ({"tasks"} if kind is Kind.environment else set()):
-        if thing in registry.load().entries[many]:
+    kinds: list[type[specs.Spec]] = [
+        specs.kind(kind),
+        *([specs.TaskSpec] if kind is Kind.environment else []),
+    ]
+    for each in kinds:
+        if thing in registry.load().of(each):
+            article = "an" if each.kind[0] in "ae" else "a"
             raise ScaffoldError(
-                f"there is {'an' if many[0] in 'ae' else 'a'} {registry.SINGULAR[many]} '{thing}' already "
-                f"(`qrlsuite list {many}`): choose another name, for example acme-{thing}"
+                f"there is {article} {specs.title(each, thing)} already (`qrlsuite list {each.kinds}`): "
+                f"choose another name, for example acme-{thing}"
             )
     return module, thing
 

@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.missing import find, require_same_code, train
 from qrlsuite.engine.terminal import Shown
@@ -212,7 +212,7 @@ def select(
         For an unknown name or option, or where no entry is left.
     """
     for new in (models or {}).values():
-        registry.model(new)
+        registry.get(specs.ModelSpec, new)
     members = study.members(settings, models)
     if not only:
         return members

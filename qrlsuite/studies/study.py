@@ -319,9 +319,9 @@ def _member(
 ) -> Member:
     model = models.get(draft.model, draft.model)
     loaded = load_task(draft.task)
-    algorithm = registry.algorithm(group.algorithm or loaded.file.default_algorithm)
+    algorithm = registry.get(specs.AlgorithmSpec, group.algorithm or loaded.file.default_algorithm)
     every = [*draft.settings, *settings]
-    sides = option_sides(loaded, algorithm, registry.model(model), every)
+    sides = option_sides(loaded, algorithm, registry.get(specs.ModelSpec, model), every)
     applicable = [s for s in settings if _has(sides, s)]
     used |= {(s.side, s.name) for s in applicable}
     all_settings = [*draft.settings, *applicable]
@@ -412,7 +412,7 @@ def load(name: str) -> Study:
     TaskError
         If the file cannot be read or is malformed.
     """
-    path = Path(name) if name.endswith(".toml") else Path(registry.study(name).path)
+    path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -157,8 +157,12 @@ def _smallest(circuits: Circuits) -> Circuit:
 
 def _able(circuit: Circuit) -> list[str]:
     """Return the installed backends that compute this kind of circuit."""
-    names = registry.load().names("circuit_backends")
-    return [name for name in names if registry.circuit_backend(name).mean_field or not circuit.mean_field]
+    names = registry.load().names(specs.CircuitBackendSpec)
+    return [
+        name
+        for name in names
+        if registry.get(specs.CircuitBackendSpec, name).mean_field or not circuit.mean_field
+    ]
 
 
 def _run(backend: str, circuit: Circuit, x: Any, parameters: dict[str, Any]) -> Any:

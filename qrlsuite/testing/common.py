@@ -33,16 +33,10 @@ class Subject:
         Values of options with which it is checked.
     """
 
-    kind: str
     spec: specs.Spec
     distribution: str | None
     modules: tuple[str, ...]
     settings: Mapping[str, Any]
-
-    @property
-    def title(self) -> str:
-        """The thing in words: `model 'mlp'`."""
-        return f"{registry.SINGULAR[self.kind].replace('_', ' ')} '{self.spec.name}'"
 
     def references(self) -> dict[str, str]:
         """Return the references of the spec by field; those inside of a field have its name and a dot in front."""
@@ -60,7 +54,7 @@ class Subject:
         return (
             None
             if reference is None
-            else option_values.build(specs.resolve(reference), self.settings, self.title)
+            else option_values.build(specs.resolve(reference), self.settings, self.spec.title)
         )
 
     def per_agent(self) -> dict[str, tuple[Any, Any]]:
@@ -70,7 +64,7 @@ class Subject:
         for name in sorted(option_values.per_agent(cls)):
             mark = option_values.tuned(cls)[name]
             low, high = (
-                option_values.build(cls, {**self.settings, name: value}, self.title)
+                option_values.build(cls, {**self.settings, name: value}, self.spec.title)
                 for value in (mark.low, mark.high)
             )
             pairs[name] = low, high
@@ -82,7 +76,9 @@ class Subject:
         for name, value in option_values.plain(self.options()).items():
             if type(value) is int and value != number and name not in self.settings:
                 with contextlib.suppress(OptionError):  # out of its bounds
-                    counting[name] = option_values.build(cls, {**self.settings, name: number}, self.title)
+                    counting[name] = option_values.build(
+                        cls, {**self.settings, name: number}, self.spec.title
+                    )
         return counting
 
     def missing(self) -> str:
@@ -91,13 +87,13 @@ class Subject:
         return " and ".join(sorted({c for m, c in extras.items() if importlib.util.find_spec(m) is None}))
 
 
-def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, Any] | None = None) -> Subject:
+def subject(
+    kind: type[specs.Spec], name_or_spec: str | specs.Spec, settings: Mapping[str, Any] | None = None
+) -> Subject:
     """Look up what is to be checked.
 
     Parameters
     ----------
-    kind:
-        A key of `registry.KINDS`.
     name_or_spec:
         A registered name, or a spec, registered or not; or for a task its file (`*.toml`).
     settings:
@@ -110,7 +106,7 @@ def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, An
         If nothing or more than one thing has that name.
     """
     known = registry.load()
-    if kind == "tasks" and isinstance(name_or_spec, str) and name_or_spec.endswith(".toml"):
+    if kind is specs.TaskSpec and isinstance(name_or_spec, str) and name_or_spec.endswith(".toml"):
         file = load_task(name_or_spec).file
         name_or_spec = specs.TaskSpec(file.name, file.summary, str(Path(name_or_spec).resolve()))
     if isinstance(name_or_spec, str):
@@ -118,11 +114,11 @@ def subject(kind: str, name_or_spec: str | specs.Spec, settings: Mapping[str, An
         spec, distribution = registered.spec, registered.distribution
     else:
         spec, distribution = name_or_spec, None
-        entry = known.entries[kind].get(spec.name)
+        entry = known.of(kind).get(spec.name)
         if entry is not None and entry.spec == spec:
             distribution = entry.distribution
     modules = () if distribution is None else plugin_modules(distribution)
-    return Subject(kind, spec, distribution, modules, {**_small(spec), **(settings or {})})
+    return Subject(spec, distribution, modules, {**_small(spec), **(settings or {})})
 
 
 def _small(spec: specs.Spec) -> dict[str, int]:
@@ -166,16 +162,18 @@ def check_common(subject: Subject) -> tuple[list[Finding], bool]:
 
 def _name(subject: Subject) -> None:
     known = registry.load()
-    owners = known.duplicates.get((subject.kind, subject.spec.name), [])
+    key = type(subject.spec), subject.spec.name
+    owners = [f"{each.distribution} ({each.place})" for each in known.duplicates.get(key, [])]
     require(
         not owners,
-        f"{subject.title} is registered by both {' and '.join(owners)}: give yours another name",
+        f"{subject.spec.title} is registered by both {' and '.join(owners)}: give yours another name",
     )
-    entry = known.entries[subject.kind].get(subject.spec.name)
-    require(
-        entry is None or entry.spec == subject.spec,
-        f"{subject.title} is already registered by '{entry.distribution if entry else ''}': give yours another name",
-    )
+    entry = known.of(key[0]).get(key[1])
+    if entry is not None:
+        require(
+            entry.spec == subject.spec,
+            f"{subject.spec.title} is already registered by '{entry.distribution}': give yours another name",
+        )
 
 
 def _references(subject: Subject) -> None:
@@ -218,9 +216,9 @@ def _all_references(subject: Subject) -> tuple[str, ...]:
     """Return the references of the subject's whole distribution, so that one process serves all of them."""
     references = set(subject.references().values())
     if subject.distribution is not None:
-        for kind, entry in registry.load():
+        for entry in registry.load():
             if entry.distribution == subject.distribution:
-                references |= set(Subject(kind, entry.spec, None, (), {}).references().values())
+                references |= set(Subject(entry.spec, None, (), {}).references().values())
     return tuple(sorted(references))
 
 
@@ -258,7 +256,7 @@ def _spawn(subject: Subject) -> None:
     if options is not None:
         cls = specs.resolve(options)
         try:
-            built = option_values.build(cls, subject.settings, subject.title)
+            built = option_values.build(cls, subject.settings, subject.spec.title)
         except Exception:  # the rule `options` reports it
             return
         try:
@@ -287,7 +285,7 @@ def _documented(subject: Subject) -> None:
 def _options(subject: Subject) -> None:
     cls = specs.resolve(subject.references()["options"])
     try:
-        defaults = option_values.build(cls, {}, subject.title)
+        defaults = option_values.build(cls, {}, subject.spec.title)
     except Exception as error:
         require(False, f"the defaults are not valid: {error}; every option needs a default that works")
     for options in (defaults, subject.options()):
@@ -320,7 +318,7 @@ def _stored(subject: Subject, cls: type[Any], options: Any) -> None:
             "have no JSON form",
         )
     try:
-        again = option_values.build(cls, plain, subject.title)
+        again = option_values.build(cls, plain, subject.spec.title)
     except Exception as error:
         require(
             False,

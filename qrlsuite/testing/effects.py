@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, Parameter, create_backend
 from qrlsuite.testing.findings import BrokenRuleError, require
 
@@ -91,7 +91,7 @@ def written(parameter: Parameter, index: int) -> str:
 
 def effective(circuit: Circuit) -> tuple[set[int], set[Scalar]]:
     """Return the input features, and the trainable scalars, that change an expectation value."""
-    names = registry.load().names("circuit_backends")
+    names = registry.load().names(specs.CircuitBackendSpec)
     require(
         bool(names), "no circuit backend is installed: install qrlsuite again, some are among its plugins"
     )

@@ -67,7 +67,7 @@ def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
     for name in modules:
         try:
             plugin = importlib.import_module(name)
-            for hook_name in ("register", *(f"register_{kind}" for kind in registry.KINDS)):
+            for hook_name in hookspecs.REGISTER:
                 hook = getattr(plugin, hook_name, None)
                 if hook is not None and hasattr(hook, f"{hookspecs.PROJECT}_impl"):
                     hook(register=lambda spec: None)

@@ -1,32 +1,29 @@
-"""Finds the targets of `qrlsuite check` by name, kind and name, distribution or module."""
+"""Finds the targets of `qrlsuite check` by name, kind and name, or distribution."""
 
 from __future__ import annotations
 
-import importlib.util
-import re
 from dataclasses import dataclass
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import QrlSuiteError, UnknownNameError, nearest
-from qrlsuite.testing import plural
-from qrlsuite.training import trackers
+from qrlsuite.registry import canonical
 
 
 @dataclass(frozen=True, slots=True)
 class CheckTarget:
-    """One thing to check: its kind in the plural, and its name, or for a hook-only tracker its module's."""
+    """One thing to check: its kind and its name, or for a task its file."""
 
-    kind: str
+    kind: type[specs.Spec]
     name: str
 
     @property
     def title(self) -> str:
-        """In words: `model mlp`."""
-        return f"{registry.SINGULAR[self.kind].replace('_', ' ')} {self.name}"
+        """In words: `model 'mlp'`."""
+        return specs.title(self.kind, self.name)
 
 
 def select(word: str) -> list[CheckTarget]:
-    """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, a task's file, or the module of a tracker.
+    """Return what a word stands for: `NAME`, `KIND:NAME`, a distribution, or a task's file.
 
     A name that is also a distribution's stands for the distribution where all that has the name is the distribution's
     own; `distribution:NAME` says so where it is not.
@@ -38,34 +35,29 @@ def select(word: str) -> list[CheckTarget]:
     """
     known = registry.load()
     if word.endswith(".toml"):
-        return [CheckTarget("tasks", word)]
+        return [CheckTarget(specs.TaskSpec, word)]
     kind, colon, name = word.partition(":")
     if colon:
         return _of_kind(kind, name)
-    owners = {kind: _owners(kind, word) for kind in registry.KINDS if word in known.entries[kind]}
-    kinds, distribution = list(owners), _distribution(word)
-    if word == distribution and {
-        owner for registered_names in owners.values() for owner in registered_names
-    } <= {word}:
+    kinds, distribution = [k for k in specs.KINDS.values() if word in known.of(k)], _distribution(word)
+    if word == distribution and {owner for k in kinds for owner in _owners(k, word)} <= {word}:
         return of_distribution(word)
     if len(kinds) > 1 or (kinds and word == distribution):
-        ways = [f"{registry.SINGULAR[kind].replace('_', '-')}:{word}" for kind in kinds]
+        ways = [f"{kind.kind.replace('_', '-')}:{word}" for kind in kinds]
         ways += [f"distribution:{word}"] * (word == distribution)
         raise QrlSuiteError(
             f"'{word}' is several things; write qrlsuite check {' or qrlsuite check '.join(ways)}"
         )
     if kinds:
-        return _of_kind(kinds[0], word)
-    if _is_module(word) and (word in _watching() or "." in word):
-        return [CheckTarget("trackers", word)]
+        return _of_kind(kinds[0].kind, word)
     if distribution is not None:
         return of_distribution(distribution)
-    names = {name for kind in registry.KINDS for name in known.entries[kind]} | _distributions()
+    names = {each.spec.name for each in known} | _distributions()
     raise UnknownNameError(f"nothing called '{word}' is registered{nearest(word, names)}")
 
 
 def of_distribution(distribution: str) -> list[CheckTarget]:
-    """Return everything that a distribution registers, and its plugins that watch runs.
+    """Return everything that a distribution registers.
 
     Raises
     ------
@@ -77,17 +69,14 @@ def of_distribution(distribution: str) -> list[CheckTarget]:
     if problems:
         raise QrlSuiteError("; ".join(problems))
     targets = [
-        CheckTarget(kind, entry.spec.name)
-        for kind, entry in known
-        if distribution in _owners(kind, entry.spec.name)
-    ]
-    targets += [
-        CheckTarget("trackers", module) for module, owner in _watching().items() if owner == distribution
+        CheckTarget(type(each.spec), each.spec.name)
+        for each in known
+        if distribution in _owners(type(each.spec), each.spec.name)
     ]
     if not targets:
         raise QrlSuiteError(
-            f"'{distribution}' registers nothing by name and watches no run; commands have no rules. Nothing to check: "
-            "if there should be, is every hook under @hookimpl, in the module that the entry point names?"
+            f"'{distribution}' registers nothing by name; commands have no rules. Nothing to check: if there should "
+            "be, is every hook under @hookimpl, in the module that the entry point names?"
         )
     return targets
 
@@ -101,18 +90,16 @@ def _of_kind(kind: str, name: str) -> list[CheckTarget]:
                 f"no plugin is of a distribution '{name}'{nearest(name, _distributions())}"
             )
         return of_distribution(distribution)
-    known, plural_kind = registry.load(), plural(kind)
-    if plural_kind != "trackers" or (plural_kind, name) in known.duplicates:
-        known.get(plural_kind, name)
-    elif name not in known.entries[plural_kind] and not _is_module(name):
-        raise UnknownNameError(f"unknown tracker '{name}'{nearest(name, known.entries[plural_kind])}")
-    return [CheckTarget(plural_kind, name)]
+    target = CheckTarget(specs.kind(kind), name)
+    registry.load().get(target.kind, name)
+    return [target]
 
 
-def _owners(kind: str, name: str) -> list[str]:
+def _owners(kind: type[specs.Spec], name: str) -> list[str]:
     """Return the distributions that registered a name: more than one where it is a duplicate."""
     known = registry.load()
-    return known.duplicates.get((kind, name)) or [known.entries[kind][name].distribution]
+    owners = known.duplicates.get((kind, name)) or [known.entries[kind][name]]
+    return [each.distribution for each in owners]
 
 
 def _distributions() -> set[str]:
@@ -121,24 +108,5 @@ def _distributions() -> set[str]:
 
 def _distribution(name: str) -> str | None:
     """Return the distribution of that name, spelled as it is; `_`, `-`, `.` and case are alike, as they are to pip."""
-    names = _distributions()
-    return name if name in names else next((d for d in sorted(names) if _folded(d) == _folded(name)), None)
-
-
-def _folded(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _watching() -> dict[str, str]:
-    """Return the plugins that implement a run event, by module: their distributions."""
-    hooks = registry.load().manager.hook
-    names = [i.plugin_name for event in trackers.EVENTS for i in getattr(hooks, event).get_hookimpls()]
-    return {name.partition(":")[2]: name.partition(":")[0] for name in sorted(set(names))}
-
-
-def _is_module(name: str) -> bool:
-    """Tell whether there is a module of that name; its packages are imported, and may fail."""
-    try:
-        return importlib.util.find_spec(name) is not None
-    except (Exception, SystemExit):
-        return False
+    names = {canonical(each): each for each in sorted(_distributions(), reverse=True)}
+    return name if name in _distributions() else names.get(canonical(name))

@@ -60,7 +60,7 @@ def _algorithms(task: Task) -> None:
 def _algorithm(location: str, name: str, values: Mapping[str, Any] | None = None) -> None:
     """Require that an algorithm exists and takes values of options; `location` the file says so."""
     try:
-        spec = registry.algorithm(name)
+        spec = registry.get(specs.AlgorithmSpec, name)
         if values is not None:
             options.build(specs.resolve(spec.options), values, f"algorithm '{name}'")
     except QrlSuiteError as error:
@@ -82,12 +82,9 @@ def _scores(task: Task) -> None:
     from qrlsuite.experiment.entry import Entry
     from qrlsuite.training.trainer import build_envs
 
-    known = registry.load().entries
-    algorithm, model = (
-        next(entry.spec for entry in known[kind].values()) for kind in ("algorithms", "models")
-    )
-    assert isinstance(algorithm, specs.AlgorithmSpec)
-    assert isinstance(model, specs.ModelSpec)
+    known = registry.load()
+    algorithm = next(iter(known.of(specs.AlgorithmSpec).values())).spec
+    model = next(iter(known.of(specs.ModelSpec).values())).spec
     choose = np.random.Generator(np.random.Philox(key=9))
     ended = 0
     with in_its_words():

@@ -54,11 +54,11 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
     trained_on = getattr(entry.model_options, "backend", None)
     if trained_on is None:
         raise OptionError(f"--backend {backend}: model '{entry.model.name}' has no circuit")
-    spec = registry.circuit_backend(backend)
+    spec = registry.get(specs.CircuitBackendSpec, backend)
     options.build(specs.resolve(spec.options), values, f"circuit backend '{backend}'")
     known = registry.load()
-    for name in known.names("models"):
-        model = registry.model(name)
+    for name in known.names(specs.ModelSpec):
+        model = registry.get(specs.ModelSpec, name)
         cls = specs.resolve(model.options)
         if model.build == entry.model.build and getattr(cls, "backend", None) == backend:
             break
@@ -66,7 +66,9 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
         raise OptionError(
             f"--backend {backend}: no model computes the circuits of '{entry.model.name}' on that backend"
         )
-    left_behind = options.field_names(specs.resolve(registry.circuit_backend(trained_on).options))
+    left_behind = options.field_names(
+        specs.resolve(registry.get(specs.CircuitBackendSpec, trained_on).options)
+    )
     kept = {
         name: value for name, value in options.plain(entry.model_options).items() if name not in left_behind
     }

@@ -1,8 +1,16 @@
-"""Run events for trackers: a tracker that fails is reported once and never stops a run.
+"""Trackers: objects that a run tells of its events. One that fails is reported once and never stops a run.
 
-Two kinds of trackers listen: plugins that implement the hooks `run_started`, `epoch_finished` and `run_finished`,
-which watch every run, and those registered with `register_trackers`, which watch when they are asked for. Workers
-are asked through the environment variable `QRLSUITE_TRACK`, which `qrlsuite run --track` sets.
+A tracker has any of these methods, which are called in the worker that trains:
+
+    run_started(run)             a seed begins, or goes on after an interruption
+    epoch_finished(run, record)  `record` is the epoch's line of `epochs.jsonl`
+    run_finished(run)            the last epoch is done; all results are on disk
+
+`run` is the seed's `run.json` and its `folder`; `run_started` is given `epochs` and `history` too, the number of the
+finished epochs and their records. Epochs after a run's last checkpoint come a second time when it goes on.
+
+Trackers whose spec says `always` watch every run, others those that ask for them: workers read the environment
+variable `QRLSUITE_TRACK`, which `qrlsuite run --track` sets.
 """
 
 from __future__ import annotations
@@ -26,8 +34,8 @@ TRACK = "QRLSUITE_TRACK"
 EVENTS = ("run_started", "epoch_finished", "run_finished")
 
 
-def parse(requests: Sequence[str]) -> dict[str, str | None]:
-    """Return targets by name from words `NAME` or `NAME=TARGET`.
+def parse(requests: Sequence[str], known: registry.Registry | None = None) -> dict[str, str | None]:
+    """Return targets by name from words `NAME` or `NAME=TARGET`; `known` is this process's registry by default.
 
     Raises
     ------
@@ -39,7 +47,8 @@ def parse(requests: Sequence[str]) -> dict[str, str | None]:
     targets: dict[str, str | None] = {}
     for word in requests:
         name, equals, target = word.strip().partition("=")
-        for module, command in registry.tracker(name).extras.items():
+        spec = (known or registry.load()).get(specs.TrackerSpec, name).spec
+        for module, command in spec.extras.items():
             if importlib.util.find_spec(module) is None:
                 raise QrlSuiteError(f"tracker '{name}' needs the package '{module}': {command}")
         if equals and not target:
@@ -93,44 +102,47 @@ class EventSink:
     """
 
     def __init__(self, known: registry.Registry, requests: Sequence[str] = ()) -> None:
-        self.known = known
         self.problems: list[str] = []
-        self._failed: set[str] = set()
-        self._asked: dict[str, Any] = {}
-        for word in requests:
-            self._guarded(word, "its factory", functools.partial(self._build, word))
+        self._trackers: dict[str, Any] = {}
+        always = [name for name, each in known.of(specs.TrackerSpec).items() if each.spec.always]
+        words = {word.partition("=")[0]: word for word in (*always, *requests)}  # a request says the target
+        for name, word in words.items():
+            self._guarded(name, "its factory", functools.partial(self._build, known, word))
 
-    def _build(self, word: str) -> None:
-        [(name, target)] = parse([word]).items()
-        tracker = specs.resolve(registry.tracker(name).factory)(target)
-        if not any(callable(getattr(tracker, event, None)) for event in EVENTS):
-            raise PluginError(f"{type(tracker).__name__} has none of the methods {', '.join(EVENTS)}")
-        self._asked[name] = tracker
+    def _build(self, known: registry.Registry, word: str) -> None:
+        [(name, target)] = parse([word], known).items()
+        self._trackers[name] = build(known.get(specs.TrackerSpec, name).spec, target)
 
     def heard(self, event: str) -> bool:
-        """Whether any tracker may listen to an event: what it is told takes time to read."""
-        return bool(self._asked) or bool(getattr(self.known.manager.hook, event).get_hookimpls())
+        """Whether any tracker listens to an event: what it is told takes time to read."""
+        return any(hasattr(tracker, event) for tracker in self._trackers.values())
 
     def send(self, event: str, **content: Any) -> None:
         """Tell every tracker of an event, each on its own."""
-        for name, call in self._listeners(event, content):
-            if name not in self._failed:
-                self._guarded(name, event, call)
-
-    def _listeners(self, event: str, content: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
-        for hook in getattr(self.known.manager.hook, event).get_hookimpls():
-            arguments = [content[name] for name in hook.argnames]
-            yield str(hook.plugin_name), functools.partial(hook.function, *arguments)
-        for name, tracker in self._asked.items():
+        for name, tracker in list(self._trackers.items()):
             method = getattr(tracker, event, None)
             if method is not None:
-                yield name, functools.partial(method, *content.values())
+                self._guarded(name, event, functools.partial(method, *content.values()))
 
     def _guarded(self, name: str, event: str, call: Callable[[], Any]) -> None:
         try:
             call()
         except Exception as error:
-            self._failed.add(name)
+            self._trackers.pop(name, None)
             message = f"tracker '{name}' failed in {event} and is left out: {registry.words(error)}"
             self.problems.append(message)
             log.warning(message)
+
+
+def build(spec: specs.TrackerSpec, target: str | None) -> Any:
+    """Build a tracker.
+
+    Raises
+    ------
+    PluginError
+        If what its factory returns listens to nothing.
+    """
+    tracker = specs.resolve(spec.factory)(target)
+    if not any(callable(getattr(tracker, event, None)) for event in EVENTS):
+        raise PluginError(f"{type(tracker).__name__} has none of the methods {', '.join(EVENTS)}")
+    return tracker

@@ -48,7 +48,7 @@ Report = Callable[[Progress], None]
 
 
 @contextlib.contextmanager
-def _building(kind: str, name: str) -> Iterator[None]:
+def _building(spec: specs.Spec) -> Iterator[None]:
     """Turn whatever a plugin raises while something of it is built into one message with the place in its code.
 
     Raises
@@ -62,9 +62,9 @@ def _building(kind: str, name: str) -> Iterator[None]:
         raise
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        owner = registry.load().get(kind, name).distribution
+        owner = registry.load().get(type(spec), spec.name).distribution
         raise PluginError(
-            f"{registry.SINGULAR[kind]} '{name}' of {owner} cannot be built: {registry.words(error)} "
+            f"{spec.title} of {owner} cannot be built: {registry.words(error)} "
             f"({last.filename}, line {last.lineno})"
         ) from error
 
@@ -74,7 +74,7 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence 
     spec = entry.task.environment
     settings = entry.task.environment_options
     inner: LaneEnv
-    with _building("environments", spec.name):
+    with _building(spec):
         if spec.vector is not None:
             inner = specs.resolve(spec.vector)(settings, lanes)
         else:
@@ -99,7 +99,7 @@ def first_network(entry: Entry) -> nn.Module:
             f"{envs.single_action_space}, not discrete, so that the size of the model is not known before it is trained"
         )
     outputs = int(envs.single_action_space.n)
-    with _building("models", entry.model.name), seeded(0):
+    with _building(entry.model), seeded(0):
         agent: nn.Module = specs.resolve(entry.model.build)(
             inputs, outputs, entry.model_options, torch.Generator()
         )
@@ -201,7 +201,7 @@ class ModelBuilder:
         """Return a population of freshly initialized agents."""
         spec, options = self.entry.model, [entry.model_options for entry in self.entries]
         call = len(self.built)
-        with _building("models", spec.name):
+        with _building(spec):
             build = specs.resolve(spec.build)
 
             def agent(streams: Streams, own: Any) -> nn.Module:
@@ -364,7 +364,7 @@ class Trainer:
             self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
         self.models = ModelBuilder(entries, size, self.streams, self.statistics, self.fence)
-        with _building("algorithms", entry.algorithm.name):
+        with _building(entry.algorithm):
             factory = specs.resolve(entry.algorithm.factory)
             own_options = population.joined([each.algorithm_options for each in entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)

@@ -347,8 +347,8 @@ class Search(Shown):
         if best is None:
             raise OptionError("no trial has finished yet, so there are no settings to write down")
         plugins = [
-            registry.load().get(kind, name).distribution
-            for kind, name in (("models", best.entry.model.name), ("algorithms", best.entry.algorithm.name))
+            registry.load().get(type(spec), spec.name).distribution
+            for spec in (best.entry.model, best.entry.algorithm)
         ]
         extra = ["optuna"] if self.request.sampler == "tpe" else []
         return preset.PresetFile(

@@ -94,9 +94,7 @@ class GridFile(BaseModel):
 def grids() -> dict[str, Path]:
     """Return the grids beside the registered tasks by name; the suite's own come first where two share one."""
     folders = dict.fromkeys(
-        Path(item.spec.path).parent / FOLDER
-        for kind, item in registry.load()
-        if kind == "tasks" and isinstance(item.spec, specs.TaskSpec)
+        Path(item.spec.path).parent / FOLDER for _, item in sorted(registry.load().of(specs.TaskSpec).items())
     )
     paths: dict[str, Path] = {}
     for folder in folders:

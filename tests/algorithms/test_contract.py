@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.training.trainer import Trainer
@@ -30,7 +30,9 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
     "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 4), ("mean", 90), ("value", 12))],
 }
-CASES = [(name, case) for name in registry.load().names("algorithms") for case in VARIANTS.get(name, [{}])]
+CASES = [
+    (name, case) for name in registry.load().names(specs.AlgorithmSpec) for case in VARIANTS.get(name, [{}])
+]
 IDS = [f"{name}-{'-'.join(str(v) for v in case.values())}" for name, case in CASES]
 every_algorithm = pytest.mark.parametrize(("name", "case"), CASES, ids=IDS)
 

@@ -111,13 +111,13 @@ class Group:
         self.seeds, self.envs = list(seeds), envs
         self.streams = [Streams("tests", seed) for seed in seeds]
         self.E = envs.num_envs // len(self.seeds)
-        self.model = registry.model(model)
+        self.model = registry.get(specs.ModelSpec, model)
         defaults = {"width": 16, "depth": 1} if model == "mlp" else {"qubits": 2, "layers": 2}
         self.model_options = options.build(
             specs.resolve(self.model.options), {**defaults, **(model_options or {})}, "model"
         )
         self.modules: list[nn.Module] = []
-        spec = registry.algorithm(algorithm)
+        spec = registry.get(specs.AlgorithmSpec, algorithm)
         self.algorithm = specs.resolve(spec.factory)(
             envs,
             self._build,

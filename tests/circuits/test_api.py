@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, ansatz, api, expectations
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.plugins.circuits.native import cpu, program
@@ -59,7 +59,7 @@ def test_a_seed_makes_samples_repeatable(circuit, parameters):
 
 
 def test_the_default_backend_is_registered():
-    assert "pennylane" in registry.load().names("circuit_backends")
+    assert "pennylane" in registry.load().names(specs.CircuitBackendSpec)
 
 
 ONES = np.ones((3, 2))

@@ -19,13 +19,13 @@ from qrlsuite.errors import OptionError
 from qrlsuite.options import field_names
 from qrlsuite.plugins.circuits.qiskit import QiskitBackend
 
-BACKENDS = registry.load().names("circuit_backends")
+BACKENDS = registry.load().names(specs.CircuitBackendSpec)
 VARIANTS = [
     (name, gate)
-    for name in registry.load().names("ansatzes")
+    for name in registry.load().names(specs.AnsatzSpec)
     for gate in (
         ("rot", "xyz", "u3")
-        if "gate" in field_names(specs.resolve(registry.ansatz(name).options))
+        if "gate" in field_names(specs.resolve(registry.get(specs.AnsatzSpec, name).options))
         else (None,)
     )
 ]

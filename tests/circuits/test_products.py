@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend, expectations
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import without_products
@@ -16,7 +16,7 @@ from qrlsuite.plugins.circuits.native import NativeBackend, dense
 from qrlsuite.testing.dense import expectation_values
 from tests.circuits.test_backends import assert_close, draw, evaluate
 
-BACKENDS = registry.load().names("circuit_backends")
+BACKENDS = registry.load().names(specs.CircuitBackendSpec)
 PAULI = {"X": np.array([[0, 1], [1, 0]]), "Y": np.array([[0, -1j], [1j, 0]]), "Z": np.diag([1, -1])}
 
 
@@ -166,7 +166,7 @@ def test_what_cannot_be_written_is_refused(write, message):
 def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
     circuit = Circuit(2)
     circuit.measure([(0, 1)])
-    spec = registry.circuit_backend("pennylane")
+    spec = registry.get(specs.CircuitBackendSpec, "pennylane")
     import dataclasses
 
     single = dataclasses.replace(spec, products=False)

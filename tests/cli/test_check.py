@@ -107,7 +107,7 @@ def test_by_name_every_rule_is_shown(check: Command) -> None:
     code, out, err = check("tidy-too")
     lines = out.splitlines()
     assert (code, err) == (0, "")
-    assert lines[0] == "engine tidy-too"
+    assert lines[0] == "engine 'tidy-too'"
     assert "  ✓ queued: no seed of an entry that was never submitted waits" in lines
     assert lines[-1] == f"all {len(lines) - 2} rules hold"
     assert check("engine:tidy-too") == check("engines:tidy-too") == (code, out, err)
@@ -137,7 +137,7 @@ def test_an_environment_is_checked_as_a_task_has_it(
     monkeypatch.setattr(testing, "check", lambda *words, **more: [asked.append((*words, more))][1:])
     given = load(tiny_task).file.environment.options
     assert check("environment:beam6g", "--task", tiny_task, "--set", "degree=5", "--deterministic")[0] == 0
-    assert asked == [("environments", "beam6g", {**given, "degree": 5}, {"deterministic": True})]
+    assert asked == [("environment", "beam6g", {**given, "degree": 5}, {"deterministic": True})]
     assert (
         "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
     )
@@ -174,7 +174,7 @@ def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check
     for distribution in ("first", "second"):
         code, out, _ = check(distribution)
         assert code == 1
-        assert "engine 'shared' is registered by both first and second" in out
+        assert "engine 'shared' is registered by both first (" in out
     assert check("shared")[0] == 2
 
 
@@ -185,9 +185,7 @@ def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check
         ("engine:tidi", "unknown engine 'tidi'; did you mean 'tidy'?"),
         ("engin:tidy", "unknown kind 'engin'; did you mean 'engine'?"),
         ("distribution:tidi", "no plugin is of a distribution 'tidi'; did you mean 'tidy'?"),
-        ("tracker:no_such_module", "unknown tracker 'no_such_module'"),
-        ("no_such_package.module", "nothing called 'no_such_package.module' is registered"),
-        ("failing.module", "nothing called 'failing.module' is registered"),
+        ("significance-test:times", "'significance-test' is now `rule`"),
         (
             "cartpole",
             "'cartpole' is several things; write qrlsuite check environment:cartpole or qrlsuite check "

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from qrlsuite import api, registry
+from qrlsuite import api, registry, specs
 from qrlsuite.cli import main
 from qrlsuite.cli.app import build
 from qrlsuite.engine.work import EngineOutcome, Show, Work
@@ -105,7 +105,7 @@ class Queue(Scripted):
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    known = registry.load().entries["engines"]
+    known = registry.load().entries[specs.EngineSpec]
     for name, cls in (("scripted", Scripted), ("queue", Queue)):
         spec = EngineSpec(name, "for tests", f"{__name__}:{cls.__name__}")
         monkeypatch.setitem(known, name, registry.Registered(spec, "tests"))
@@ -236,7 +236,7 @@ def test_a_study_goes_on_with_the_code_that_began_it(
     Scripted.interrupt_at = len(Scripted.trained) + 1
     assert say("study", "run", "widths.toml", "--engine", "scripted").exit_code == 130
     Scripted.interrupt_at = -1
-    known = registry.load().entries["models"]
+    known = registry.load().entries[specs.ModelSpec]
     changed = replace(known["mlp"].spec, numerics=2)  # type: ignore[call-arg]
     monkeypatch.setitem(known, "mlp", replace(known["mlp"], spec=changed))
     message = refused("study", "run", "widths.toml", "--engine", "scripted")
@@ -250,7 +250,9 @@ def test_the_example_on_the_page_runs(
 ) -> None:
     [example] = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "decisions.md").read_text(), re.DOTALL)
     spec = EngineSpec("local", "for tests", f"{__name__}:Scripted")
-    monkeypatch.setitem(registry.load().entries["engines"], "local", registry.Registered(spec, "tests"))
+    monkeypatch.setitem(
+        registry.load().entries[specs.EngineSpec], "local", registry.Registered(spec, "tests")
+    )
     example = example.replace("beam6g", "tiny.toml").replace("width=64", "width=2")
     exec(example, {})
     assert "mlp width=2 mlp width=16 " in capsys.readouterr().out

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, UnknownNameError
 from qrlsuite.leaderboard import pictures
@@ -89,7 +89,7 @@ def test_a_third_partys_environment_may_draw_and_is_checked(
 
     from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
-    known = registry.load().entries["environments"]
+    known = registry.load().entries[specs.EnvironmentSpec]
     spec = known["beam6g"].spec
     assert isinstance(spec, EnvironmentSpec)
     options = "qrlsuite.plugins.environments.beam6g.pictures:FieldOptions"

@@ -16,7 +16,7 @@ import pytest
 import tomli_w
 from typer.testing import CliRunner, Result
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.cli import main
 from qrlsuite.cli.app import RENAMED, build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
@@ -105,7 +105,7 @@ class Queue(Here):
 
 @pytest.fixture(autouse=True)
 def engines(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = registry.load().entries["engines"]
+    known = registry.load().entries[specs.EngineSpec]
     for name, cls in (("here", Here), ("queue", Queue)):
         spec = EngineSpec(name, "for tests", f"{__name__}:{cls.__name__}")
         monkeypatch.setitem(known, name, registry.Registered(spec, "tests"))
@@ -165,7 +165,7 @@ REDUCED = {"interactions": 16, "environments": 4, "validation_episodes": 2, "ste
 
 def reduced(name: str, folder: Path) -> str:
     """Write a study of the suite with small models, and the same tasks at a protocol of moments; returns its path."""
-    text = Path(registry.study(name).path).read_text()
+    text = Path(registry.get(specs.StudySpec, name).path).read_text()
     for size, grid in SIZES.items():
         text = re.sub(rf"\b{size} = \[[^]]*\]", f"{size} = {grid}", text)
     text = re.sub(r"qubits = \d+", "qubits = 2", text)
@@ -189,7 +189,7 @@ def reduced(name: str, folder: Path) -> str:
 
 def test_no_study_is_left_out() -> None:
     built_in = {
-        r.spec.name for kind, r in registry.load() if kind == "studies" and r.distribution == "qrlsuite"
+        name for name, r in registry.load().of(specs.StudySpec).items() if r.distribution == "qrlsuite"
     }
     assert set(STUDIES) == built_in
 
@@ -472,7 +472,7 @@ def two_studies(widths: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         path.stem: registry.Registered(StudySpec(path.stem, "for tests", str(path)), "tests")
         for path in (Path(widths), wide)
     }
-    monkeypatch.setitem(registry.load().entries, "studies", registered)
+    monkeypatch.setitem(registry.load().entries, specs.StudySpec, registered)
 
 
 @pytest.mark.usefixtures("two_studies")

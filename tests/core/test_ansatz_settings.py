@@ -12,7 +12,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from typer.testing import CliRunner
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError
@@ -40,7 +40,7 @@ def ising(qubits: int, layers: int, options: Options) -> Circuit:
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = registry.load().entries["ansatzes"]
+    known = registry.load().entries[specs.AnsatzSpec]
     spec = AnsatzSpec("ising", "an ansatz with options", f"{__name__}:Options", f"{__name__}:ising")
     monkeypatch.setitem(known, "ising", replace(known["iqp"], spec=spec))
 

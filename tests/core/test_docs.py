@@ -106,7 +106,7 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
             and not named[flag].endswith(".toml")
             and not ("--published" in words and (PUBLISHED / named[flag]).is_dir())
         ):
-            registry.load().get(kind, named[flag].split()[0])
+            registry.get(specs.kind(kind), named[flag].split()[0])
     for model in [value for key, value in itertools.pairwise(words) if key == "--model"] * (
         words[0] == "tune"
     ):
@@ -213,10 +213,10 @@ def test_variables_and_make_targets_exist(page: Path) -> None:
 
 def test_the_fidelity_pages_options_exist() -> None:
     text = (ROOT / "docs" / "fidelity.md").read_text()
-    environment = options.field_names(specs.resolve(registry.environment("beam6g").options))
+    environment = options.field_names(specs.resolve(registry.get(specs.EnvironmentSpec, "beam6g").options))
     for name in re.findall(r"`(\w+) = \"", text):
         assert name in environment
-    assert "init" in options.field_names(specs.resolve(registry.model("mlp").options))
+    assert "init" in options.field_names(specs.resolve(registry.get(specs.ModelSpec, "mlp").options))
     for preset in re.findall(r"--preset (\w+)", text):
         resolve("beam6g", "mlp", preset=preset)
 

@@ -15,7 +15,7 @@ import torch
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError
 from qrlsuite.registry import Registered
 from qrlsuite.results.checkpoint import group_id
@@ -214,7 +214,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Base]], ModelSpec
         spec = ModelSpec(
             "acme", "hides", family="classical", options="acme_hidden:Options", build="acme_hidden:build"
         )
-        monkeypatch.setitem(registry.load().entries["models"], "acme", Registered(spec, "qrlsuite"))
+        monkeypatch.setitem(registry.load().entries[specs.ModelSpec], "acme", Registered(spec, "qrlsuite"))
         return spec
 
     return register
@@ -254,7 +254,7 @@ def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: 
 
 @pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
 def test_check_names_attribute_and_cure(cls: type[Base], install: Callable[[type[Base]], ModelSpec]) -> None:
-    findings = rules.check(Subject("models", install(cls), None, (), {}))
+    findings = rules.check(Subject(install(cls), None, (), {}))
     (broken,) = [finding for finding in findings if finding.rule == "nothing hidden"]
     assert not broken.ok
     assert re.search(REFUSED[cls], broken.message), broken.message

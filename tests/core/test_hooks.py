@@ -1,89 +1,105 @@
-"""Each hook by the example in its own manual; and a stranger's distribution, as pip leaves it, on the command line."""
+"""Each hook by the example in its manual; and a stranger's distribution, as pip leaves it, on the command line."""
 
 from __future__ import annotations
 
-import inspect
+import re
 import subprocess
 import sys
-import textwrap
 import types
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from qrlsuite import hookspecs, registry
+from qrlsuite import hookspecs, registry, specs
 from qrlsuite.cli.extensions import add_commands
-from qrlsuite.experiment.catalog import hooks
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
 from tests.commands import qrlsuite
 from tests.conftest import install, installed
 
-NAMES = [row["name"] for row in hooks()]
+MANUAL = (Path(__file__).parents[2] / "docs" / "api" / "hooks.md").read_text()
+EXAMPLES = dict(re.findall(r"^## `(\w+)`\n.*?```python\n(.*?)```", MANUAL, re.MULTILINE | re.DOTALL))
 
 
-def example(hook: str, folder: Path) -> types.ModuleType:
-    """The module that the hook's manual shows."""
-    manual = inspect.getdoc(getattr(hookspecs, hook)) or ""
-    code = manual.partition(":\n\n    ")[2]
-    lines = [line for line in f"    {code}".splitlines() if not line.strip() or line.startswith("    ")]
-    module = types.ModuleType(f"example_{hook}")
-    module.__file__ = str(folder / "plugin.py")
-    names = {"hookimpl": hookspecs.hookimpl, "RuleSpec": registry.specs.RuleSpec}
-    module.__dict__.update(names)
-    exec(compile(textwrap.dedent("\n".join(lines)), f"<manual of {hook}>", "exec"), module.__dict__)
-    return module
-
-
-def load(module: types.ModuleType) -> registry.Registry:
-    sys.modules[module.__name__] = module
-    point = metadata.EntryPoint("example", module.__name__, "qrlsuite")
+def load(name: str, code: str) -> registry.Registry:
+    """Load a plugin's code and nothing else."""
+    module = types.ModuleType(name)
+    module.__file__ = f"{name}.py"
+    exec(compile(code, f"{name}.py", "exec"), module.__dict__)
+    sys.modules[name] = module
+    point = metadata.EntryPoint("example", name, "qrlsuite")
     return registry.create(strict=True, points=lambda: [("example-dist", point)])
 
 
-@pytest.mark.parametrize("hook", NAMES)
-def test_the_example_in_the_manual_works(hook: str, tmp_path: Path) -> None:
-    found = load(example(hook, tmp_path))
-    kind = hook.removeprefix("register_")
-    if hook == "register":
-        assert found.plugins[0].registered == {"ansatzes": ["ring"], "tasks": ["short"]}
-    elif kind in registry.KINDS:
-        [plugin] = found.plugins
-        [name] = plugin.registered[kind]
-        assert found.get(kind, name).distribution == "example-dist"
-    elif hook == "register_commands":
-        app = typer.Typer()
-        app.callback()(lambda: None)
-        add_commands(app, found)
-        assert "Hello, you." in CliRunner().invoke(app, ["hello"]).output
-    else:
-        content: dict[str, Any] = {"run": {**RUN, "folder": str(tmp_path), "epochs": 0}}
-        if hook == "epoch_finished":
-            content["record"] = RECORD
-        sink = trackers.EventSink(found)
-        sink.send(hook, **content)
+def test_every_kind_has_a_hook_and_every_hook_a_manual() -> None:
+    assert EXAMPLES.keys() == hookspecs.HOOKS.keys()
+    assert {f"register_{kind}" for kind in specs.KINDS} | {"register_commands"} == hookspecs.HOOKS.keys()
+
+
+@pytest.mark.parametrize(("hook", "kind"), hookspecs.REGISTER.items())
+def test_the_example_in_the_manual_works(hook: str, kind: type[specs.Spec]) -> None:
+    found = load(f"example_{hook}", EXAMPLES[hook])
+    [(name, registered)] = found.of(kind).items()
+    assert found.plugins[0].registered == {kind.kinds: [name]}
+    line = EXAMPLES[hook].splitlines()[int(registered.place.rpartition(":")[2]) - 1]
+    assert "register(" in line, "where it was registered"
+
+
+def test_the_example_of_a_command_works() -> None:
+    app = typer.Typer()
+    app.callback()(lambda: None)
+    add_commands(app, load("example_commands", EXAMPLES["register_commands"]))
+    assert "Hello, you." in CliRunner().invoke(app, ["hello"]).output
+
+
+UNPORTED = {
+    "register(register)": "the hook 'register' is now one hook for each kind: `register_models`, `register_tasks`",
+    "register_significance_tests(register)": "'register_significance_tests' is now `register_rules`, with RuleSpec",
+    "epoch_finished(run, record)": "'epoch_finished' is now a method of a tracker: `register_trackers` with "
+    "TrackerSpec(..., always=True)",
+    "register_rules(register): from qrlsuite.specs import SignificanceTestSpec": "qrlsuite.specs."
+    "SignificanceTestSpec is now RuleSpec",
+}
+
+
+@pytest.mark.parametrize(("hook", "answer"), UNPORTED.items(), ids=["one hook", "rules", "events", "spec"])
+def test_a_plugin_of_an_earlier_version_is_told_the_new_name(hook: str, answer: str) -> None:
+    code = f"from qrlsuite import hookimpl\n@hookimpl\ndef {hook if ': ' in hook else hook + ': pass'}\n"
+    with pytest.raises(registry.PluginError) as refused:
+        load("unported", code)
+    assert answer in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+ALWAYS = """
+from qrlsuite import hookimpl, specs
+
+@hookimpl
+def register_trackers(register):
+    register(specs.TrackerSpec("notes", "Notes every run", f"{__name__}:Notes", always=True))
+
+class Notes:
+    heard = []
+    def __init__(self, target):
+        self.target = target
+    def epoch_finished(self, run, record):
+        self.heard.append((self.target, run["seed"], record["epoch"]))
+"""
+
+
+def test_a_tracker_that_always_watches_is_asked_by_no_one_and_may_be_given_a_target() -> None:
+    known = load("always", ALWAYS)
+    for requests in ([], ["notes=here"]):
+        sink = trackers.EventSink(known, requests)
+        assert sink.heard("epoch_finished")
+        assert not sink.heard("run_started")
+        sink.send("run_started", run=RUN)
+        sink.send("epoch_finished", run=RUN, record=RECORD)
         assert not sink.problems
-        assert (tmp_path / "notes.txt").read_text().strip()
-
-
-def test_one_hook_takes_every_kind_of_spec_and_nothing_else() -> None:
-    module = types.ModuleType("example_one_hook")
-    module.register = registry.hookspecs.hookimpl(lambda register: register("ring"))  # type: ignore[attr-defined]
-    with pytest.raises(registry.PluginError, match=r"hook 'register': register\(\) needs a spec of"):
-        load(module)
-
-
-def test_every_kind_and_event_has_a_hook() -> None:
-    expected = {f"register_{kind}" for kind in registry.KINDS} | {
-        "register",
-        "register_commands",
-        *trackers.EVENTS,
-    }
-    assert set(NAMES) == expected
+    assert sys.modules["always"].Notes.heard == [(None, 7, 1), ("here", 7, 1)]
 
 
 COMMANDS = """

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.where import Where
@@ -418,9 +418,9 @@ def tiny(task: str, *settings: str, model: str = "mlp") -> Entry:
 
 
 def with_numerics(monkeypatch: pytest.MonkeyPatch, kind: str, name: str, number: int) -> None:
-    known = registry.load().entries[kind]
+    known = registry.load().entries[specs.kind(kind)]
     each = known[name]
-    monkeypatch.setitem(known, name, replace(each, spec=replace(each.spec, numerics=number)))  # type: ignore[call-arg]
+    monkeypatch.setitem(known, name, replace(each, spec=replace(each.spec, numerics=number)))
 
 
 def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(

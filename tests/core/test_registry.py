@@ -38,24 +38,25 @@ def points(*pairs: tuple[str, str]) -> Callable[[], list[tuple[str, metadata.Ent
 def test_a_third_partys_model_is_found() -> None:
     plugin("tp_good", register_models=lambda register: register(specs.ModelSpec(name="tp", **MODEL)))
     found = registry.create(points=points(("third-party", "tp_good")))
-    assert found.names("models") == ["tp"]
-    assert found.get("models", "tp").distribution == "third-party"
+    assert found.names(specs.ModelSpec) == ["tp"]
+    assert found.get(specs.ModelSpec, "tp").distribution == "third-party"
 
 
 def test_an_unknown_name_gets_the_nearest_match() -> None:
     with pytest.raises(UnknownNameError, match="unknown model 'mpl'; did you mean 'mlp'"):
-        registry.load().get("models", "mpl")
+        registry.load().get(specs.ModelSpec, "mpl")
 
 
 def test_a_name_registered_twice_names_both_distributions() -> None:
     for name in ("tp_one", "tp_two"):
         plugin(name, register_models=lambda register: register(specs.ModelSpec(name="twin", **MODEL)))
     both = points(("one", "tp_one"), ("two", "tp_two"))
-    message = r"'twin' is registered by both one and two: uninstall one of them \(pip uninstall two\)"
+    place = r"\(.*test_registry.py:\d+\)"
+    message = rf"'twin' is registered by both one {place} and two {place}: uninstall one of them \(pip uninstall two\)"
     with pytest.warns(registry.PluginWarning, match=message):
         found = registry.create(points=both)
     with pytest.raises(PluginError, match=message):
-        found.get("models", "twin")
+        found.get(specs.ModelSpec, "twin")
     with pytest.raises(PluginError, match=message):
         registry.create(strict=True, points=both)
 
@@ -66,7 +67,9 @@ def test_a_name_registered_twice_by_one_distribution_is_its_own_affair() -> None
         register(specs.ModelSpec(name="twin", **MODEL))
 
     plugin("tp_twice", register_models=twice)
-    with pytest.warns(registry.PluginWarning, match="twice by one: give one of them another name"):
+    with pytest.warns(
+        registry.PluginWarning, match="twice by one, .*:\\d+ and .*:\\d+: give one of them another name"
+    ):
         registry.create(points=points(("one", "tp_twice")))
 
 
@@ -98,7 +101,7 @@ def test_a_broken_plugin_is_named_and_skipped(functions: dict[str, Any], message
     with pytest.warns(registry.PluginWarning, match=message) as caught:
         found = registry.create(points=both)
     assert str(caught[0].message).startswith("plugin 'tp_broken' of distribution 'broken-dist': ")
-    assert found.names("models") == ["fine"]
+    assert found.names(specs.ModelSpec) == ["fine"]
     assert [bool(p.problem) for p in found.plugins] == [True, False]
     assert "tp_broken" not in str(found.manager.list_name_plugin())
     with pytest.raises(PluginError, match=message):
@@ -196,9 +199,8 @@ def test_references_that_do_not_resolve(reference: str, message: str) -> None:
         specs.resolve(reference)
 
 
-@pytest.mark.parametrize(("kind", "name"), [(k, r.spec.name) for k, r in registry.load()])
-def test_every_registered_reference_resolves(kind: str, name: str) -> None:
-    spec = registry.load().get(kind, name).spec
+@pytest.mark.parametrize("spec", [each.spec for each in registry.load()], ids=lambda spec: spec.title)
+def test_every_registered_reference_resolves(spec: specs.Spec) -> None:
     for field in ("options", "build", "factory", "population", "vector", "entry_point"):
         reference = getattr(spec, field, None)
         if reference is not None:

@@ -85,9 +85,9 @@ def curves(first_good: int, name: str) -> LearningCurves:
 
 def test_built_in_rules_are_registered_like_anyones() -> None:
     known = registry.load()
-    assert set(known.names("rules")) == {"intervals", "times", "times-skewed"}
-    for name in known.names("rules"):
-        assert known.get("rules", name).distribution == "qrlsuite"
+    assert set(known.names(specs.RuleSpec)) == {"intervals", "times", "times-skewed"}
+    for name in known.names(specs.RuleSpec):
+        assert known.get(specs.RuleSpec, name).distribution == "qrlsuite"
         assert rules.load(name).name == name
     assert isinstance(rules.load(), IntervalRule), "the paper's rule is the default"
     with pytest.raises(UnknownNameError, match="did you mean 'intervals'"):

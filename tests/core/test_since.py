@@ -15,7 +15,7 @@ import pytest
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from qrlsuite import options, registry
+from qrlsuite import options, registry, specs
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import PluginError
 from qrlsuite.experiment.entry import Entry, from_record, resolve
@@ -77,9 +77,10 @@ def upgrade(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
     def apply() -> None:
         for (kind, name), cls in LATER.items():
-            found = registry.load().entries[kind][name]
-            spec = dataclasses.replace(found.spec, options=f"later:{cls.__name__}")  # type: ignore[call-arg]
-            monkeypatch.setitem(registry.load().entries[kind], name, dataclasses.replace(found, spec=spec))
+            known = registry.load().entries[specs.kind(kind)]
+            found = known[name]
+            spec = dataclasses.replace(found.spec, options=f"later:{cls.__name__}")
+            monkeypatch.setitem(known, name, dataclasses.replace(found, spec=spec))
 
     return apply
 

@@ -116,8 +116,8 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
     """Of every published entry: its seconds per seed and epoch lie in the range that the reference speeds give."""
     (path,) = {
         Path(registered.spec.speeds)
-        for kind, registered in registry.load()
-        if kind == "studies" and isinstance(registered.spec, StudySpec) and registered.spec.speeds
+        for registered in registry.load().of(StudySpec).values()
+        if registered.spec.speeds
     }
     known = Speeds(references=[replace(row, calibration=None) for row in speed.load(path)])
     found = [file for folder in published.folders() for file in folder.glob("*/*/entry.json")]

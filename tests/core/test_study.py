@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import Setting, parse_setting
@@ -110,7 +110,7 @@ EXPECTED = {
 
 def test_the_benchmarks_studies_are_there() -> None:
     built_in = [
-        r.spec.name for kind, r in registry.load() if kind == "studies" and r.distribution == "qrlsuite"
+        name for name, r in registry.load().of(specs.StudySpec).items() if r.distribution == "qrlsuite"
     ]
     assert set(built_in) == set(EXPECTED)
 
@@ -270,7 +270,7 @@ def test_unknown_names() -> None:
 def test_speeds_come_with_the_studies() -> None:
     from qrlsuite.results import speed
 
-    rows = speed.load(Path(str(registry.study("fig7").speeds)))
+    rows = speed.load(Path(str(registry.get(specs.StudySpec, "fig7").speeds)))
     kinds = {row.kind for row in rows}
     for name in EXPECTED:
         for member in study.load(name).members() if name != "matched" else []:

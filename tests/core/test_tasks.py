@@ -27,7 +27,7 @@ reference = { threshold = 1.0, delta = 0.5 }
 """
 
 
-@pytest.mark.parametrize("name", registry.load().names("tasks"))
+@pytest.mark.parametrize("name", registry.load().names(specs.TaskSpec))
 def test_every_registered_task_loads_under_its_own_name(name: str) -> None:
     loaded = task.load(name)
     assert loaded.name == name
@@ -190,7 +190,7 @@ def test_other_environment_options_make_another_task(tmp_path: Path) -> None:
 
 
 def test_tasks_that_extend_beam6g_are_those_they_were_when_their_files_were_whole() -> None:
-    names = [name for name in registry.load().names("tasks") if name.startswith("beam6g-")]
+    names = [name for name in registry.load().names(specs.TaskSpec) if name.startswith("beam6g-")]
     assert len(names) == 24
     assert task.digest({name: task.load(name).hash for name in names}) == "9ceffffafc875806"
 

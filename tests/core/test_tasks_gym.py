@@ -29,7 +29,7 @@ from tests.environments.strangers import HERE
 ROOT = Path(__file__).parents[2]
 PRESETS = [
     (name, preset, algorithm, family)
-    for name in registry.load().names("tasks")
+    for name in registry.load().names(specs.TaskSpec)
     for preset, tables in task.load(name).file.presets.items()
     for algorithm, families in tables.items()
     for family in ("classical", "quantum")
@@ -42,7 +42,7 @@ def cli(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return qrlsuite(*words, cwd=cwd, env=environment)
 
 
-@pytest.mark.parametrize("name", registry.load().names("tasks"))
+@pytest.mark.parametrize("name", registry.load().names(specs.TaskSpec))
 def test_every_task_is_whole(name: str) -> None:
     loaded = task.load(name)
     file = loaded.file
@@ -60,10 +60,12 @@ def test_every_task_is_whole(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "preset", "algorithm", "family"), PRESETS)
 def test_every_preset_is_made_of_options(name: str, preset: str, algorithm: str, family: str) -> None:
-    if algorithm not in registry.load().names("algorithms"):
+    if algorithm not in registry.load().names(specs.AlgorithmSpec):
         pytest.skip(f"{algorithm} is not registered")
     _, values = task.load(name).preset(preset, algorithm, family)
-    built = options.build(specs.resolve(registry.algorithm(algorithm).options), values, "preset")
+    built = options.build(
+        specs.resolve(registry.get(specs.AlgorithmSpec, algorithm).options), values, "preset"
+    )
     assert {key: value for key, value in options.plain(built).items() if key in values} == values
 
 
@@ -77,7 +79,7 @@ def test_cartpole_is_as_the_benchmark_says() -> None:
 
 
 def test_all_twenty_placements_are_there_and_differ() -> None:
-    names = [name for name in registry.load().names("tasks") if re.fullmatch(r"beam6g-a\d-\d", name)]
+    names = [name for name in registry.load().names(specs.TaskSpec) if re.fullmatch(r"beam6g-a\d-\d", name)]
     assert names == [f"beam6g-a{antennas}-{index}" for antennas in (2, 3, 4, 5) for index in range(5)]
     assert len({task.load(name).hash for name in names}) == 20
     for name in names:
@@ -152,7 +154,7 @@ def test_tasks_without_a_file_that_cannot_be(env_id: str, message: str) -> None:
 
 
 def test_a_task_file_names_an_unknown_id_with_its_path(tmp_path: Path) -> None:
-    text = Path(registry.task("acrobot").path).read_text().replace("Acrobot-v1", "Acrobat-v1")
+    text = Path(registry.get(specs.TaskSpec, "acrobot").path).read_text().replace("Acrobot-v1", "Acrobat-v1")
     with pytest.raises(
         QrlSuiteError, match=r"t.toml: environment.options: id = 'Acrobat-v1': .*'Acrobot-v1'"
     ):

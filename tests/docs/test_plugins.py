@@ -5,24 +5,20 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from pathlib import Path
 
 import pytest
 
-from qrlsuite import hookspecs, registry, scaffold
+from qrlsuite import hookspecs, scaffold
+from qrlsuite.specs import KINDS
 from tests.testing.test_builtins import RULES
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "plugins.md").read_text()
 PACKAGE = ROOT / "tests" / "third_party" / "acme-qrl"
 FILES = re.findall(r"\*\*`(\S+)`\*\*\n\n```(?:python|toml)\n(.*?)```\n", PAGE, re.DOTALL)
-HOOKS = [
-    name
-    for name, function in vars(hookspecs).items()
-    if inspect.isfunction(function) and hasattr(function, f"{hookspecs.PROJECT}_spec")
-]
+HOOKS = list(hookspecs.HOOKS)
 
 
 @pytest.mark.parametrize(("path", "text"), FILES, ids=[path for path, _ in FILES])
@@ -45,7 +41,7 @@ def test_every_hook_is_on_the_page(hook: str) -> None:
 
 @pytest.mark.parametrize("kind", RULES)
 def test_the_rules_on_the_page_are_the_checks(kind: str) -> None:
-    word = registry.SINGULAR[kind].replace("_", " ")
+    word = KINDS[kind].kind.replace("_", " ")
     (row,) = re.findall(rf"^\| {word} \| (.*) \|$", PAGE, re.MULTILINE)
     assert re.findall(r"`([^`]+)`", row) == RULES[kind]
 

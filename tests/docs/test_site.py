@@ -73,7 +73,7 @@ def test_tutorials_are_pages_with_their_output(site: Path) -> None:
 @pytest.mark.parametrize(
     ("page", "names"),
     [
-        ("hooks", [f"qrlsuite.hookspecs.{name}" for name in HOOKS]),
+        ("hooks", [*HOOKS, "qrlsuite.training.trackers"]),
         ("specs", [f"qrlsuite.specs.{cls.__name__}" for cls in Spec.__subclasses__()]),
         ("testing", [f"qrlsuite.testing.{name}" for name in testing.__all__]),
         ("statistics", [f"qrlsuite.statistics.{name}" for name in statistics.__all__]),

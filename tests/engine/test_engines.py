@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.cli.app import build
 from qrlsuite.engine import api, local, where, worker
 from qrlsuite.engine.local import LocalEngine
@@ -31,7 +31,7 @@ from tests.conftest import Hold, results
 
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
-    assert {"local", "slurm"} <= set(registry.load().names("engines"))
+    assert {"local", "slurm"} <= set(registry.load().names(specs.EngineSpec))
     assert isinstance(where.build("local", {"partition": None}), LocalEngine)
 
 

@@ -283,7 +283,7 @@ def test_gymnasium_make_vec():
 
 
 def test_registered_spec_leads_here():
-    spec = registry.environment("beam6g")
+    spec = registry.get(specs.EnvironmentSpec, "beam6g")
     assert specs.resolve(spec.options) is BeamOptions
     assert specs.resolve(spec.vector) is make_vector
     assert specs.resolve(spec.entry_point) is BeamManagement6G

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 import qrlsuite
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import load
@@ -72,12 +72,8 @@ def machine() -> dict[str, Any]:
 
 def hashes() -> dict[str, Any]:
     """Return the hashes of tasks and of entries at their defaults, and the records of the published entries."""
-    known = registry.load().entries
-    tasks = {
-        name: load(name).hash
-        for name in sorted(known["tasks"])
-        if known["tasks"][name].distribution == "qrlsuite"
-    }
+    known = registry.load().of(specs.TaskSpec)
+    tasks = {name: load(name).hash for name in sorted(known) if known[name].distribution == "qrlsuite"}
     models = ("mlp", "vqc-native", "vqc-pennylane", "vqc-qiskit")
     named = {
         " ".join(words): resolve(words[0], words[2], words[1]).hash

@@ -6,6 +6,8 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from qrlsuite import api, hookimpl, registry
+from qrlsuite import api, registry, specs
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
@@ -337,26 +339,15 @@ def test_epochs_of_a_gpu_before_those_of_the_cpu_are_not_forgotten(folder: Path,
     assert "trained on the CPU here, on cuda (NVIDIA H100) there" in verdict.message
 
 
-def test_verification_is_no_run_that_trackers_hear_of(folder: Path) -> None:
+def test_verification_is_no_run_that_trackers_hear_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[str] = []
-
-    class Tracker:
-        @hookimpl
-        def run_started(self, run: dict[str, Any]) -> None:
-            heard.append(run["folder"])
-
-        @hookimpl
-        def run_finished(self, run: dict[str, Any]) -> None:
-            heard.append(run["folder"])
-
-    manager = registry.load().manager
-    tracker = Tracker()
-    manager.register(tracker)
-    try:
-        assert verify.verify(folder, rerun=1).check == "verified"
-        assert heard == []
-    finally:
-        manager.unregister(tracker)
+    tracker = type("Tracker", (), {"run_started": lambda self, run: heard.append(run["folder"])})
+    monkeypatch.setitem(sys.modules, "listening", types.SimpleNamespace(tracker=lambda target: tracker()))
+    spec = specs.TrackerSpec("listening", "Hears of every run", "listening:tracker", always=True)
+    known = registry.load().entries[specs.TrackerSpec]
+    monkeypatch.setitem(known, "listening", registry.Registered(spec, "tests"))
+    assert verify.verify(folder, rerun=1).check == "verified"
+    assert heard == []
 
 
 def test_what_a_seed_was_made_with_names_device_and_every_plugin(
@@ -366,8 +357,8 @@ def test_what_a_seed_was_made_with_names_device_and_every_plugin(
     named = {"environments": "beam6g", "algorithms": "ddqn", "ansatzes": "cx", "circuit_backends": "native"}
     packages = dict(zip(named, ("pluggy", "packaging", "pydantic", "pydantic_core")))
     for kind, name in named.items():
-        owned = dataclasses.replace(known.entries[kind][name], distribution=packages[kind])
-        monkeypatch.setitem(known.entries[kind], name, owned)
+        of_kind = known.entries[specs.kind(kind)]
+        monkeypatch.setitem(of_kind, name, dataclasses.replace(of_kind[name], distribution=packages[kind]))
     folder = train("runs", [0], 1, model="vqc-native", settings=("qubits=2", "layers=1", "ansatz=cx"))
     (made,) = (EntryStore(folder).seed(0).record() or {})["provenance"]
     assert set(packages.values()) <= made["versions"].keys()

@@ -230,7 +230,7 @@ def unscaled(qubits: int, layers: int, options: NoOptions) -> Circuit:
 def test_circuits_without_that_parameter(
     words: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = registry.load().entries["ansatzes"]
+    known = registry.load().entries[specs.AnsatzSpec]
     spec = AnsatzSpec(
         "unscaled", "Nothing scaled", "qrlsuite.plugins.circuits.ansatz:NoOptions", f"{__name__}:unscaled"
     )

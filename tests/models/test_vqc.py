@@ -3,14 +3,14 @@ import copy
 import pytest
 import torch
 
-from qrlsuite import options, population, registry
+from qrlsuite import options, population, registry, specs
 from qrlsuite.circuit import ansatz, create_backend
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
 from qrlsuite.plugins.models.vqc import VQCNativeOptions, VQCOptions, VQCPennyLaneOptions, VQCQiskitOptions
 
 CLASSES = {"pennylane": VQCPennyLaneOptions, "native": VQCNativeOptions, "qiskit": VQCQiskitOptions}
-BACKENDS = [name for name in CLASSES if name in registry.load().names("circuit_backends")]
+BACKENDS = [name for name in CLASSES if name in registry.load().names(specs.CircuitBackendSpec)]
 
 
 def small(backend="pennylane", **values):
@@ -277,7 +277,7 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
         "init_scale", "linear",
     }  # fmt: skip
     for name in BACKENDS:
-        backend_options = registry.circuit_backend(name).options
+        backend_options = registry.get(specs.CircuitBackendSpec, name).options
         from qrlsuite.specs import resolve
 
         assert set(options.field_names(CLASSES[name])) == own | set(

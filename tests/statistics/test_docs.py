@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import qrlsuite.statistics
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.statistics import (
     Decided,
     DecisionPlan,
@@ -60,7 +60,7 @@ def test_functions_on_the_page_exist(name: str) -> None:
 
 
 def test_rules_verdicts_and_outcomes_are_on_the_page() -> None:
-    for name in (*registry.load().names("rules"), *Verdict, *Outcome):
+    for name in (*registry.load().names(specs.RuleSpec), *Verdict, *Outcome):
         assert name in PAGE
 
 

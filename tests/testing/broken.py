@@ -13,7 +13,6 @@ from typing import Any
 
 from qrlsuite import scaffold
 from qrlsuite.specs import Spec
-from qrlsuite.testing import _FILES
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import Finding
 
@@ -72,23 +71,23 @@ def module(source: str) -> str:
     return made.__name__
 
 
-def own_rules(kind: str, spec: Spec, settings: Mapping[str, Any] | None = None) -> list[Finding]:
+def own_rules(spec: Spec, settings: Mapping[str, Any] | None = None) -> list[Finding]:
     """Go through the rules of a kind, without those that all kinds share (they start an interpreter each time)."""
-    rules = importlib.import_module(f"qrlsuite.testing.{_FILES[kind]}")
-    findings: list[Finding] = rules.check(Subject(kind, spec, None, (), dict(settings or {})))
+    rules = importlib.import_module(f"qrlsuite.testing.{spec.kind}")
+    findings: list[Finding] = rules.check(Subject(spec, None, (), dict(settings or {})))
     return findings
 
 
-def assert_breaks(kind: str, spec: Spec, rule: str, message: str, also: frozenset[str] = frozenset()) -> None:
+def assert_breaks(spec: Spec, rule: str, message: str, also: frozenset[str] = frozenset()) -> None:
     """Assert that a plugin breaks exactly this rule, and what is said about it."""
-    broken = {finding.rule: finding.message for finding in own_rules(kind, spec) if not finding.ok}
+    broken = {finding.rule: finding.message for finding in own_rules(spec) if not finding.ok}
     assert rule in broken, f"'{rule}' holds; broken are {broken}"
     assert re.search(message, broken[rule]), broken[rule]
     assert broken.keys() == {rule} | also, f"also broken: {broken.keys() - {rule}}"
 
 
-def assert_all_good(kind: str, spec: Spec) -> set[str]:
+def assert_all_good(spec: Spec) -> set[str]:
     """Assert that no rule is broken; return the rules."""
-    findings = own_rules(kind, spec)
+    findings = own_rules(spec)
     assert all(finding.ok for finding in findings), findings
     return {finding.rule for finding in findings}

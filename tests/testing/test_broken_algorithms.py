@@ -86,9 +86,9 @@ def spec(edit: Edit | None = None) -> AlgorithmSpec:
 
 @pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
 def test_one_rule_is_broken(edit: Edit) -> None:
-    assert_breaks("algorithms", spec(edit), edit.rule, edit.message, edit.also)
+    assert_breaks(spec(edit), edit.rule, edit.message, edit.also)
 
 
 def test_every_rule_has_an_algorithm_that_breaks_it() -> None:
     per_agent = spec(edit("", "", *PER_AGENT))
-    assert assert_all_good("algorithms", per_agent) == {edit.rule for edit in EDITS}
+    assert assert_all_good(per_agent) == {edit.rule for edit in EDITS}

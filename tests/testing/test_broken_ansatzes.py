@@ -11,7 +11,7 @@ import torch
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend
 from qrlsuite.errors import OptionError
 from qrlsuite.scaffold import Kind
@@ -88,7 +88,7 @@ def spec(*changes: str) -> AnsatzSpec:
 
 @pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
 def test_one_rule_is_broken(edit: Edit) -> None:
-    assert_breaks("ansatzes", spec(*edit.changes), edit.rule, edit.message)
+    assert_breaks(spec(*edit.changes), edit.rule, edit.message)
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,12 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Installed]], None
     """Register a class of this file as the circuit backend `theirs`, beside the suite's own native one."""
 
     def put(cls: type[Installed]) -> None:
-        known = registry.load().entries["circuit_backends"]
+        known = registry.load().entries[specs.CircuitBackendSpec]
         reference = f"{__name__}:{cls.__name__}"
         backend = CircuitBackendSpec("theirs", "A stranger's", f"{__name__}:NoOptions", reference)
         monkeypatch.setitem(
             registry.load().entries,
-            "circuit_backends",
+            specs.CircuitBackendSpec,
             {"native": known["native"], "theirs": registry.Registered(backend, "stranger")},
         )
 
@@ -163,7 +163,7 @@ def test_an_installed_backend_that_fails_it_is_named(
     install: Callable[[type[Installed]], None], rule: str, cls: type[Installed], message: str
 ) -> None:
     install(cls)
-    assert_breaks("ansatzes", spec(), rule, message)
+    assert_breaks(spec(), rule, message)
 
 
 @pytest.mark.parametrize("cls", [Installed, Sampling])
@@ -171,28 +171,26 @@ def test_a_backend_that_samples_is_only_run(
     install: Callable[[type[Installed]], None], cls: type[Installed]
 ) -> None:
     install(cls)
-    assert_all_good("ansatzes", spec())
+    assert_all_good(spec())
 
 
 def test_without_a_backend_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry.load().entries, "circuit_backends", {})
-    assert_breaks("ansatzes", spec(), "effects", "no circuit backend is installed: install qrlsuite")
+    monkeypatch.setitem(registry.load().entries, specs.CircuitBackendSpec, {})
+    assert_breaks(spec(), "effects", "no circuit backend is installed: install qrlsuite")
 
 
 def test_every_rule_has_an_ansatz_that_breaks_it() -> None:
     rules = {edit.rule for edit in EDITS} | {rule for rule, _, _ in BACKENDS}
-    assert assert_all_good("ansatzes", spec()) == rules
+    assert assert_all_good(spec()) == rules
 
 
 def test_sizes_may_be_refused() -> None:
-    assert_all_good(
-        "ansatzes", spec(CIRCUIT, f"if not 2 <= qubits <= 10: {REFUSE}('2 to 10')\n    {CIRCUIT}")
-    )
+    assert_all_good(spec(CIRCUIT, f"if not 2 <= qubits <= 10: {REFUSE}('2 to 10')\n    {CIRCUIT}"))
 
 
 def test_what_the_ends_of_a_pattern_leave_without_effect_is_named_and_breaks_nothing() -> None:
     """Published circuits end every layer with RZ, the last one too."""
-    findings = {finding.rule: finding for finding in own_rules("ansatzes", spec(*LAST_ROTATION))}
+    findings = {finding.rule: finding for finding in own_rules(spec(*LAST_ROTATION))}
     assert all(finding.ok for finding in findings.values())
     assert findings["effects"].message.endswith(
         "4 of 24 scalars do not (4 qubits, 3 layers: weights[2, 0, 1], weights[2, 1, 1], weights[2, 2, 1], ...)"
@@ -202,7 +200,7 @@ def test_what_the_ends_of_a_pattern_leave_without_effect_is_named_and_breaks_not
 @pytest.mark.parametrize("gate", ["xyz", "u3"])
 @pytest.mark.parametrize("name", ["iqp", "cx", "cz"])
 def test_the_gates_of_built_in_ansatzes_have_effects(name: str, gate: str) -> None:
-    findings = own_rules("ansatzes", registry.ansatz(name), {"gate": gate})
+    findings = own_rules(registry.get(specs.AnsatzSpec, name), {"gate": gate})
     assert all(finding.ok for finding in findings), findings
 
 

@@ -146,7 +146,7 @@ def spec(*changes: str, mean_field: bool = False) -> CircuitBackendSpec:
 
 @pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
 def test_one_rule_is_broken(edit: Edit) -> None:
-    assert_breaks("circuit_backends", spec(*edit.changes, **edit.spec), edit.rule, edit.message, edit.also)
+    assert_breaks(spec(*edit.changes, **edit.spec), edit.rule, edit.message, edit.also)
 
 
 RULES = {edit.rule for edit in EDITS}
@@ -165,7 +165,7 @@ RULES = {edit.rule for edit in EDITS}
 def test_every_rule_that_applies_has_a_backend_that_breaks_it(
     good: CircuitBackendSpec, rules: set[str]
 ) -> None:
-    assert assert_all_good("circuit_backends", good) == rules
+    assert assert_all_good(good) == rules
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_every_rule_that_applies_has_a_backend_that_breaks_it(
 def test_a_wrong_gate_is_named(gate: str, controlled: bool) -> None:
     same = f"operation.gate == {gate!r} and (operation.control is not None) == {controlled}"
     left_out = spec(CHANGE, f"return None if {same} else operation")
-    [message] = [f.message for f in own_rules("circuit_backends", left_out) if f.rule == "values"]
+    [message] = [f.message for f in own_rules(left_out) if f.rule == "values"]
     named = message.partition("these are wrong: ")[2].partition(";")[0].split(", ")
     wanted = f"{gate} with control" if controlled else gate
     assert wanted in named

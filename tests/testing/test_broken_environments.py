@@ -6,7 +6,7 @@ import pytest
 
 from qrlsuite.scaffold import Kind
 from qrlsuite.specs import EnvironmentSpec
-from qrlsuite.testing import check_environment
+from qrlsuite.testing import check
 from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, template
 
 LANES = '''
@@ -178,17 +178,17 @@ def spec(*changes: str, vector: str | None = "Lanes") -> EnvironmentSpec:
 
 @pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
 def test_one_rule_is_broken(edit: Edit) -> None:
-    assert_breaks("environments", spec(*edit.changes, **edit.spec), edit.rule, edit.message, edit.also)
+    assert_breaks(spec(*edit.changes, **edit.spec), edit.rule, edit.message, edit.also)
 
 
 @pytest.mark.parametrize("vector", ["Lanes", None])
 def test_every_rule_has_an_environment_that_breaks_it(vector: str | None) -> None:
-    assert assert_all_good("environments", spec(vector=vector)) == {edit.rule for edit in EDITS}
+    assert assert_all_good(spec(vector=vector)) == {edit.rule for edit in EDITS}
 
 
 def test_episodes_may_be_alike_where_they_are_meant_to() -> None:
     alike = spec(STREAM, "self.taken[lane] * 0.37 % 1 for lane in lanes")
-    rules = {finding.rule: finding.ok for finding in check_environment(alike, deterministic=True)}
+    rules = {finding.rule: finding.ok for finding in check("environment", alike, deterministic=True)}
     assert "different seed" not in rules
     assert rules["same seed"]
     assert rules["validation"]

@@ -167,11 +167,11 @@ def spec(source: str = GOOD, **more: Any) -> ModelSpec:
 
 @pytest.mark.parametrize("edit", EDITS, ids=ids(EDITS))
 def test_one_rule_is_broken(edit: Edit) -> None:
-    assert_breaks("models", spec(edit.of(GOOD), **edit.spec), edit.rule, edit.message, edit.also)
+    assert_breaks(spec(edit.of(GOOD), **edit.spec), edit.rule, edit.message, edit.also)
 
 
 def test_every_rule_has_a_model_that_breaks_it() -> None:
-    assert assert_all_good("models", spec()) == {edit.rule for edit in EDITS}
+    assert assert_all_good(spec()) == {edit.rule for edit in EDITS}
 
 
 SHARING = """
@@ -194,7 +194,7 @@ def test_weights_that_all_seeds_share_show_in_the_order_of_building(
     for name, code in {"good": GOOD, "shared": GOOD.replace("    return Network", f"{SHARING}\n#")}.items():
         (tmp_path / f"acme_{name}.py").write_text(code)
         given = ModelSpec("broken", "Shares", "classical", f"acme_{name}:Options", f"acme_{name}:build")
-        findings = rules.check(Subject("models", given, "acme", (f"acme_{name}",), {}))
+        findings = rules.check(Subject(given, "acme", (f"acme_{name}",), {}))
         broken[name] = {finding.rule: finding.message for finding in findings if not finding.ok}
     assert broken["good"] == {}
     assert broken["shared"].keys() == {"build order"}

@@ -7,6 +7,7 @@ import importlib.util
 import pytest
 
 from qrlsuite import registry
+from qrlsuite.specs import KINDS
 from qrlsuite.testing import check
 from qrlsuite.testing.selection import CheckTarget, of_distribution
 
@@ -49,28 +50,28 @@ WHERE_OFFERED = {
     ("rules", "intervals"): ["against"],
     ("rules", "times"): ["against"],
     ("rules", "times-skewed"): ["against"],
-    **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind == "studies"},
+    **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
     **{("models", name): ["memory"] for name in ("fourier", "mlp", "vqc-native", "vqc-pennylane")},
-    **{("algorithms", item.name): ["memory"] for item in EVERYTHING if item.kind == "algorithms"},
+    **{("algorithms", item.name): ["memory"] for item in EVERYTHING if item.kind.kinds == "algorithms"},
 }
 """Rules about what a thing need not have."""
 
 
-@pytest.mark.parametrize("item", EVERYTHING, ids=lambda item: f"{item.kind}-{item.name}")
+@pytest.mark.parametrize("item", EVERYTHING, ids=lambda item: f"{item.kind.kinds}-{item.name}")
 def test_it_conforms(item: CheckTarget) -> None:
     """A rule that is silently skipped would never be broken: so every one is named."""
-    package = NEEDS.get((item.kind, item.name))
+    package = NEEDS.get((item.kind.kinds, item.name))
     if package is not None and importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
-    findings = check(item.kind, item.name)
+    findings = check(item.kind.kind, item.name)
     broken = [f"{finding.rule}: {finding.message}" for finding in findings if not finding.ok]
     assert not broken
     spec = registry.load().get(item.kind, item.name).spec
     options = OPTIONS if getattr(spec, "options", None) else []
-    offered = WHERE_OFFERED.get((item.kind, item.name), [])
-    expected = [*COMMON, *options, *RULES[item.kind], *offered]
+    offered = WHERE_OFFERED.get((item.kind.kinds, item.name), [])
+    expected = [*COMMON, *options, *RULES[item.kind.kinds], *offered]
     assert sorted(finding.rule for finding in findings) == sorted(expected)
 
 
 def test_no_kind_is_left_out() -> None:
-    assert RULES.keys() == registry.KINDS.keys() == {item.kind for item in EVERYTHING}
+    assert RULES.keys() == KINDS.keys() == {item.kind.kinds for item in EVERYTHING}

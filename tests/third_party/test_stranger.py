@@ -180,7 +180,7 @@ def test_the_commands_of_the_page_run(installed: Installation, ranked: Path) -> 
             outputs[" ".join(words)] = installed.qrlsuite(*words, *more).stdout
     assert len(outputs) > 10
     checked = outputs["check acme-qrl"]
-    for title in ("ansatz rzz-ring", "circuit backend damped", "rule half", "tracker acme-log"):
+    for title in ("ansatz 'rzz-ring'", "circuit backend 'damped'", "rule 'half'", "tracker 'acme-log'"):
         assert title in checked
     assert "rules hold" in checked
     assert len((installed.folder / "scores.txt").read_text().splitlines()) == 4  # 2 seeds of 2 epochs

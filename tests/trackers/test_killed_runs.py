@@ -65,7 +65,7 @@ from qrlsuite.testing.tracker import RECORD, RUN
 folder = Path("runs", "task", "entry", "seed-0007")
 folder.mkdir(parents=True)
 run = {**RUN, "folder": str(folder), "epochs": 0, "history": []}
-tracker = specs.resolve(registry.tracker(sys.argv[1]).factory)(None)
+tracker = specs.resolve(registry.get(specs.TrackerSpec, sys.argv[1]).factory)(None)
 tracker.run_started(run)
 tracker.epoch_finished(run, RECORD)
 tracker.run_finished(run)

@@ -81,7 +81,9 @@ def factory(target: str | None) -> Fails:
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = specs.TrackerSpec(name="failing", summary="Fails", factory=f"{__name__}:factory")
-    monkeypatch.setitem(registry.load().entries["trackers"], "failing", registry.Registered(spec, "tests"))
+    monkeypatch.setitem(
+        registry.load().entries[specs.TrackerSpec], "failing", registry.Registered(spec, "tests")
+    )
 
 
 @pytest.mark.usefixtures("failing")
@@ -108,7 +110,7 @@ def test_asking_for_what_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(QrlSuiteError, match="nothing follows '='"):
         trackers.parse(["tensorboard="])
     spec = specs.TrackerSpec("far", "Away", factory="a:b", extras={"no_such_module": "pip install far"})
-    monkeypatch.setitem(registry.load().entries["trackers"], "far", registry.Registered(spec, "tests"))
+    monkeypatch.setitem(registry.load().entries[specs.TrackerSpec], "far", registry.Registered(spec, "tests"))
     with pytest.raises(
         QrlSuiteError, match="tracker 'far' needs the package 'no_such_module': pip install far"
     ):

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from qrlsuite import registry, testing
+from qrlsuite import registry, specs, testing
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
 from qrlsuite.experiment.task import load as load_task
@@ -25,8 +25,7 @@ def check(
         str | None,
         typer.Argument(
             metavar="NAME|KIND:NAME|DISTRIBUTION",
-            help="What is registered, a whole distribution, or a task's file. For a tracker without a name: its "
-            "module.",
+            help="What is registered, a whole distribution, or a task's file.",
         ),
     ] = None,
     settings: Annotated[
@@ -58,7 +57,7 @@ def check(
         return
     items = selection.select(name)
     more = {"deterministic": True} if deterministic else {}
-    if (task or deterministic) and [item.kind for item in items] != ["environments"]:
+    if (task or deterministic) and [item.kind for item in items] != [specs.EnvironmentSpec]:
         raise typer.BadParameter(
             "--task and --deterministic are for an environment: qrlsuite check environment:NAME"
         )
@@ -86,7 +85,7 @@ def _options_in(task: str, item: CheckTarget) -> dict[str, Any]:
 def _findings(item: CheckTarget, settings: dict[str, Any], more: dict[str, Any]) -> list[Finding]:
 
     try:
-        return testing.check(item.kind, item.name, settings, **more)
+        return testing.check(item.kind.kind, item.name, settings, **more)
     except (Exception, SystemExit) as error:  # code that fails outside of any rule: the rest is still checked
         return [Finding("check", False, registry.words(error))]
 
@@ -94,7 +93,7 @@ def _findings(item: CheckTarget, settings: dict[str, Any], more: dict[str, Any])
 def _plain(item: CheckTarget, finding: Finding) -> dict[str, Any]:
 
     return {
-        "kind": registry.SINGULAR[item.kind],
+        "kind": item.kind.kind,
         "name": item.name,
         "rule": finding.rule,
         "ok": finding.ok,

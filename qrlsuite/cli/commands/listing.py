@@ -8,11 +8,9 @@ from typing import Annotated
 
 import typer
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import UnknownNameError, nearest
-from qrlsuite.experiment.catalog import hooks
 from qrlsuite.registry import Registry
 
 SHOWN = 8
@@ -23,7 +21,7 @@ def list_things(
     kind: Annotated[
         str | None,
         typer.Argument(
-            help="tasks, models, algorithms, environments, ansatzes, circuit-backends, ..., plugins, hooks; "
+            help="tasks, models, algorithms, environments, ansatzes, circuit-backends, ..., plugins; "
             "default: all that is registered"
         ),
     ] = None,
@@ -31,28 +29,22 @@ def list_things(
 ) -> None:
     """List what is registered, by the suite or by plugins, and from which distribution.
 
-    `plugins` shows each plugin with its version, what it registers and its problems; `hooks` what a plugin can do.
+    `plugins` shows each plugin with its version, what it registers and its problems.
 
-    Examples: qrlsuite list models; qrlsuite list plugins; qrlsuite list hooks
+    Examples: qrlsuite list models; qrlsuite list plugins
     """
     known = registry.load()
-    accepted = {name.replace("_", "-"): name for name in registry.KINDS} | {
-        name: name for name in registry.KINDS
-    }
     if kind == "plugins":
         _list_plugins(known, json_output)
         return
-    if kind == "hooks":
-        rows = [{"kind": "hooks", "distribution": "qrlsuite", **row} for row in hooks()]
-    else:
-        if kind is not None and kind not in accepted:
-            raise UnknownNameError(f"unknown kind '{kind}'{nearest(kind, [*accepted, 'hooks', 'plugins'])}")
-        rows = [
-            {"kind": k, "name": r.spec.name, "summary": r.spec.summary, "distribution": r.distribution}
-            for k, r in known
-            if kind is None or k == accepted[kind]
-        ]
-        rows += _published_studies() if kind in (None, "studies") else []
+    only = None if kind is None else specs.kind(kind)
+    rows = [
+        {"kind": each.spec.kinds, "name": each.spec.name, "summary": each.spec.summary}
+        | {"distribution": each.distribution}
+        for each in known
+        if only in (None, type(each.spec))
+    ]
+    rows += _published_studies() if only in (None, specs.StudySpec) else []
     if json_output:
         typer.echo(json.dumps(rows))
         return

@@ -138,7 +138,7 @@ def run(
 
 def _quick_settings(model: str, chosen: list[Any]) -> list[Any]:
     """Reduce the qubits of a circuit, unless they were set by hand."""
-    names = options.field_names(specs.resolve(registry.model(model).options))
+    names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, model).options))
     if "qubits" in names and not any(word.name == "qubits" for word in chosen):
         return [options.Setting("model", "qubits", QUICK_QUBITS), *chosen]
     return chosen

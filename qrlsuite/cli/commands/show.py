@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from qrlsuite import circuit, registry
+from qrlsuite import circuit, registry, specs
 from qrlsuite.circuit import drawing, export
 from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
@@ -17,7 +17,7 @@ from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import printable_lines, table_console
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import identity
-from qrlsuite.experiment.catalog import describe, hooks
+from qrlsuite.experiment.catalog import describe
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.leaderboard.shelf import collect, published_studies
 from qrlsuite.leaderboard.shelf import published as published_entries
@@ -78,18 +78,15 @@ def show(
     qrlsuite show ansatz iqp --format qasm3; qrlsuite show fig7 --published;
     qrlsuite show "cartpole/reinforce mlp" --published
     """
-    manual = _hook(name, second)
-    if manual is not None:
-        typer.echo(json.dumps(manual) if json_output else f"{manual['signature']}\n\n{manual['manual']}")
-        return
-    kind, target = _kind(name, second)
-    if kind in (None, "studies") and (target.endswith(".toml") or published_studies.folder_of(target)):
-        kind = "studies"
+    kind, target = (None, name) if second is None else (specs.kind(name), second)
+    if kind in (None, specs.StudySpec) and (target.endswith(".toml") or published_studies.folder_of(target)):
+        kind = specs.StudySpec
     known = registry.load()
-    kinds = [k for k in registry.KINDS if (kind in (None, k)) and target in known.entries[k]]
-    if target.startswith("gym:") and kind in (None, "tasks"):
-        kinds = ["tasks"]
-    if kind == "studies" or kinds == ["studies"]:
+    among = list(specs.KINDS.values()) if kind is None else [kind]
+    kinds = [k for k in among if target in known.of(k)]
+    if target.startswith("gym:") and specs.TaskSpec in among:
+        kinds = [specs.TaskSpec]
+    if kind is specs.StudySpec or kinds == [specs.StudySpec]:
         _show_study(target, runs, published, json_output)
         return
     if not kinds and kind is None:
@@ -99,12 +96,12 @@ def show(
             typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
             return
     if not kinds:
-        names = [n for k in registry.KINDS if kind in (None, k) for n in known.entries[k]]
+        names = [n for k in among for n in known.of(k)]
         names += published_studies.names()
         more = "; --published looks among the published entries, too" if kind is None else ""
         raise UnknownNameError(f"nothing called '{target}'{nearest(target, names)}{more}")
     if len(kinds) > 1:
-        singulars = " or ".join(f"`show {registry.SINGULAR[k]} {target}`" for k in kinds)
+        singulars = " or ".join(f"`show {k.kind} {target}`" for k in kinds)
         raise UnknownNameError(f"'{target}' is several things; write {singulars}")
     if code:
         size = (4 if qubits is None else qubits, 2 if layers is None else layers)
@@ -112,15 +109,17 @@ def show(
         typer.echo(json.dumps(content) if json_output else printable_lines(_text(content)))
         return
     content = describe(kinds[0], target)
-    if kinds[0] == "rules":
+    if kinds[0] is specs.RuleSpec:
         content["promises"] = rules.load(target).promise
-    if kinds[0] != "ansatzes" and (settings or figure or format or qubits is not None or layers is not None):
+    if kinds[0] is not specs.AnsatzSpec and (
+        settings or figure or format or qubits is not None or layers is not None
+    ):
         raise OptionError(
-            f"{registry.SINGULAR[kinds[0]]} '{target}': --qubits, --layers, --set, --figure and --format draw an "
+            f"{specs.title(kinds[0], target)}: --qubits, --layers, --set, --figure and --format draw an "
             "ansatz; options "
             "are changed where they are used, as in `qrlsuite run --set NAME=VALUE`"
         )
-    if kinds[0] == "ansatzes":
+    if kinds[0] is specs.AnsatzSpec:
         size = (4 if qubits is None else qubits, 2 if layers is None else layers)
         if format is not None:
             text = export.export(_circuit(target, *size, settings or []), format)
@@ -141,31 +140,6 @@ def _show_study(name: str, runs: Path, published: bool, json_output: bool) -> No
         print_outcome(found)
     else:
         table_console().print(found, soft_wrap=True)
-
-
-def _hook(first: str, second: str | None) -> dict[str, str] | None:
-    """Return a hook and its manual: `show hook register_models`, or `show register_models`."""
-    by_name = {row["name"]: row for row in hooks()}
-    if second is None:
-        return by_name.get(first)
-    if first not in ("hook", "hooks"):
-        return None
-    if second not in by_name:
-        raise UnknownNameError(f"unknown hook '{second}'{nearest(second, by_name)}")
-    return by_name[second]
-
-
-def _kind(first: str, second: str | None) -> tuple[str | None, str]:
-    """Split `show [KIND] NAME` into the kind in the plural, or None, and the name."""
-    if second is None:
-        return None, first
-    singulars = {word: kind for kind, word in registry.SINGULAR.items()} | {
-        kind: kind for kind in registry.KINDS
-    }
-    singulars |= {word.replace("_", "-"): kind for word, kind in singulars.items()}
-    if first not in singulars:
-        raise UnknownNameError(f"unknown kind '{first}'{nearest(first, singulars)}")
-    return singulars[first], second
 
 
 def _entry_folder(runs: Path, name: str, published: bool) -> Path | None:
@@ -232,7 +206,9 @@ def _codes_of_seeds(store: EntryStore) -> dict[str, list[str]]:
     }
 
 
-def _code_of_plugin(kind: str, name: str, qubits: int, layers: int, settings: list[str]) -> dict[str, Any]:
+def _code_of_plugin(
+    kind: type[specs.Spec], name: str, qubits: int, layers: int, settings: list[str]
+) -> dict[str, Any]:
     """Return what a registered thing adds to the identity of an entry: its circuit, files or `numerics`.
 
     Raises
@@ -240,11 +216,9 @@ def _code_of_plugin(kind: str, name: str, qubits: int, layers: int, settings: li
     OptionError
         If it computes nothing of an entry.
     """
-    if kind not in identity.ROLES:
-        raise OptionError(
-            f"{registry.SINGULAR[kind]} '{name}' computes nothing of an entry, and has no code identity"
-        )
-    drawn = _circuit(name, qubits, layers, settings) if kind == "ansatzes" else None
+    if not issubclass(kind, specs.NumericSpec):
+        raise OptionError(f"{specs.title(kind, name)} computes nothing of an entry, and has no code identity")
+    drawn = _circuit(name, qubits, layers, settings) if kind is specs.AnsatzSpec else None
     text = {} if drawn is None else {"circuit text": canonical(drawn)}
     return {**text, **identity.of_registered(kind, name, drawn)}
 

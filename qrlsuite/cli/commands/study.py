@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from qrlsuite import api, options, registry
+from qrlsuite import api, options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -421,7 +421,7 @@ def _chosen(
     if name != ALL:
         return [_members(name, settings, models, only)]
     changes, chosen, refusals = _changes(settings, models), [], []
-    for study in map(studies.find, registry.load().names("studies")):
+    for study in map(studies.find, registry.load().names(specs.StudySpec)):
         try:
             chosen.append((study, runner.select(study, *changes, only or [])))
         except OptionError as error:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import registry
+from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import Task, digest
 from qrlsuite.results.claims import SeedsClaimedError, acquire
@@ -75,7 +75,7 @@ def import_files(
     UnknownNameError
         If there is no such algorithm.
     """
-    registry.algorithm(algorithm)
+    registry.get(specs.AlgorithmSpec, algorithm)
     contents = []
     for path in files:
         each(path)
