@@ -5,7 +5,7 @@
 On entries of one task, published or in ./runs, or without any on the two networks whose curves the tests keep (30 runs
 each of an MLP of width 64 and one of width 16): random halves of their real runs, pairs and boards of simulated equals,
 and simulated entries that are slower. Without entries also: what few runs do to S_hat, and what intervals of unequal
-numbers of runs would do. The tables of docs/statistics.md about `width64` and `width16` are its output.
+numbers of runs would do. The tables of docs/error-rates.md about `width64` and `width16` are its output.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 Fresh runs are drawn from smoothed models (`SmoothedRuns`) of the published entries of task beam6g, on the 49 cells of
 its surface grid. `--pairs` is the number of simulated pairs or plans per line (parts equals, unequal, decisions,
 equality); a tenth of it for power, seeds and plans of five entries, 1/25 for coverage, a hundredth for boards. Many
-tables of docs/statistics.md are its output. `benchmarks/calibration.py` measures entries of
+tables of docs/error-rates.md are its output. `benchmarks/calibration.py` measures entries of
 your own.
 """
 

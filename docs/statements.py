@@ -399,8 +399,8 @@ ANTENNAS: dict[str, Callable[[], tuple[str, str, str]]] = {
 
 
 def bias() -> tuple[str, str]:
-    """How far few runs are from many, by the table of docs/statistics.md."""
-    table = (DOCS / "statistics.md").read_text()
+    """How far few runs are from many, by the table of docs/error-rates.md."""
+    table = (DOCS / "error-rates.md").read_text()
     found = {
         (network, int(runs)): np.array([float(cell) for cell in cells.split(" | ")])
         for network, runs, cells in re.findall(r"^\| (width\d+) \| (\d+) \| (.*) \|$", table, re.M)

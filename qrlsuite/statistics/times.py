@@ -90,7 +90,7 @@ def mean_time(entry: LearningCurves, grid: Grid, level: float = 0.95) -> MeanTim
     grid:
         Its E thresholds count; its deltas do not.
     level:
-        Of the interval: about how often it covers the mean of infinitely many runs. See docs/statistics.md for
+        Of the interval: about how often it covers the mean of infinitely many runs. See docs/error-rates.md for
         how often it does.
 
     Raises

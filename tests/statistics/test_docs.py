@@ -1,4 +1,4 @@
-"""docs/statistics.md is held to the code."""
+"""docs/statistics.md and docs/error-rates.md are held to the code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from qrlsuite.statistics import (
     nominal_levels,
 )
 
-PAGE = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = "\n".join((DOCS / f"{name}.md").read_text() for name in ("statistics", "error-rates"))
 
 
 def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
