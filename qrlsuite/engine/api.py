@@ -32,28 +32,8 @@ from qrlsuite.results.survey import submitted, write_submitted
 from qrlsuite.training.remote_task import MOST_BYTES, differing
 
 __all__ = [
-    "MOST_BYTES",
-    "ONE_THREAD",
-    "Answer",
-    "ChoosingLink",
-    "Claim",
-    "Engine",
-    "EngineOutcome",
-    "EntryStore",
-    "Link",
-    "LocalEngine",
-    "RemoteEngine",
-    "SeedGroup",
-    "Show",
-    "Snapshot",
-    "Work",
-    "WorkerJob",
-    "certain",
-    "differing",
-    "raise_failures",
-    "submitted",
-    "train_remotely",
-    "usable_cores",
-    "worker_command",
+    "MOST_BYTES", "ONE_THREAD", "Answer", "ChoosingLink", "Claim", "Engine", "EngineOutcome", "EntryStore",
+    "Link", "LocalEngine", "RemoteEngine", "SeedGroup", "Show", "Snapshot", "Work", "WorkerJob", "certain",
+    "differing", "raise_failures", "submitted", "train_remotely", "usable_cores", "worker_command",
     "write_submitted",
-]
+]  # fmt: skip
