@@ -15,7 +15,7 @@ from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
 from qrlsuite.testing.fresh import built_in_order
-from qrlsuite.training import hidden
+from qrlsuite.training import unregistered
 from qrlsuite.training.fences import Fence, seeded
 
 OBS, OUT, B, S = 4, 3, 6, 5
@@ -76,9 +76,9 @@ def check(subject: Subject) -> list[Finding]:
             "parameters registered", "what wants a gradient is known to torch", lambda: _registered(subjects)
         )
         rules.run(
-            "nothing hidden",
+            "nothing unregistered",
             "what differs between seeds, or is changed by a pass, is registered",
-            lambda: _hidden(subjects),
+            lambda: _unregistered(subjects),
         )
         rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(subjects))
         rules.run("same seed", "the generator alone decides the parameters", lambda: _same(subjects))
@@ -182,9 +182,9 @@ def _registered(subjects: Subjects) -> None:
     require(bool(trainable), "there is no trainable parameter: write self.name = nn.Parameter(...)")
 
 
-def _hidden(subjects: Subjects) -> None:
+def _unregistered(subjects: Subjects) -> None:
     try:
-        hidden.require_none(subjects.agent, OBS, subjects.spec.name, subjects.spec.population is None)
+        unregistered.require_none(subjects.agent, OBS, subjects.spec.name, subjects.spec.population is None)
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
 

@@ -31,7 +31,7 @@ from qrlsuite.gymlanes import GymLanes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.progress import Progress
 from qrlsuite.seeding import Streams, pack, stream_key, unpack
-from qrlsuite.training import hidden
+from qrlsuite.training import unregistered
 from qrlsuite.training.device import find as find_device
 from qrlsuite.training.fences import Fence, seeded
 from qrlsuite.training.metering import MeteredEnv
@@ -175,8 +175,8 @@ class ModelBuilder:
     `entry` is that of all agents, or one for each.
 
     With `statistics`, all of them standardize their observations by these. A model that hides state from torch is
-    refused (PluginError), see `qrlsuite.training.hidden`. While an agent is built, the global generators have states
-    of its own stream, so that layers of torch may be built as they are. `fence` watches the passes.
+    refused (PluginError), see `qrlsuite.training.unregistered`. While an agent is built, the global generators have
+    states of its own stream, so that layers of torch may be built as they are. `fence` watches the passes.
     """
 
     def __init__(
@@ -215,7 +215,7 @@ class ModelBuilder:
             stacked = spec.population is None
             if stacked:  # a stack keeps one agent's plain attributes for all
                 both = options[0], next((own for own in options if own != options[0]), options[0])
-            hidden.require_none(
+            unregistered.require_none(
                 lambda which: agent(two[which], both[which]), self.observation_size, spec.name, stacked
             )
             agents = [agent(streams, own) for streams, own in zip(self.streams, options)]

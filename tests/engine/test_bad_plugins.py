@@ -51,7 +51,7 @@ MODELS: dict[str, tuple[str | None, set[str]]] = {
     "urandom_in_forward": (PROBE, {"pure"}),
     "batch_norm": (HIDDEN, {"shapes"}),
     "batch_mean": (None, {"rows apart"}),
-    "recurrent_buffer": (HIDDEN, {"nothing hidden"}),
+    "recurrent_buffer": (HIDDEN, {"nothing unregistered"}),
     "cache_by_shape": (PROBE, {"no cache"}),
     "plain_integer": (PROBE, {"population"}),
 }

@@ -22,7 +22,7 @@ RULES = {
     ],
     "circuit_backends": ["builds", "shapes", "values", "gradients", "repeatable", "seed independence"],
     "models": [
-        "builds", "shapes", "parameters registered", "nothing hidden", "quantum parameters", "same seed",
+        "builds", "shapes", "parameters registered", "nothing unregistered", "quantum parameters", "same seed",
         "different seed", "global randomness", "pure", "rows apart", "no cache", "gradients",
         "finite differences", "copies", "population", "seed independence", "options per agent", "state",
     ],

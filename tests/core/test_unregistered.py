@@ -24,7 +24,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import ModelSpec
 from qrlsuite.testing import model as rules
 from qrlsuite.testing.common import Subject
-from qrlsuite.training import hidden
+from qrlsuite.training import unregistered
 from tests.conftest import results
 
 
@@ -178,17 +178,17 @@ def of(cls: type[Base]) -> Callable[[int], nn.Module]:
 
 
 @pytest.mark.parametrize("cls", REFUSED)
-def test_hidden_state_is_refused(cls: type[Base]) -> None:
+def test_unregistered_state_is_refused(cls: type[Base]) -> None:
     with pytest.raises(PluginError, match=f"^model 'acme': {REFUSED[cls]}"):
-        hidden.require_none(of(cls), 3, "acme")
+        unregistered.require_none(of(cls), 3, "acme")
 
 
 def test_constants_and_shared_objects_are_legal() -> None:
-    hidden.require_none(of(Legal), 3, "acme")
+    unregistered.require_none(of(Legal), 3, "acme")
 
 
 def test_a_population_of_its_own_may_count_passes_in_a_buffer() -> None:
-    hidden.require_none(of(Recurrent), 3, "acme", stacked=False)
+    unregistered.require_none(of(Recurrent), 3, "acme", stacked=False)
 
 
 def test_global_randomness_is_not_disturbed() -> None:
@@ -197,7 +197,7 @@ def test_global_randomness_is_not_disturbed() -> None:
             return super().forward(x + torch.rand(3))
 
     before = torch.get_rng_state()
-    hidden.require_none(of(Noisy), 3, "acme")
+    unregistered.require_none(of(Noisy), 3, "acme")
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -206,13 +206,17 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Base]], ModelSpec
     """Register a model named `acme`."""
 
     def register(cls: type[Base]) -> ModelSpec:
-        module = types.ModuleType("acme_hidden")
+        module = types.ModuleType("acme_unregistered")
         vars(module).update(
             Options=Options, build=lambda obs, out, options, generator: cls(obs, out, generator)
         )
-        monkeypatch.setitem(sys.modules, "acme_hidden", module)
+        monkeypatch.setitem(sys.modules, "acme_unregistered", module)
         spec = ModelSpec(
-            "acme", "hides", family="classical", options="acme_hidden:Options", build="acme_hidden:build"
+            "acme",
+            "hides",
+            family="classical",
+            options="acme_unregistered:Options",
+            build="acme_unregistered:build",
         )
         monkeypatch.setitem(registry.load().entries[specs.ModelSpec], "acme", Registered(spec, "qrlsuite"))
         return spec
@@ -255,7 +259,7 @@ def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: 
 @pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
 def test_check_names_attribute_and_cure(cls: type[Base], install: Callable[[type[Base]], ModelSpec]) -> None:
     findings = rules.check(Subject(install(cls), None, (), {}))
-    (broken,) = [finding for finding in findings if finding.rule == "nothing hidden"]
+    (broken,) = [finding for finding in findings if finding.rule == "nothing unregistered"]
     assert not broken.ok
     assert re.search(REFUSED[cls], broken.message), broken.message
 
