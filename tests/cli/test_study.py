@@ -291,6 +291,9 @@ def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp
         "ddqn vqc-native qubits=2 layers=1",
     ]
     assert results(folder, 3) == before
+    words = ["export", widths, "--runs", runs, "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(build(), words, catch_exceptions=False)
+    assert done.stdout.count("wrote ") == 3
 
 
 def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:

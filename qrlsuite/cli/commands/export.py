@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
+from qrlsuite import registry
 from qrlsuite.cli.arguments import AcrossOption, JsonOption, RunsOption, TaskOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
@@ -20,7 +22,9 @@ from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.results import lookup
 from qrlsuite.results.store import write_atomically
 from qrlsuite.results.text import counted
+from qrlsuite.specs import StudySpec
 from qrlsuite.studies.looks import StudyWithLooks
+from qrlsuite.studies.study import Study
 
 
 def export(
@@ -28,7 +32,7 @@ def export(
         list[str] | None,
         typer.Argument(
             metavar="[ENTRY]...",
-            help="Its name or label, or the beginning of one, after [TASK/]; or a study with looks: STUDY.toml.",
+            help="Its name or label, or the beginning of one, after [TASK/]; or a study, by its name or file.",
         ),
     ] = None,
     task: TaskOption = None,
@@ -38,7 +42,7 @@ def export(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Write to DIR/TASK/ENTRY/, a study to DIR/NAME/; default: leaderboard/entries, leaderboard/plans.",
+            help="Write to DIR/TASK/ENTRY/, a study with looks to DIR/NAME/; default: below leaderboard/.",
         ),
     ] = None,
     rliable: Annotated[
@@ -59,8 +63,8 @@ def export(
     """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
 
     Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some seeds again. A study
-    with looks is written with the curves of its seeds, so that others can compute its verdicts (`qrlsuite show
-    DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
+    is written as its entries; one with looks with the curves of its seeds, so that others can compute its verdicts
+    (`qrlsuite show DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
 
     With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
     thresholds (in [0, 1], more is better), of every entry that was trained on all tasks of --across with the same
@@ -74,19 +78,22 @@ def export(
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
     names = list(dict.fromkeys(entries or []))
-    if with_looks := [name for name in names if name.endswith(".toml") or published_studies.folder_of(name)]:
-        if len(names) > len(with_looks):
-            raise OptionError(
-                "export entries and studies by commands of their own: they go to different folders"
-            )
-        _studies(with_looks, out or Path("leaderboard/plans"), runs, json_output)
+    named = {name: studies.find(name) for name in names if _is_study(name)}
+    with_looks = [study for study in named.values() if study.file.looks is not None]
+    if len({*map(_is_study, names)}) > 1 or 0 < len(with_looks) < len(named):
+        raise OptionError(
+            "export entries, studies and studies with looks by commands of their own: they go to different folders"
+        )
+    if with_looks:
+        _with_looks(with_looks, out or Path("leaderboard/plans"), runs, json_output)
         return
-    out = out or Path("leaderboard/entries")
+    out = out or Path("leaderboard/unranked" if named else "leaderboard/entries")
     lookup.check_tasks(runs, task)
     tasks = [task] if task else []
-    if everything:
-        selected, refused = collect.collect(runs, tasks)
-        for line in refused:
+    if everything or named:
+        chosen = [studies.select(name, runs, tasks) for name in named] or [collect.collect(runs, tasks)]
+        selected = list({entry.folder: entry for entries, _ in chosen for entry in entries}.values())
+        for line in (line for _, refused in chosen for line in refused):
             typer.echo(f"left out: {line}", err=True)
     else:
         selected = [collect.find(runs, name, tasks=tasks) for name in names]
@@ -95,7 +102,7 @@ def export(
         try:
             folder = write(entry, out, force)
         except QrlSuiteError as error:
-            if not everything:
+            if not (everything or named):
                 raise
             typer.echo(f"left out: {error}", err=True)
             continue
@@ -122,9 +129,14 @@ def export(
         typer.echo(f"next: {command('verify', str(out), '--rerun', '2')}")
 
 
-def _studies(names: list[str], out: Path, runs: Path, json_output: bool) -> None:
+def _is_study(name: str) -> bool:
+    registered = registry.load().names(StudySpec)
+    return name.endswith(".toml") or name in registered or published_studies.folder_of(name) is not None
+
+
+def _with_looks(chosen: Sequence[Study], out: Path, runs: Path, json_output: bool) -> None:
     """Write studies with looks."""
-    folders = [published_studies.export(StudyWithLooks(studies.find(name), runs), out) for name in names]
+    folders = [published_studies.export(StudyWithLooks(study, runs), out) for study in chosen]
     if json_output:
         typer.echo(json.dumps([{"folder": str(folder)} for folder in folders]))
         return
