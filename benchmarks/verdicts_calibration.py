@@ -38,7 +38,7 @@ from qrlsuite.statistics import (
     times_below,
     times_board,
 )
-from qrlsuite.statistics.calibration import draw_times, judge, judge_times, play, simulated_pairs
+from qrlsuite.statistics.simulation import draw_times, judge, judge_times, play, simulated_pairs
 
 EPSILONS, DELTAS = [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 GRID = Grid.relative(EPSILONS, DELTAS)

@@ -8,7 +8,7 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 - `times`: one number per run behind the surface. `permutation`: tests that relabel whole runs.
 - `board` and `ranking`: all pairs, and tiers. `times_board`: all pairs by their mean times; `pair`: one of them.
 - `sequential`: as many runs as it takes to decide, at one error for all looks.
-- `calibration`: how often all this errs. `planning`: how many runs it takes.
+- `simulation`: how often all this errs. `planning`: how many runs it takes.
 - `across`: several tasks at once. `final`: entries by their scores at the end, or over all of training.
 """
 
@@ -24,18 +24,6 @@ from qrlsuite.statistics.board import Board, outperformance
 from qrlsuite.statistics.bootstrap import (
     bootstrap_draws,
     bootstrap_interval,
-)
-from qrlsuite.statistics.calibration import (
-    DecisionRates,
-    Rates,
-    SmoothedRuns,
-    TimesRates,
-    board_false_winners,
-    decision_rates,
-    false_winners,
-    power,
-    slower,
-    split_halves,
 )
 from qrlsuite.statistics.compare import MIN_RUNS, Comparison, Outcome, Verdict, compare
 from qrlsuite.statistics.curves import LearningCurves, common_horizon
@@ -64,6 +52,18 @@ from qrlsuite.statistics.significance import (
     IntervalRule,
     Resampling,
     SignificanceRule,
+)
+from qrlsuite.statistics.simulation import (
+    DecisionRates,
+    Rates,
+    SmoothedRuns,
+    TimesRates,
+    board_false_winners,
+    decision_rates,
+    false_winners,
+    power,
+    slower,
+    split_halves,
 )
 from qrlsuite.statistics.times import MeanTime, mean_time, times_below
 from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board

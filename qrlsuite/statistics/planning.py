@@ -14,10 +14,10 @@ from statistics import NormalDist
 import numpy as np
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.calibration import SmoothedRuns, draw_times, judge_times, play, slower
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Grid, IntArray, whole
 from qrlsuite.statistics.sequential import Decided, Decision, DecisionPlan, PairDecision, Spending
+from qrlsuite.statistics.simulation import SmoothedRuns, draw_times, judge_times, play, slower
 from qrlsuite.statistics.times import check_probability
 
 LADDER = (20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400)

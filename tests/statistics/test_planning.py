@@ -24,8 +24,8 @@ from qrlsuite.statistics import (
     slower,
     times_below,
 )
-from qrlsuite.statistics.calibration import judge, judge_times, simulated_pairs
 from qrlsuite.statistics.sequential import Decision, PairDecision
+from qrlsuite.statistics.simulation import judge, judge_times, simulated_pairs
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))

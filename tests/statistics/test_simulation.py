@@ -20,7 +20,7 @@ from qrlsuite.statistics import (
     power,
     split_halves,
 )
-from qrlsuite.statistics.calibration import judge, simulated_pairs
+from qrlsuite.statistics.simulation import judge, simulated_pairs
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE, entry
 
 FAST = Resampling(300)
