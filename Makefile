@@ -45,7 +45,7 @@ RERUN ?= 2
 verify: export BASE := $(BASE)
 verify: export RERUN := $(RERUN)
 verify: install
-	$(BIN)/qrlsuite leaderboard verify --base "$$BASE" --rerun "$$RERUN"
+	$(BIN)/qrlsuite verify --base "$$BASE" --rerun "$$RERUN"
 
 # Pages from docs/ and the docstrings into site/; warnings are errors, and nothing is fetched.
 docs: install-dev

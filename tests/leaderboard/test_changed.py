@@ -159,13 +159,13 @@ def test_the_command_checks_entries_and_plans_that_differ(repository: Path) -> N
     assert (done.returncode, done.stdout) == (0, "no entry differs from HEAD\n")
     shutil.copytree(published_studies.PUBLISHED / PLAN, repository / "leaderboard" / "plans" / PLAN)
     done = qrlsuite("verify", "--base", "HEAD", cwd=repository)
-    assert f"ok     {PLAN}: plan sound" in done.stdout
+    assert f"ok     {PLAN}: study sound" in done.stdout
     assert "10 of 10 entries ok" in done.stdout
     (repository / "leaderboard" / "plans" / PLAN / "plan.toml").write_text("format_version = 2\n")
     done = qrlsuite("verify", "--base", "HEAD", "--json", cwd=repository)
     assert done.returncode == 1
-    (plan,) = json.loads(done.stdout)["plans"]
-    assert not plan["ok"]
+    (study,) = json.loads(done.stdout)["studies"]
+    assert not study["ok"]
     done = qrlsuite("verify", PLACE, "--base", "HEAD", cwd=repository)
     assert "give PATH or --base, not both" in done.stderr
 
