@@ -298,11 +298,11 @@ def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     assert "q_2: ┤ H ├┤ U3 ├" in found["drawing"]
     assert "two_qubit_depth: 3" in qrlsuite(*ansatz).stdout
     assert (tmp_path / "cx.svg").read_text().startswith("<?xml")
-    hooks = qrlsuite("list", "hooks").stdout
-    assert "register_environments" in hooks
-    manual = qrlsuite("show", "hook", "register_models").stdout
-    assert "register_models" in manual
-    assert qrlsuite("show", "register_models").stdout == manual
+    for words in (("list", "hooks"), ("show", "hook", "register_models"), ("list", "significance-tests")):
+        refused = qrlsuite(*words)
+        assert refused.returncode == 2
+        answer = "`rules`" if words[1] == "significance-tests" else "documentation: docs/api/hooks.md"
+        assert refused.stderr == f"qrlsuite: '{words[1]}' is now {answer}\n"
 
 
 def test_show_says_how_a_published_entry_was_made() -> None:
