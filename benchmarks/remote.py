@@ -139,8 +139,15 @@ def queue(given: argparse.Namespace) -> dict[str, Any]:
             folder,
         ]
         workers = [subprocess.Popen(worker, env=ENVIRONMENT, stderr=subprocess.DEVNULL) for _ in range(2)]
-        more = ["--seeds", str(given.groups), "--workers", str(given.groups), "--minutes", str(given.minutes)]
-        more += ["--engine", "dask", "--engine-set", f"scheduler={address}"]
+        more = [
+            "--seeds",
+            str(given.groups),
+            "--workers",
+            str(given.groups),
+            "--budget",
+            f"{given.minutes}min",
+        ]
+        more += ["--engine", f"dask scheduler={address}"]
         words = command(Path(folder) / "runs", given.model, given.set, *more)
         client = subprocess.Popen(
             words, env={**ENVIRONMENT, "QRLSUITE_CHECKPOINT_SECONDS": str(given.seconds)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.notation import parse_named
 from qrlsuite.results import lookup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import evaluation
@@ -174,7 +175,6 @@ def evaluate(
     progress: bool = True,
     entanglement: bool = False,
     backend: str | None = None,
-    backend_options: Mapping[str, Any] | None = None,
     yes: bool = False,
 ) -> Evaluation:
     """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
@@ -193,9 +193,9 @@ def evaluate(
         Whether to show a bar.
     entanglement:
         Measure the entanglement of every entry's circuit, too.
-    backend, backend_options:
-        Play every entry with its circuits on this backend, too, see `qrlsuite.training.deployment`. What this costs is
-        said first; finished episodes are kept.
+    backend:
+        Play every entry with its circuits on this backend, too: `qiskit shots=1000`, see
+        `qrlsuite.training.deployment`. What this costs is said first; finished episodes are kept.
     yes:
         Execute circuits on a device that is no simulator.
 
@@ -215,11 +215,8 @@ def evaluate(
     folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in names)
     stores = [EntryStore(folder) for folder in folders]
     _one_task(stores)
-    deployed = (
-        [Deployment(s, backend, backend_options or {}, best, device) for s in stores] if backend else []
-    )
-    if backend_options and backend is None:
-        raise OptionError("--backend-set needs --backend, the circuit backend that has these options")
+    there = parse_named(backend, "--backend ") if backend else None
+    deployed = [Deployment(store, *there, best, device) for store in stores] if there else []
     console = Console(stderr=True, quiet=not progress, highlight=False)
     for each, store in zip(deployed, stores):
         cost = each.cost(episodes, seed, steps_per_episode(store, best, episodes, seed, device))

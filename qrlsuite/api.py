@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from matplotlib.figure import Figure
 from rich.console import Console, ConsoleOptions, RenderResult
 
+from qrlsuite.engine import budget as budgets
 from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import Shown, show_figures_in_notebook
@@ -56,9 +57,8 @@ from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
-from qrlsuite.tuning import space
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.search import Request, Search, default_sampler, tuning_seeds
+from qrlsuite.tuning.search import Search, preset_path, read_requests, tuning_seeds
 
 if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
@@ -380,7 +380,7 @@ def train(
     engine: str | Where = "local",
     workers: int | None = None,
     device: str = "cpu",
-    minutes: float | None = None,
+    budget: str | None = None,
     track: str | Sequence[str] = (),
     fresh: bool = False,
     same: str | None = None,
@@ -413,8 +413,8 @@ def train(
         Processes, or tasks in a queue; None takes one per core, or what the engine takes.
     device:
         `cpu`, `cuda` or `cuda:1`.
-    minutes:
-        Stop after this time, with every finished epoch saved.
+    budget:
+        `"30min"`, `"8h"` or `"2core-hours"`: stop then, with every finished epoch saved.
     track:
         Trackers that watch, `NAME` or `NAME=TARGET`.
     fresh:
@@ -430,7 +430,7 @@ def train(
     -------
     EntryResults
         The entry with its learning curves (N, T), of all its seeds that are there; None where no epoch has finished
-        yet, for it was handed to a queue, or `minutes` were too few.
+        yet, for it was handed to a queue, or the `budget` was too small.
 
     Raises
     ------
@@ -454,11 +454,11 @@ def train(
     seed_numbers = None if seeds is None else read_seeds(seeds)
     _check_positive("epochs", epochs)
     where = _where(engine, workers, device, fresh, same)
-    missing.check_minutes(minutes, where)
+    missing.check_budget(budget, where)
     missing.require_same_code(Path(runs), [entry], where)
     work = missing.find(Path(runs), entry, where, seed_numbers, epochs)
     with trackers.asking(watching):
-        missing.train(work, where, RunDisplay(work, where.workers, not progress, "call"), minutes)
+        missing.train(work, where, RunDisplay(work, where.workers, not progress, "call"), budget)
     return collect.read(work.store)
 
 
@@ -471,7 +471,6 @@ def evaluate(
     seed: int = 0,
     device: str = "cpu",
     backend: str | None = None,
-    backend_options: Mapping[str, Any] | None = None,
     yes: bool = False,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
@@ -496,10 +495,8 @@ def evaluate(
     device:
         `cpu`, `cuda` or `cuda:1`.
     backend:
-        Let the same agents act on this circuit backend, too: `native`, `pennylane`, `qiskit`, or a plugin's. Finished
-        episodes are kept in the entry's folder.
-    backend_options:
-        Options of that backend, such as `{"shots": 1000}`.
+        Let the same agents act on this circuit backend, too: `native`, `pennylane`, `qiskit`, or a plugin's, with
+        options if need be: `"qiskit shots=1000"`. Finished episodes are kept in the entry's folder.
     yes:
         Execute circuits on a device that is no simulator.
     runs:
@@ -543,27 +540,20 @@ def evaluate(
         device=device,
         progress=progress,
         backend=backend,
-        backend_options=backend_options,
         yes=yes,
     )
 
 
 def tune(
     task: str,
-    model: str | Sequence[str],
+    entries: str | Sequence[str],
     *,
-    algorithm: str | None = None,
-    options: Mapping[str, Any] | None = None,
-    vary: Mapping[str, Any] | None = None,
-    grid: str | None = None,
-    sampler: Literal["halving", "grid", "one-at-a-time", "random", "tpe"] | None = None,
-    trials: int | None = None,
-    core_hours: float | None = None,
-    sampler_seed: int = 0,
+    vary: str | Sequence[str] | Mapping[str, Any] | None = None,
+    sampler: str | None = None,
     seeds: Seeds = 20,
     epochs: int | None = None,
     objective: Literal["time", "cell", "area"] = "time",
-    minutes: float | None = None,
+    budget: str | None = None,
     out: str | PathLike[str] | None = None,
     engine: str | Where = "local",
     workers: int | None = None,
@@ -579,26 +569,17 @@ def tune(
 
     Parameters
     ----------
-    task, algorithm, engine, workers, device, fresh, same, runs:
+    task, engine, workers, device, fresh, same, runs:
         As for `train`. Trials lie below `runs`/tuning.
-    model:
-        A model, with settings if need be (`"mlp width=16"`); or several, which get equal budgets.
-    options:
-        Values that all trials share; they are not varied.
+    entries:
+        What is tuned: `"mlp width=16"`, or several, which get equal budgets. Options that are written are not varied.
     vary:
-        What is varied: lists of values, or ranges: `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`.
-    grid:
-        What is varied by a grid's name (`paper`) or a grid file's path; `vary` replaces options of it. Without it
+        What is varied: lists of values, or ranges, `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`; or
+        words as on the command line: a grid's name (`"paper"`), a grid file's path, `"lr=1e-3,5e-4"`. Without it
         `halving` varies the options that models and algorithms mark as `Tuned`.
     sampler:
-        Successive halving, all combinations, one option at a time, at random, or Optuna's TPE. None takes all
-        combinations of what `vary` or `grid` list, and halving without them.
-    trials:
-        How many settings: for `random` and `tpe` in all, for `halving` per varied option (8 by default).
-    core_hours:
-        For `halving`, instead of `trials`: as many settings as this many core-hours of each model hold.
-    sampler_seed:
-        For `random` and `tpe`: another one proposes other settings.
+        `halving`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`.
+        None takes all combinations of what `vary` lists, and halving without it.
     seeds:
         Runs of each trial, with `halving` of each in the last rung: a number counts from seed 1,000,000.
     epochs:
@@ -606,8 +587,9 @@ def tune(
     objective:
         What is minimized: steps below threshold (`time`), sample complexity at the task's reference `cell`, or its
         mean over the ranking grid (`area`).
-    minutes:
-        Begin no trial that would not end within this time. Every call gets it anew.
+    budget:
+        `"30min"`: begin no trial that would not end within this time; every call gets it anew. `"2core-hours"` with
+        `halving`: as many settings as this much of each model's time holds.
     out:
         The preset file, ending in .toml; None takes one below `runs`.
     progress:
@@ -616,12 +598,12 @@ def tune(
     Returns
     -------
     list of Search
-        One per model, with `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None
+        One per entry, with `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None
         where the search is not over.
 
     Raises
     ------
-    UnknownNameError, OptionError, TaskError
+    UnknownNameError, OptionError, FileError
         For an unknown name, or an option or argument that cannot be used.
     QrlSuiteError
         If a trial failed; finished epochs are kept.
@@ -631,40 +613,18 @@ def tune(
     Examples
     --------
     >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
-    >>> entry = train("beam6g", "mlp", preset=str(small.written))  # doctest: +SKIP
+    >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
     """
-    preset = None if out is None else Path(out)
-    if preset is not None and preset.suffix != ".toml":
-        raise OptionError(f"out = {str(out)!r}: the preset file's name ends in .toml")
     _check_positive("epochs", epochs)
-    _check_positive("trials", trials)
-    where = _where(engine, workers, device, fresh, same)
-    budget = _seconds(minutes)
-    varied = {
-        name: list(values) if isinstance(values, tuple) else values for name, values in (vary or {}).items()
-    }
-    shared = Request(
-        task=task,
-        entry="",
-        algorithm=algorithm,
-        settings=tuple(from_mapping(options)),
-        grid=None if grid is None else space.load(grid),
-        varied=tuple(from_mapping(varied)),
-        sampler=sampler or default_sampler(grid or vary),
-        trials=trials,
-        core_hours=core_hours,
-        sampler_seed=sampler_seed,
-        seeds=tuning_seeds(seeds),
-        epochs=epochs,
-        objective=objective,
+    where, folder = _where(engine, workers, device, fresh, same), Path(runs)
+    requests = read_requests(
+        task, _several(entries), vary or (), sampler, tuning_seeds(seeds), epochs, objective, budget
     )
-    requests = [replace(shared, entry=each) for each in _several(model)]
-    if not requests or (preset is not None and len(requests) > 1):
-        raise OptionError("model: give at least one model, and with `out` only one")
-    searches = tuning_runner.build(requests, Path(runs))
+    path = preset_path(out, requests)
+    searches = tuning_runner.build(requests, folder)
     display = TuneDisplay(searches, where, not progress, "call")
     display.begin()
-    tuning_runner.run(searches, Path(runs), where, display, budget, preset)
+    tuning_runner.run(searches, folder, where, display, path)
     return searches
 
 
@@ -813,7 +773,7 @@ def run_study(
     only: str | Sequence[str] = (),
     seeds: Seeds | None = None,
     epochs: int | None = None,
-    minutes: float | None = None,
+    budget: str | None = None,
     format: Literal["png", "pdf", "svg"] = "png",
     engine: str | Where = "local",
     workers: int | None = None,
@@ -842,8 +802,8 @@ def run_study(
         `models`, `seeds` and `epochs`, only of a study without looks.
     seeds, epochs:
         As for `train`; None takes each task's protocol.
-    minutes:
-        Stop at a group's end when this time is used up. The same call continues.
+    budget:
+        As for `train`, but stop at a group's end. The same call continues.
     format:
         Of the pictures, which are written into the results folder.
     engine, workers, device, fresh, same, runs, progress:
@@ -859,7 +819,7 @@ def run_study(
     Raises
     ------
     UnknownNameError, OptionError, TaskError
-        For an unknown name, an option or argument that cannot be used, or `minutes` that hold not even one seed.
+        For an unknown name, an option or argument that cannot be used, or a `budget` that holds not even one seed.
     QrlSuiteError
         If training failed; finished epochs are kept.
     KeyboardInterrupt
@@ -867,13 +827,13 @@ def run_study(
 
     Examples
     --------
-    >>> run_study("fig6", seeds=20, minutes=30)  # doctest: +SKIP
+    >>> run_study("fig6", seeds=20, budget="30min")  # doctest: +SKIP
     """
     if format not in ("png", "pdf", "svg"):
         raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
     _check_positive("epochs", epochs)
-    budget = _seconds(minutes)
     where = _where(engine, workers, device, fresh, same)
+    limit = budgets.seconds(budget, where.workers)
     seed_numbers = None if seeds is None else read_seeds(seeds)
     study = studies.find(name)
     names = [only] if isinstance(only, str) else only
@@ -900,9 +860,9 @@ def run_study(
     speeds = speed.known(folder)
     missing.require_same_code(folder, [member.entry for member in members], where)
     items = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
-    if budget is not None:
-        study_runner.check_budget(items, budget, where.workers)
-    session = study_runner.Session(folder, where, speeds, budget, not progress, "call")
+    if limit is not None:
+        study_runner.check_budget(items, limit, where.workers)
+    session = study_runner.Session(folder, where, speeds, limit, not progress, "call")
     session.run(items)
     drawn = studies.write(study.name, studies.draw(study, members, folder), folder, format)
     after = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
@@ -925,12 +885,6 @@ def _where(
 def _check_positive(name: str, value: int | None) -> None:
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise OptionError(f"{name} = {value!r}: give a whole number, 1 or more")
-
-
-def _seconds(minutes: float | None) -> float | None:
-    if minutes is not None and not 0 < minutes < float("inf"):
-        raise OptionError(f"minutes = {minutes:g}: give a time, for example 30")
-    return None if minutes is None else 60 * minutes
 
 
 def _selected(

@@ -98,6 +98,30 @@ RENAMED = {
 """Commands of earlier versions, one word or two, and what does their work now."""
 
 
+_ENTRY = "write it into the entry, [ALGORITHM] MODEL NAME=VALUE ... preset=FILE, as in"
+_ENGINE = "--engine 'slurm partition=gpu time=2:00:00'"
+RENAMED_OPTIONS = {
+    "run": {"--algorithm": f"{_ENTRY} `qrlsuite run ppo mlp`", "--preset": f"{_ENTRY} `qrlsuite run mlp preset=FILE`"},
+    "tune": {
+        **dict.fromkeys(("--model", "--set", "--algorithm"), f"{_ENTRY} `qrlsuite tune 'mlp width=16'`"),
+        "--grid": "--vary paper, or --vary FILE.toml",
+        **dict.fromkeys(("--trials", "--sampler-seed"), "--sampler 'random trials=50 seed=1'"),
+        "--core-hours": "--budget 2core-hours",
+    },
+    "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'"},
+    "": {
+        "--minutes": "--budget 30min",
+        **dict.fromkeys(("--partition", "--time", "--engine-set"), _ENGINE),
+    },
+}  # fmt: skip
+"""Options of earlier versions by command (all of them at last), and what to write now."""
+
+
+def renamed_option(command: str, option: str) -> str | None:
+    """Return what to write in the place of an option of an earlier version."""
+    return {**RENAMED_OPTIONS[""], **RENAMED_OPTIONS.get(command, {})}.get(option)
+
+
 @functools.cache
 def load(command: LazyCommand) -> Any:
     """Import a built-in command and return it as Typer builds it."""

@@ -394,14 +394,14 @@ class RunDisplay:
             f"stopped; every finished epoch is saved. The same {self.again} continues from there."
         )
 
-    def out_of_time(self, minutes: float) -> None:
+    def out_of_time(self, budget: str) -> None:
         """Say that training stopped as it was asked to, how far it is, and how to go on."""
         self.close()
         reached = [int(state.get("epoch") or 0) for state in self._last.values()] or [0]
         epochs = f"{min(reached)}" if min(reached) == max(reached) else f"{min(reached)} to {max(reached)}"
-        limit = "--minutes" if self.again == "command" else "`minutes`"
+        limit = "--budget" if self.again == "command" else "`budget`"
         self.console.print(
-            f"stopped after {minutes:g} min, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "
+            f"stopped after {budget}, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "
             f"same {self.again} continues from there, and without {limit} to the end.",
             soft_wrap=True,
         )

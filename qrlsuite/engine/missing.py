@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.engine import remote
+from qrlsuite.engine.budget import Budget, seconds
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
@@ -104,21 +105,21 @@ class _TimeIsUp(Exception):
     """Ends an engine's work as Ctrl-C does."""
 
 
-def check_minutes(minutes: float | None, where: Where) -> None:
-    """Refuse a time limit that cannot be kept.
+def check_budget(budget: str | None, where: Where) -> None:
+    """Refuse a budget that cannot be kept.
 
     Raises
     ------
     OptionError
-        If it is no positive, finite number, or the engine hands its work to a queue.
+        If it cannot be read, or the engine hands its work to a queue.
     """
-    if minutes is None:
+    if budget is None:
         return
-    if not 0 < minutes < float("inf"):
-        raise OptionError(f"--minutes {minutes:g}: give a time, for example --minutes 2 or --minutes 0.5")
+    Budget.parse(budget)
     if where.submits:
         raise OptionError(
-            f"--minutes: engine '{where.name}' leaves its tasks in a queue; give --time instead"
+            f"--budget: engine '{where.name}' leaves its tasks in a queue; limit these: "
+            f"--engine '{where.name} time=2:00:00'"
         )
 
 
@@ -126,14 +127,14 @@ def train(
     work: Missing,
     where: Where,
     display: RunDisplay,
-    minutes: float | None = None,
+    budget: str | None = None,
     confirmed: bool = True,
 ) -> EngineOutcome:
     """Train what is planned, showing progress; returns how it ended.
 
     Parameters
     ----------
-    minutes:
+    budget:
         After which training stops, with every finished epoch saved. None for no limit.
     confirmed:
         Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
@@ -145,16 +146,16 @@ def train(
     QrlSuiteError
         If a group failed; finished epochs are kept.
     """
-    began = time.monotonic()
+    began, limit = time.monotonic(), seconds(budget, where.workers)
 
     def show(snapshot: Snapshot) -> None:
         display.update(snapshot)
-        if display.endless and not confirmed and minutes is None and display.console.is_terminal:
+        if display.endless and not confirmed and limit is None and display.console.is_terminal:
             raise QrlSuiteError("stopped: this takes more than a day; --yes starts it anyway")
-        if minutes is not None and time.monotonic() - began >= 60 * minutes:
+        if limit is not None and time.monotonic() - began >= limit:
             raise _TimeIsUp
 
-    display.deadline = None if minutes is None else began + 60 * minutes
+    display.deadline = None if limit is None else began + limit
     code = identity.of(work.entry)
     codes.require(work.store, code)
     if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
@@ -173,7 +174,7 @@ def train(
     try:
         outcome = where.run([work], show)
     except _TimeIsUp:
-        display.out_of_time(minutes or 0.0)
+        display.out_of_time(budget or "")
         return EngineOutcome()
     except KeyboardInterrupt:
         display.interrupted()

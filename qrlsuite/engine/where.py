@@ -12,6 +12,7 @@ from typing import Any
 from qrlsuite import options, registry, specs
 from qrlsuite.engine.work import Engine, EngineOutcome, Missing, Show, Work
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
+from qrlsuite.notation import parse_named
 from qrlsuite.results.seeds import LARGEST_GROUP, SeedGroup
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import device as devices
@@ -50,17 +51,16 @@ class Where:
         cls,
         engine: str = "local",
         workers: int | None = None,
-        options: Mapping[str, Any] | None = None,
         device: str = "cpu",
     ) -> Where:
-        """Build an engine by name.
+        """Build an engine.
 
         Parameters
         ----------
+        engine:
+            A name with options: `slurm partition=gpu`.
         workers:
             Groups that are trained at a time; None lets the engine choose.
-        options:
-            The engine's options; None stands for an option that was not given.
 
         Raises
         ------
@@ -69,9 +69,10 @@ class Where:
             no such device.
         """
         devices.check(device)  # the machine that trains checks whether it has this device
-        built = build(engine, options or {})
-        spec = registry.get(specs.EngineSpec, engine)
-        return cls(built, built.workers(workers), device, spec.submits, engine, spec.remote or spec.submits)
+        name, values = parse_named(engine, "--engine ")
+        built = build(name, values)
+        spec = registry.get(specs.EngineSpec, name)
+        return cls(built, built.workers(workers), device, spec.submits, name, spec.remote or spec.submits)
 
     def run(self, several: Sequence[Missing], show: Show) -> EngineOutcome:
         """Let the engine train one of the lists of `divide` to the same epoch: several entries in populations."""
@@ -130,7 +131,7 @@ def build(name: str, option_values: Mapping[str, Any]) -> Engine:
     Parameters
     ----------
     option_values:
-        Its options by name; None stands for an option that was not given.
+        Its options by name.
 
     Raises
     ------
@@ -142,15 +143,14 @@ def build(name: str, option_values: Mapping[str, Any]) -> Engine:
         If a package that it needs is not installed; the message has the pip command.
     """
     spec = registry.get(specs.EngineSpec, name)
-    chosen_values = {key: value for key, value in option_values.items() if value is not None}
-    if spec.options is None and chosen_values:
-        raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(chosen_values))}")
+    if spec.options is None and option_values:
+        raise OptionError(f"engine '{name}' has no options, got {', '.join(sorted(option_values))}")
     for module, command in spec.extras.items():
         if importlib.util.find_spec(module) is None:
             raise QrlSuiteError(f"engine '{name}' needs the package '{module}': {command}")
     chosen = None
     if spec.options is not None:
-        chosen = options.build(specs.resolve(spec.options), chosen_values, f"engine '{name}'")
+        chosen = options.build(specs.resolve(spec.options), option_values, f"engine '{name}'")
     built: Engine = specs.resolve(spec.factory)(chosen)
     run = getattr(built, "run", None)
     if run is None or next(iter(inspect.signature(run).parameters), "") == "work":

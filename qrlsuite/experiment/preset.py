@@ -1,4 +1,4 @@
-"""Preset files: settings in TOML that `qrlsuite run --preset FILE.toml` reads, and how they were found.
+"""Preset files: settings in TOML that an entry names (`mlp preset=FILE.toml`), and how they were found.
 
 A preset never decides what an entry is, its values do. But where it was found by tuning, the entry carries the
 record of that, so that a reader of a leaderboard knows how much was spent on the settings.
@@ -142,7 +142,7 @@ def require(preset: PresetFile, source: str, algorithm: str, model: str) -> None
         if expected != actual:
             raise OptionError(
                 f"preset file {source} holds settings for {kind} '{expected}', not for '{actual}': "
-                f"write --{kind} {expected}, or tune {actual}"
+                f"write {expected}, or tune {actual}"
             )
 
 

@@ -78,7 +78,7 @@ _WORDS = {
         "policy gradient with a mean baseline",
         (
             "qrlsuite show algorithm {thing}",
-            "qrlsuite run --task cartpole --model mlp --algorithm {thing} --quick",
+            "qrlsuite run {thing} mlp --task cartpole --quick",
         ),
         {"algorithm.py": "the algorithm: edit this"},
     ),

@@ -134,7 +134,7 @@ class DeploymentSection(_StudyTable):
     backend: Annotated[str, Field(min_length=1)]
     vary: Annotated[str, Field(min_length=1, description="the option that takes each of the values")]
     values: Annotated[list[bool | int | float | str], Field(min_length=1)]
-    options: Annotated[dict[str, Any], Field(description="its other options, as in --backend-set")] = {}
+    options: Annotated[dict[str, Any], Field(description="its other options")] = {}
 
     def chosen(self, value: Any) -> dict[str, Any]:
         """Return the backend's options with one of the values."""

@@ -100,9 +100,9 @@ class Halving(Search):
                 f"--seeds {format_seeds(seeds)}: halving takes seeds one after the other, such as --seeds {len(seeds)}"
             )
         if request.core_hours is not None and request.trials is not None:
-            raise OptionError("--trials and --core-hours: give one of them, or no budget is equal in both")
-        if request.core_hours is not None and not 0 < request.core_hours < math.inf:
-            raise OptionError(f"--core-hours {request.core_hours:g}: give a time, for example 2")
+            raise OptionError(
+                "--budget in core-hours and trials: give one of them, or no budget is equal in both"
+            )
         self.settings: int | None = None
         if request.core_hours is None:
             self.settings = self._at_most((request.trials or PER_OPTION) * len(self.space))
@@ -255,8 +255,8 @@ class Halving(Search):
         if settings <= FINALISTS:
             needed = runs(ladder(FINALISTS + 1, seeds)) * a_run
             raise OptionError(
-                f"--core-hours {hours:g}: a run of {self.base.label} takes {a_run:.2g} of them, so that the smallest "
-                f"search needs {needed:.2g}: give more, or fewer --seeds"
+                f"--budget {hours:g}core-hours: a run of {self.base.label} takes {a_run:.2g} of them, so that the "
+                f"smallest search needs {needed:.2g}: give more, or fewer --seeds"
             )
         return self._at_most(settings)
 
@@ -319,7 +319,7 @@ class Halving(Search):
         edges = self._how()["note"]
         return (
             "Trials of the last rung stand first, on seeds that no choice had seen before; an entry is judged on "
-            f"protocol seeds all the same{f'. Beware: {edges}, more --trials go on' if edges else ''}"
+            f"protocol seeds all the same{f'. Beware: {edges}, more trials go on' if edges else ''}"
         )
 
     def _seeds_text(self, trial: Trial) -> str:

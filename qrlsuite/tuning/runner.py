@@ -47,8 +47,8 @@ def build(requests: Sequence[Request], runs: Path) -> list[Search]:
         if search.request.sampler != "grid":
             counts = " and ".join(str(each.planned) for each in built)
             raise OptionError(
-                f"sampler '{search.request.sampler}' gives these models {counts} trials; --sampler random --trials "
-                f"{fewest} gives each as many"
+                f"sampler '{search.request.sampler}' gives these models {counts} trials; "
+                f"--sampler 'random trials={fewest}' gives each as many"
             )
         built[i] = Search(dataclasses.replace(search.request, sampler="random", trials=fewest), runs)
     return built
@@ -59,16 +59,15 @@ def run(
     runs: Path,
     where: Where,
     display: TuneDisplay,
-    budget: float | None = None,
     out: Path | None = None,
 ) -> bool:
     """Run trials, then write the preset file of each search that has a best trial and waits for none.
 
+    No trials are begun that would not end within the requests' budget of time, one after the other and at the pace of
+    those before.
+
     Parameters
     ----------
-    budget:
-        Seconds: no trials are begun that would not end within them, one after the other and at the pace of those
-        before. None for no limit.
     out:
         The preset file of the one search; None takes `Search.path`.
 
@@ -85,6 +84,7 @@ def run(
         If a trial cannot be run.
     """
     try:
+        budget = searches[0].request.seconds(where.workers)
         complete = _run(searches, runs, where, display, budget)
     except KeyboardInterrupt:
         display.interrupted()

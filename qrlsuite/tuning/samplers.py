@@ -9,10 +9,12 @@ import importlib.util
 import itertools
 import math
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+import pydantic
 
+from qrlsuite import notation, options
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.tuning.space import Dimension, Point, Space
 
@@ -23,6 +25,28 @@ NAMES = {
     "random": "combinations drawn at random, none twice",
     "tpe": "proposals of Optuna's tree-structured Parzen estimator, after what was seen",
 }
+
+
+@pydantic.dataclasses.dataclass(frozen=True)
+class SamplerOptions:
+    """What is written behind a sampler's name."""
+
+    trials: Annotated[int | None, pydantic.Field(ge=1, le=100_000)] = None
+    seed: Annotated[int, pydantic.Field(ge=0)] = 0
+
+
+def read(text: str) -> tuple[str, SamplerOptions]:
+    """Read a sampler with its options: `random trials=50 seed=1`; for `halving`, trials per varied option.
+
+    Raises
+    ------
+    UnknownNameError, OptionError
+        If there is no such sampler, or it has no such option or value.
+    """
+    name, values = notation.parse_named(text, "--sampler ")
+    if name not in NAMES:
+        raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
+    return name, options.build(SamplerOptions, values, f"sampler '{name}'")
 
 
 class Sampler(Protocol):
@@ -66,16 +90,16 @@ def create(name: str, space: Space, trials: int | None, seed: int, base: Point) 
         if ranges:
             raise OptionError(
                 f"{ranges[0]} is a range, which sampler '{name}' cannot go through: give a list, or use "
-                "--sampler random or --sampler tpe"
+                "--sampler random or tpe"
             )
         if trials is not None and not (name == "grid" and trials >= size(space)):
             raise OptionError(
-                f"--trials is for samplers that draw: --sampler random --trials {trials} takes as many of the "
+                f"trials is for samplers that draw: --sampler 'random trials={trials}' takes as many of the "
                 f"{size(space)} combinations"
             )
         return Listed(product(space) if name == "grid" else one_at_a_time(space, base))
     if trials is None:
-        raise OptionError(f"--sampler {name} needs --trials, the number of settings to try")
+        raise OptionError(f"--sampler {name}: write the number of settings to try, '{name} trials=50'")
     if name == "random":
         return Listed(random_points(space, trials, seed))
     return Tpe(space, trials, seed)

@@ -6,8 +6,9 @@ finished on the disk, and ends with the same preset (but for the measured hours)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import notation, options, registry
+from qrlsuite.engine.budget import Budget
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
@@ -69,15 +71,13 @@ class Request:
     Attributes
     ----------
     entry:
-        What is tuned, as `qrlsuite.notation.parse_entry` reads it. Its settings are shared by all trials.
-    algorithm, settings:
-        Given beside it.
+        What is tuned, as `qrlsuite.notation.parse_entry` reads it. All trials share its settings, and those given here.
     grid, varied:
         What is varied: a grid file, and options with lists of values of their own.
     trials, sampler_seed:
         See `qrlsuite.tuning.samplers`, and for `halving` `qrlsuite.tuning.halving`.
-    core_hours:
-        With `halving` instead of `trials`: as many settings as this many core-hours hold.
+    budget:
+        Of time; or of core-hours: with `halving`, instead of `trials`, as many settings as these hold.
     seeds:
         Tuning seeds; with `halving` those of the last rung, in number.
     epochs:
@@ -86,22 +86,72 @@ class Request:
 
     task: str
     entry: str
-    algorithm: str | None = None
     settings: tuple[Setting, ...] = ()
     grid: space.GridFile | None = None
     varied: tuple[Setting, ...] = ()
     sampler: str = "grid"
     trials: int | None = None
-    core_hours: float | None = None
+    budget: Budget | None = None
     sampler_seed: int = 0
     seeds: tuple[int, ...] = ()
     epochs: int | None = None
     objective: Objective = "time"
 
+    @property
+    def core_hours(self) -> float | None:
+        """With `halving`, the core-hours that decide how many settings are tried."""
+        return self.budget.core_hours if self.budget is not None and self.sampler == "halving" else None
 
-def default_sampler(varied: object) -> str:
-    """Return the sampler of a search that names none: all combinations of what is listed, else halving."""
-    return "grid" if varied else "halving"
+    def seconds(self, workers: int) -> float | None:
+        """Return the time that the search may take; None for no limit."""
+        return None if self.budget is None or self.core_hours else self.budget.seconds(workers)
+
+
+def read_requests(
+    task: str,
+    entries: Sequence[str],
+    vary: str | Sequence[str] | Mapping[str, Any],
+    sampler: str | None,
+    seeds: tuple[int, ...],
+    epochs: int | None,
+    objective: Objective,
+    budget: str | None,
+) -> list[Request]:
+    """Return a request for each entry, all of them with the same budget.
+
+    Parameters
+    ----------
+    vary:
+        See `qrlsuite.tuning.space.read_varied`.
+    sampler:
+        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else halving.
+    """
+    grid, varied = space.read_varied(vary)
+    name, chosen = samplers.read(sampler or ("grid" if vary else "halving"))
+    shared = Request(
+        task,
+        "",
+        grid=grid,
+        varied=varied,
+        sampler=name,
+        trials=chosen.trials,
+        sampler_seed=chosen.seed,
+        budget=None if budget is None else Budget.parse(budget),
+        seeds=seeds,
+        epochs=epochs,
+        objective=objective,
+    )
+    if not entries:
+        raise OptionError("name at least one entry to tune, for example 'mlp width=16'")
+    return [replace(shared, entry=entry) for entry in entries]
+
+
+def preset_path(out: str | PathLike[str] | None, requests: Sequence[Request]) -> Path | None:
+    """Check the name of the preset file."""
+    path = None if out is None else Path(out)
+    if path is not None and (len(requests) > 1 or path.suffix != ".toml"):
+        raise OptionError(f"--out {path}: one file ending in .toml, for one entry")
+    return path
 
 
 @dataclass(frozen=True)
@@ -164,7 +214,7 @@ class Search(Shown):
         self.request = request
         self.results = results
         self.runs = results / FOLDER
-        self.notation = notation.parse_entry(request.entry).given(request.algorithm, request.settings)
+        self.notation = notation.parse_entry(request.entry).given(settings=request.settings)
         self.base = self._entry()
         self.epochs = request.epochs or self.base.task.epochs(self.base.algorithm.name)
         self.trials: list[Trial] = []
@@ -181,8 +231,6 @@ class Search(Shown):
 
     def _begin(self) -> None:
         request = self.request
-        if request.core_hours is not None:
-            raise OptionError(f"--core-hours is for --sampler halving, not for '{request.sampler}'")
         self.space = self._space(request.grid is None and not request.varied)
         self.sampler = samplers.create(
             request.sampler,
@@ -394,7 +442,7 @@ class Search(Shown):
         base = self.base
         comment = (
             f"Settings found by `qrlsuite tune` ({cell_text(base.task.file.ranking, self.request.objective)}); to use "
-            f"them:\n  qrlsuite run --task {self.request.task} --model {base.model.name} --preset {path.name}"
+            f"them:\n  qrlsuite run {base.model.name} preset={path.name} --task {self.request.task}"
         )
         write_atomically(path, preset.dumps(best_preset, comment).encode())
         self.written = path

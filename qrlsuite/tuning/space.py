@@ -115,7 +115,9 @@ def load(name: str) -> GridFile:
     """
     known = grids()
     if not name.endswith(".toml") and name not in known:
-        raise UnknownNameError(f"unknown grid '{name}'{nearest(name, known)}; or give a file, my-grid.toml")
+        raise UnknownNameError(
+            f"unknown grid '{name}'{nearest(name, known)}; or give a file, my-grid.toml, or 'lr=[1e-3, 5e-4]'"
+        )
     path = Path(name) if name.endswith(".toml") else known[name]
     try:
         data = options.read_toml(path.read_text(encoding="utf-8"))
@@ -211,8 +213,8 @@ def space(
             _forget(axes, _full_name(_word(setting), sides, setting.prefix))
     if not axes:
         raise OptionError(
-            f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: give --grid NAME, --grid FILE.toml "
-            "or --vary 'lr=[1e-3, 5e-4]'"
+            f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: --vary takes a grid's name, a grid "
+            "file or 'lr=[1e-3, 5e-4]'"
         )
     result = tuple(_dimension(name, values) for name, values in axes.items())
     for dimension in result:
@@ -270,6 +272,29 @@ def parse_varied(word: str) -> Setting:
         value = [options.parse_value(part.strip()) for part in text.split(",") if part.strip()]
     side, dot, name = key.strip().partition(".")
     return Setting(side, name, value) if dot else Setting(None, side, value)
+
+
+def read_varied(vary: str | Sequence[str] | Mapping[str, Any]) -> tuple[GridFile | None, tuple[Setting, ...]]:
+    """Return a grid and the options with values of their own.
+
+    Parameters
+    ----------
+    vary:
+        Words, each a grid's name, a grid file's path or `NAME=VALUES`; or a mapping of option names to values.
+
+    Raises
+    ------
+    QrlSuiteError
+        If a word is none of these, or there are several grids.
+    """
+    if isinstance(vary, Mapping):
+        varied = {name: list(v) if isinstance(v, tuple) else v for name, v in vary.items()}
+        return None, tuple(options.from_mapping(varied))
+    words = [vary] if isinstance(vary, str) else list(vary)
+    grids = [word for word in words if "=" not in word]
+    if len(grids) > 1:
+        raise OptionError(f"--vary {grids[0]} --vary {grids[1]}: give one grid")
+    return load(grids[0]) if grids else None, tuple(parse_varied(word) for word in words if "=" in word)
 
 
 def _values(name: str, value: Any) -> list[Any] | Range:

@@ -36,7 +36,7 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         assert "4 seeds complete" in done.stderr
         assert f"results: {runs}/" in done.stderr
         assert (f"results go to the new folder {runs};" in done.stderr) == (width == "16")
-    again = qrlsuite("run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", runs, "--json")
+    again = qrlsuite("run", "ddqn", "mlp", "width=16", "--task", task, "--runs", runs, "--json")
     assert json.loads(again.stdout)["seeds"] == 4
 
     table = qrlsuite("leaderboard", "--runs", runs)
@@ -102,12 +102,12 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
     assert first.wait(HANGS) == 0
 
 
-def test_minutes_stop_a_run_as_ctrl_c_does(task: str, tmp_path: Path) -> None:
+def test_a_budget_stops_a_run_as_ctrl_c_does(task: str, tmp_path: Path) -> None:
     words = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "1", "--workers", "1"]
     runs = ["--runs", str(tmp_path / "runs")]
-    done = qrlsuite(*words, *runs, "--epochs", "1000000", "--minutes", "0.02")
+    done = qrlsuite(*words, *runs, "--epochs", "1000000", "--budget", "1.2s")
     assert done.returncode == 0, done.stderr
-    assert "stopped after 0.02 min, at epoch " in done.stderr
+    assert "stopped after 1.2s, at epoch " in done.stderr
     assert "The same command continues from there" in " ".join(done.stderr.split())
     (entry,) = (tmp_path / "runs" / "tiny").iterdir()
     assert EntryStore(entry).finished([0], 1_000_000) == set()
@@ -193,13 +193,15 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["run", "--task", "beam6g", "--model", "mlp", "--minutes", "-1"], "--minutes 2"),
+        (["run", "--task", "beam6g", "--model", "mlp", "--budget", "-1"], "--budget -1: write 90s, 30min"),
         (["run", "--task", "beam6h", "--model", "mlp"], "unknown task 'beam6h'; did you mean 'beam6g'"),
         (["run", "--task", "beam6g", "--model", "mpl"], "unknown model 'mpl'; did you mean 'mlp'"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--algorithm", "dqn"], "did you mean 'ddqn'"),
+        (["run", "dqn mlp", "--task", "beam6g"], "did you mean 'ddqn'"),
+        (["run", "--task", "beam6g"], "name a model, for example: qrlsuite run mlp width=16 --task beam6g"),
+        (["run", "ppo", "mlp", "--model", "mlp", "--task", "beam6g"], "'ppo mlp' and --model mlp: give one"),
         (["run", "--task", "beam6g", "--model", "mlp", "--set", "widht=1"], "did you mean 'width'"),
         (["run", "--task", "beam6g", "--model", "mlp", "--set", "width=wide"], "width = 'wide'"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--preset", "relesed"], "did you mean 'released'"),
+        (["run", "--task", "beam6g", "mlp", "preset=relesed"], "did you mean 'released'"),
         (
             ["run", "--task", "beam6g", "--model", "mlp", "--seeds", "a:b"],
             "write a number (100), a range (0:20)",
@@ -234,7 +236,6 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         ),
         (["run", "--task", "beam6g", "--model", "mlp", "--seeds", "9" * 12], "100000 seeds are the most"),
         (["run", "--task", "beam6g", "--model", "mlp", "--sedes", "3"], "--seeds"),
-        (["run", "--task", "beam6g"], "see `qrlsuite run --help`"),
         (["run", "--task", "beam6g", "--model", "mlp", "--epochs", "0"], "--epochs"),
         (["rnu"], "Did you mean 'run'"),
         (["show", "ansatz", "iqp", "--figure", "iqp.jpeg2"], "must be .png, .pdf or .svg"),
@@ -251,6 +252,14 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
             )
         ],
         (["runs", "--task", "/etc"], "unknown task '/etc'"),
+        (["run", "--task", "beam6g", "mlp", "--minutes", "3"], "--minutes is gone: --budget 30min"),
+        (["run", "--task", "beam6g", "mlp", "--preset", "x"], "--preset is gone: write it into the entry"),
+        (["study", "run", "fig6", "--partition", "x"], "--partition is gone: --engine 'slurm partition=gpu"),
+        (["tune", "--task", "beam6g", "--model", "mlp"], "--model is gone: write it into the entry"),
+        (
+            ["evaluate", "mlp", "--backend-set", "shots=3"],
+            "--backend-set is gone: --backend 'qiskit shots=1000'",
+        ),
         (["status"], "`qrlsuite status` is now `qrlsuite runs`"),
         (["leaderboard", "verify", "."], "`qrlsuite leaderboard verify` is now `qrlsuite verify`"),
         (["calibrate"], "`qrlsuite calibrate` is now `python benchmarks/calibration.py`"),

@@ -59,7 +59,7 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
     assert len({state["median_score"] for state in snapshot.values()}) == 2, "the groups must differ"
 
 
-@pytest.mark.parametrize(("again", "limit"), [("command", "--minutes"), ("call", "`minutes`")])
+@pytest.mark.parametrize(("again", "limit"), [("command", "--budget"), ("call", "`budget`")])
 def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
     again: Literal["command", "call"],
     limit: str,
@@ -68,9 +68,9 @@ def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     plan = Missing(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
-    RunDisplay(plan, 1, again=again).out_of_time(1.5)
+    RunDisplay(plan, 1, again=again).out_of_time("90s")
     message = capsys.readouterr().err
-    assert "stopped after 1.5 min, at epoch 0 of 3" in message
+    assert "stopped after 90s, at epoch 0 of 3" in message
     assert f"The same {again} continues from there, and without {limit} to the end." in message
 
 

@@ -52,7 +52,7 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
     finish(straight)
     straight.write(straight.path)
 
-    words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--set", "depth=1"]
+    words = ["tune", "mlp width=4 depth=1", "--task", task]
     words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "8", "--workers", "1"]
     words += ["--runs", str(tmp_path / "stopped")]
     trials = tmp_path / "stopped" / "tuning"
@@ -74,7 +74,7 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
     assert without_hours(path.read_text()) == without_hours(straight.path.read_text())
 
     used = qrlsuite(
-        "run", "--task", task, "--model", "mlp", "--preset", str(path), "--seeds", "1", "--epochs", "1",
+        "run", "mlp", f"preset={path}", "--task", task, "--seeds", "1", "--epochs", "1",
         "--runs", str(tmp_path / "runs"), "--json",
     )  # fmt: skip
     assert used.returncode == 0, used.stderr
@@ -89,8 +89,8 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
 
 
 def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
-    words = ["tune", "--task", task, "--model", "mlp width=4", "--model", "mlp width=5 depth=1"]
-    words += ["--vary", "lr=1e-2,1e-3,1e-4", "--set", "lr=1e-2", "--vary", "gamma=.9,.99"]
+    words = ["tune", "mlp width=4 lr=1e-2", "mlp width=5 depth=1 lr=1e-2", "--task", task]
+    words += ["--vary", "lr=1e-2,1e-3,1e-4", "--vary", "gamma=.9,.99"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     done = qrlsuite(*words)
     assert done.returncode == 0, done.stderr
@@ -100,11 +100,13 @@ def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
     assert done.stdout.count("next: qrlsuite run") == 2
     content = json.loads(CliRunner().invoke(build(), [*words, "--json"]).stdout)
     assert [len(each["trials"]) for each in content["searches"]] == [2, 2]
-    assert {"algorithm.gamma"} == set(content["searches"][0]["space"]), "--set takes lr out"
+    assert {"algorithm.gamma"} == set(content["searches"][0]["space"]), (
+        "an option that is written is not varied"
+    )
 
 
 def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tmp_path: Path) -> None:
-    words = ["tune", "--task", task, "--model", "mlp", "--grid", "paper", "--runs", str(tmp_path / "runs")]
+    words = ["tune", "mlp", "--task", task, "--vary", "paper", "--runs", str(tmp_path / "runs")]
     planned = CliRunner().invoke(build(), [*words, "--dry-run"])
     assert planned.exit_code == 0
     assert "2160 trials" in planned.stderr
@@ -117,16 +119,19 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tm
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--model", "width=4"], "entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ..."),
-        (["--model", "mlp", "--model", "mlp", "--out", "p.toml"], "for one model"),
-        (["--model", "mlp", "--grid", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
+        (["width=4"], "entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ..."),
+        (["mlp", "mlp", "--out", "p.toml"], "for one entry"),
+        (["mlp", "--vary", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
         (
-            ["--model", "mlp", "--vary", "lr=1,2", "--seeds", "0:20"],
+            ["mlp", "--vary", "lr=1,2", "--seeds", "0:20"],
             "--seeds 0:20: tuning uses seeds from 1000000",
         ),
-        (["--model", "mlp", "--vary", "lr=1,2", "--budget", "soon"], "--budget soon: write a time"),
-        (["--model", "mlp", "--vary", "lr"], "write a name and its values"),
-        (["--model", "mlp", "--vary", "lr=1,2", "--out", "p.json"], "one file ending in .toml"),
+        (["mlp", "--vary", "lr=1,2", "--budget", "soon"], "--budget soon: write 90s, 30min"),
+        (["mlp", "--vary", "=1"], "write a name and its values"),
+        (["mlp", "--vary", "paper", "--vary", "x.toml"], "give one grid"),
+        (["mlp", "--sampler", "randm trials=3"], "did you mean 'random'"),
+        (["mlp", "--sampler", "random trial=3"], "did you mean 'trials'"),
+        (["mlp", "--vary", "lr=1,2", "--out", "p.json"], "one file ending in .toml"),
     ],
 )
 def test_wrong_input(words: list[str], message: str, task: str) -> None:
@@ -136,7 +141,7 @@ def test_wrong_input(words: list[str], message: str, task: str) -> None:
 
 
 def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> None:
-    words = ["tune", "--task", task, "--model", "mlp", "--set", "width=4", "--vary", "lr=1e-2,1e-3"]
+    words = ["tune", "mlp width=4", "--task", task, "--vary", "lr=1e-2,1e-3"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     first = CliRunner().invoke(build(), [*words, "--budget", "0.01s"])
     assert "the budget is spent, 1 trials are left" in first.stdout, "after the first trial, no other fits"
@@ -153,7 +158,7 @@ def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(task: str,
     assert trained.returncode == 0, trained.stderr
     (runs / "tiny" / "damaged").mkdir()
     (runs / "tiny" / "damaged" / "entry.json").write_text("{")
-    words = ["tune", "--task", task, "--model", "mlp", "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
+    words = ["tune", "mlp", "--task", task, "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
     done = qrlsuite(*words, "--seeds", "1", "--runs", str(runs))
     assert done.returncode == 0, done.stderr
     assert re.search(

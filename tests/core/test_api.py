@@ -84,7 +84,7 @@ def test_trackers_are_asked_for_while_training_only(
 
 
 def test_training_that_is_stopped_before_an_epoch_gives_no_entry(tiny_task: str, tmp_path: Path) -> None:
-    assert quiet(tiny_task, tmp_path, seeds=1, minutes=1e-9) is None
+    assert quiet(tiny_task, tmp_path, seeds=1, budget="0.0001s") is None
     assert quiet(tiny_task, tmp_path, seeds=1, epochs=1).curves.shape == (1, 1)
 
 
@@ -107,8 +107,7 @@ def test_evaluating(tiny_task: str, tmp_path: Path) -> None:
 def test_tuning(tiny_task: str, tmp_path: Path) -> None:
     (found,) = api.tune(
         tiny_task,
-        "mlp",
-        options=OPTIONS,
+        " ".join(["mlp", *(f"{name}={value}" for name, value in OPTIONS.items())]),
         vary={"lr": (1e-2, 1e-3)},
         seeds=1,
         epochs=1,
@@ -158,7 +157,7 @@ def test_running_a_study(tiny_task: str, tmp_path: Path) -> None:
         ({"workers": 0}, "workers = 0"),
         ({"engine": "lokal"}, "did you mean 'local'"),
         ({"device": "gpu"}, "give cpu, cuda"),
-        ({"minutes": 0}, "give a time"),
+        ({"budget": "0h"}, "write 90s, 30min"),
         ({"track": "tensorbord"}, "did you mean 'tensorboard'"),
     ],
 )
@@ -184,8 +183,8 @@ def test_bad_input_of_the_others(tiny_task: str, tmp_path: Path) -> None:
         api.run_study("fig66", runs=tmp_path)
     with pytest.raises(OptionError, match="format = 'gif'"):
         api.run_study("fig6", format="gif", runs=tmp_path)  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="minutes = 0"):
-        api.run_study("fig6", minutes=0, runs=tmp_path)
+    with pytest.raises(OptionError, match="--budget 0h"):
+        api.run_study("fig6", budget="0h", runs=tmp_path)
     with pytest.raises(OptionError, match="an engine that is built already"):
         api.train(tiny_task, "mlp", engine=Where.create(), workers=2, runs=tmp_path)
     assert list(tmp_path.iterdir()) == [Path(tiny_task)]

@@ -126,7 +126,7 @@ def test_a_device_that_is_no_simulator_needs_a_yes(trained: EntryStore, unreliab
     runs, entry = trained.path.parent.parent, [str(trained.path)]
     given: dict[str, Any] = {
         "best": 1, "episodes": 4, "progress": False,
-        "backend": "pennylane", "backend_options": {"device": "unreliable.qpu", "shots": 5},
+        "backend": "pennylane device=unreliable.qpu shots=5",
     }  # fmt: skip
     unreliable.batches = 0
     with pytest.raises(OptionError, match=r"is no simulator: 1 agents.*80 circuits.*400 shots; add --yes"):
@@ -171,8 +171,7 @@ def test_a_study_executes_nothing_on_hardware(
 def test_from_python(trained: EntryStore) -> None:
     runs, entry = trained.path.parent.parent, str(trained.path)
     given: dict[str, Any] = {"best": 2, "episodes": 5, "progress": False, "runs": runs}
-    there: dict[str, Any] = {"backend": "native", "backend_options": {"shots": 1}}
-    found = api.evaluate(entry, **given, **there)
+    found = api.evaluate(entry, **given, backend="native shots=1")
     exact, sampled = found.policies[:2]
     assert sampled.name == f"{exact.name} on native shots=1"
     assert sampled.seeds == exact.seeds
@@ -180,8 +179,6 @@ def test_from_python(trained: EntryStore) -> None:
         sampled.returns, Deployment(trained, "native", {"shots": 1}, best=2).play(5, 0).returns
     )
     np.testing.assert_array_equal(exact.returns, api.evaluate(entry, **given).policies[0].returns)
-    with pytest.raises(OptionError, match="--backend-set needs --backend"):
-        api.evaluate(entry, **given, backend_options={"shots": 1})
 
 
 @pytest.mark.parametrize(
@@ -218,14 +215,10 @@ def test_entries_without_circuits_or_agents_are_refused(
 def test_the_command(trained: EntryStore) -> None:
     runs = str(trained.path.parent.parent)
     words = ["evaluate", str(trained.path), "--runs", runs, "--best", "1", "--episodes", "5", "--json"]
-    there = ["--backend", "qiskit", "--backend-set", "shots=10", "--backend-set", "estimator=aer"]
+    there = ["--backend", "qiskit shots=10 estimator=aer"]
     result = CliRunner().invoke(build(), [*words, *there])
     policies = [each["policy"] for each in json.loads(result.stdout)["policies"]]
     assert policies[1] == f"{policies[0]} on qiskit shots=10 estimator=aer"
-    for wrong, message in (
-        (["--backend-set", "shots=10"], "--backend-set needs --backend"),
-        (["--backend", "native", "--backend-set", "shots"], "--backend-set shots: write name=value"),
-    ):  # fmt: skip
-        result = CliRunner().invoke(build(), [*words, *wrong])
-        assert isinstance(result.exception, OptionError)
-        assert message in str(result.exception)
+    result = CliRunner().invoke(build(), [*words, "--backend", "native shots"])
+    assert isinstance(result.exception, OptionError)
+    assert "--backend 'native shots': write a name and its options" in str(result.exception)

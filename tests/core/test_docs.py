@@ -99,7 +99,7 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
     if page == "plugins.md":
         return  # names of a package that its own test installs
     named = dict(itertools.pairwise(words))
-    for flag, kind in (("--task", "tasks"), ("--model", "models"), ("--algorithm", "algorithms")):
+    for flag, kind in (("--task", "tasks"), ("--model", "models")):
         if (
             flag in named
             and not named[flag].startswith(("gym:", "my-"))
@@ -107,19 +107,13 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
             and not ("--published" in words and (PUBLISHED / named[flag]).is_dir())
         ):
             registry.get(specs.kind(kind), named[flag].split()[0])
-    for model in [value for key, value in itertools.pairwise(words) if key == "--model"] * (
-        words[0] == "tune"
-    ):
-        resolve(named["--task"], model, named.get("--algorithm"))
-    if (
-        words[0] == "run"
-        and "--task" in named
-        and "--model" in named
-        and "my-" not in line
-        and "gym:" not in line
-    ):
-        settings = [parse_setting(value) for key, value in itertools.pairwise(words) if key == "--set"]
-        resolve(named["--task"], named["--model"], named.get("--algorithm"), settings, named.get("--preset"))
+    if words[0] not in ("run", "tune") or "--task" not in named or "my-" in line or "gym:" in line:
+        return
+    plain = list(itertools.takewhile(lambda word: not word.startswith("-"), words[1:]))
+    settings = [parse_setting(value) for key, value in itertools.pairwise(words) if key == "--set"]
+    entries = plain if words[0] == "tune" else [named.get("--model") or " ".join(plain)]
+    for entry in entries:
+        resolve(named["--task"], entry, settings=settings)
 
 
 def examples() -> list[tuple[str, str]]:
@@ -217,7 +211,7 @@ def test_the_fidelity_pages_options_exist() -> None:
     for name in re.findall(r"`(\w+) = \"", text):
         assert name in environment
     assert "init" in options.field_names(specs.resolve(registry.get(specs.ModelSpec, "mlp").options))
-    for preset in re.findall(r"--preset (\w+)", text):
+    for preset in re.findall(r"preset=(\w+)", text):
         resolve("beam6g", "mlp", preset=preset)
 
 

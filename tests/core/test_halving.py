@@ -14,6 +14,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
+from qrlsuite.engine.budget import Budget
 from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import Tuned, parse_setting
@@ -195,7 +196,7 @@ def test_with_real_training_two_models_get_equal_budgets(tiny_task: str, tmp_pat
 
 def test_equal_core_hours(tiny_task: str, tmp_path: Path) -> None:
     """A run is recorded with 36 core-seconds, .01 core-hours."""
-    wanted = request(tiny_task, core_hours=0.301)
+    wanted = request(tiny_task, budget=Budget(None, 0.301))
     found = Halving(wanted, tmp_path)
     assert found.settings is None
     finish(found, Recorder(tmp_path / "tuning", near(2e-3)))
@@ -205,7 +206,7 @@ def test_equal_core_hours(tiny_task: str, tmp_path: Path) -> None:
     again = Recorder(tmp_path / "tuning", near(2e-3))
     assert finish(Halving(wanted, tmp_path), again).settings == 9
     assert again.runs == []
-    little = Halving(request(tiny_task, core_hours=0.01), tmp_path)
+    little = Halving(request(tiny_task, budget=Budget(None, 0.01)), tmp_path)
     with pytest.raises(OptionError, match=r"needs 0\.19: give more, or fewer --seeds"):
         finish(little, again)
 
@@ -239,9 +240,7 @@ def test_all_combinations_of_a_list_and_no_more(tiny_task: str, tmp_path: Path) 
     ("changes", "message"),
     [
         ({"seeds": (1_000_000, 1_000_002)}, "halving takes seeds one after the other, such as --seeds 2"),
-        ({"trials": 3, "core_hours": 1.0}, "--trials and --core-hours: give one of them"),
-        ({"core_hours": -1.0}, "--core-hours -1: give a time"),
-        ({"sampler": "grid", "varied": varied("lr=1,2"), "core_hours": 1.0}, "--core-hours is for --sampler"),
+        ({"trials": 3, "budget": Budget(None, 1.0)}, "--budget in core-hours and trials: give one of them"),
         ({"settings": (*OWN, parse_setting("lr=1e-3"))}, "nothing is varied"),
     ],
 )

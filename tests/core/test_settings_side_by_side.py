@@ -229,7 +229,7 @@ def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Pa
     lists = by.divide(plans(tmp_path, [*alike, other], [0, 1], by))
     claim.release()
     assert [[plan.entry for plan in each] for each in lists] == [[alike[0], alike[2]], [alike[1]], [other]]
-    elsewhere = where.Where.create("command", 1, {"template": "{command}"})
+    elsewhere = where.Where.create("command template='{command}'", 1)
     lists = elsewhere.divide(plans(tmp_path, alike, [0, 1], elsewhere))
     assert (len(lists), elsewhere.room) == (3, 1)
 

@@ -327,8 +327,8 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
         ({"varied": varied("lr={low = 2, high = 1}")}, "low < high is needed"),
         ({"varied": varied("lr={low = 1, high = inf}")}, "finite"),
         ({"varied": varied("lr={low = 1, high = 2}")}, "is a range, which sampler 'grid' cannot go through"),
-        ({"trials": 2}, "--sampler random --trials 2"),
-        ({"sampler": "tpe"}, "needs --trials"),
+        ({"trials": 2}, "--sampler 'random trials=2'"),
+        ({"sampler": "tpe"}, "'tpe trials=50'"),
         ({"sampler": "gird"}, "did you mean 'grid'"),
     ],
 )

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 SMALL = {
     "run": ("--seeds", "2", "--epochs", "1", "--workers", "1"),
     "evaluate": ("--episodes", "5"),
-    "tune": ("--sampler", "random", "--trials", "1", "--seeds", "2", "--epochs", "1", "--workers", "1"),
+    "tune": ("--sampler", "random trials=1", "--seeds", "2", "--epochs", "1", "--workers", "1"),
     "study": ("--seeds", "2", "--epochs", "1", "--set", "qubits=2", "--set", "layers=1", "--workers", "1"),
 }
 """What is appended to a command, so that it takes seconds; the last of two equal options counts."""

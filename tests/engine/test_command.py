@@ -15,6 +15,7 @@ import pytest
 
 from qrlsuite.engine import api
 from qrlsuite.errors import OptionError
+from qrlsuite.notation import write_setting
 from qrlsuite.options import build as build_options
 from qrlsuite.plugins.engines.command import CommandEngine, CommandOptions, shell_line
 from qrlsuite.results import claims
@@ -29,7 +30,7 @@ QUEUE = "({command} >/dev/null 2>&1 &)"
 
 def words(task: str, runs: Path, template: str, *more: str) -> list[str]:
     given = ["run", "--task", task, "--model", "mlp", "--set", "width=16", "--seeds", "2", "--epochs", "3"]
-    return [*given, "--runs", str(runs), "--engine", "command", "--engine-set", f"template={template}", *more]
+    return [*given, "--runs", str(runs), "--engine", f"command {write_setting('template', template)}", *more]
 
 
 @pytest.mark.parametrize(

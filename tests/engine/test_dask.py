@@ -52,7 +52,7 @@ def task(tmp_path: Path) -> Path:
 def words(task: Path, runs: Path, scheduler: str, epochs: int, *more: str) -> list[str]:
     given = ["run", "--task", str(task), "--model", "mlp", "--set", "width=16", "--seeds", str(SEEDS)]
     given += ["--epochs", str(epochs), "--workers", str(SEEDS), "--runs", str(runs)]
-    return [*given, "--engine", "dask", "--engine-set", f"scheduler={scheduler}", *more]
+    return [*given, "--engine", f"dask scheduler={scheduler}", *more]
 
 
 def environment(seconds: float = 0.3) -> dict[str, str]:
@@ -155,7 +155,7 @@ def test_over_tls_from_python(
     with Cluster(tmp_path / "cluster", variables, "tls") as cluster, dask.config.set(tls):
         assert cluster.address.startswith("tls://127.0.0.1:")
         cluster.add(variables)
-        engine = Where.create("dask", 2, {"scheduler": cluster.address})
+        engine = Where.create(f"dask scheduler={cluster.address}", 2)
         done = api.train(
             str(task), "mlp", options={"width": 16}, seeds=2, epochs=2, engine=engine, runs=tmp_path / "runs"
         )
@@ -258,7 +258,7 @@ def test_a_scheduler_of_another_version(task: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scheduler", ["tcp://127.0.0.1:1", "nowhere://x"])
 def test_a_scheduler_that_is_not_there(scheduler: str, task: Path, tmp_path: Path) -> None:
-    line = only_line(qrlsuite(*words(task, tmp_path / "runs", scheduler, 1, "--engine-set", "timeout=0.5")))
+    line = only_line(qrlsuite(*words(task, tmp_path / "runs", f"{scheduler} timeout=0.5", 1)))
     assert line.startswith(f"qrlsuite: no Dask scheduler answers at {scheduler} within 0.5 s (")
     assert line.endswith("): is it running there, and can this machine reach it?")
 

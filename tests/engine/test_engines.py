@@ -32,7 +32,7 @@ from tests.conftest import Hold, results
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
     assert {"local", "slurm"} <= set(registry.load().names(specs.EngineSpec))
-    assert isinstance(where.build("local", {"partition": None}), LocalEngine)
+    assert isinstance(where.build("local", {}), LocalEngine)
 
 
 @pytest.mark.parametrize(

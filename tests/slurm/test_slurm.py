@@ -57,8 +57,7 @@ def run(folder: Path, *words: str, epochs: int, seeds: int = SEEDS) -> subproces
 
 
 def submit(folder: Path, limit: str, epochs: int) -> str:
-    late = ("--engine-set", "grace=10")
-    answer = run(folder, "--engine", "slurm", "--time", limit, *late, "--json", epochs=epochs)
+    answer = run(folder, "--engine", f"slurm time={limit} grace=10", "--json", epochs=epochs)
     words = json.loads(answer.stdout)["submitted"].split()
     return str(words[words.index("job") + 1].rstrip(";"))
 
@@ -87,7 +86,7 @@ def starts(entry: Path, job: str, index: int) -> int:
 def test_a_wrong_partition_is_slurms_own_message(tmp_path: Path) -> None:
     (tmp_path / "tiny.toml").write_text(TINY)
     command = [sys.executable, "-m", "qrlsuite", "run", "--task", "tiny.toml", "--model", "mlp"]
-    command += ["--engine", "slurm", "--partition", "nowhere"]
+    command += ["--engine", "slurm partition=nowhere"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 2
     assert "SLURM refused the job" in done.stderr

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
 from qrlsuite.engine.terminal import table_console
-from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import evaluation, pictures
-from qrlsuite.options import parse_setting
 from qrlsuite.results.store import write_atomically
 
 
@@ -48,13 +46,8 @@ def evaluate(
         typer.Option(
             "--backend",
             metavar="NAME",
-            help="Also let the agents act on another circuit backend: native, pennylane, qiskit, or a plugin's.",
-        ),
-    ] = None,
-    backend_set: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--backend-set", metavar="NAME=VALUE", help="An option of that backend: shots=1000. Repeatable."
+            help="Also let the agents act on another circuit backend, with its options: 'native shots=1000', 'qiskit "
+            "estimator=aer', 'pennylane device=lightning.qubit', or a plugin's.",
         ),
     ] = None,
     yes: Annotated[
@@ -80,7 +73,7 @@ def evaluate(
     With --backend the same agents act with shots, with noise or on a device, beside themselves as they were
     trained. The cost is printed first. Finished episodes are kept, and not played again.
 
-    Example: qrlsuite evaluate vqc-native --backend qiskit --backend-set estimator=aer --backend-set shots=1000
+    Example: qrlsuite evaluate vqc-native --backend "qiskit estimator=aer shots=1000"
 
     Example: qrlsuite evaluate "mlp width=64" vqc-native --best 10 --episodes 1000 --out histogram.png
     """
@@ -95,7 +88,6 @@ def evaluate(
         progress=not json_output,
         entanglement=entanglement,
         backend=backend,
-        backend_options=_options(backend_set or []),
         yes=yes,
     )
     if out is not None:
@@ -106,12 +98,3 @@ def evaluate(
     table_console().print(evaluations)
     if out is not None:
         typer.echo(f"wrote {out}")
-
-
-def _options(words: list[str]) -> dict[str, Any]:
-    """Read `name=value` words."""
-    settings = [parse_setting(word, "--backend-set ") for word in words]
-    for setting in settings:
-        if setting.side is not None:
-            raise OptionError(f"{setting.written}: write the name of the backend's option alone")
-    return {setting.name: setting.value for setting in settings}

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from qrlsuite import options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of
 from qrlsuite.cli.training import (
+    BudgetOption,
     DeviceOption,
     EngineOption,
-    EngineOptionsOption,
     FreshOption,
-    MinutesOption,
-    PartitionOption,
     SameOption,
-    TimeOption,
     TrackOption,
     WorkersOption,
     where_of,
 )
 from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.experiment import entry as entries
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.notation import Written, parse_entry
 from qrlsuite.results.seeds import parse_seeds
 from qrlsuite.training import trackers
 
@@ -43,20 +42,20 @@ def run(
             autocompletion=names_of("tasks"),
         ),
     ],
+    entry: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENTRY]",
+            help="[ALGORITHM] MODEL [NAME=VALUE ...] [preset=FILE], as boards print it: mlp width=16, or ppo mlp. "
+            "--model and --set say the same.",
+        ),
+    ] = None,
     model: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--model",
             help="A function approximator (see `qrlsuite list models`).",
             autocompletion=names_of("models"),
-        ),
-    ],
-    algorithm: Annotated[
-        str | None,
-        typer.Option(
-            "--algorithm",
-            help="A learning algorithm; default: the task's.",
-            autocompletion=names_of("algorithms"),
         ),
     ] = None,
     settings: Annotated[
@@ -66,9 +65,6 @@ def run(
             metavar="NAME=VALUE",
             help="An option, for example --set qubits=6, --set algorithm.gamma=.9, --set environment.degree=4.",
         ),
-    ] = None,
-    preset: Annotated[
-        str | None, typer.Option("--preset", help="One of the task's presets of settings.")
     ] = None,
     seeds: Annotated[
         str | None, typer.Option("--seeds", help="100, or 0:20, or 0,3,10:12; default: the task's protocol.")
@@ -83,12 +79,9 @@ def run(
             help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
         ),
     ] = False,
-    minutes: MinutesOption = None,
+    budget: BudgetOption = None,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
-    partition: PartitionOption = None,
-    time: TimeOption = None,
-    engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
     fresh: FreshOption = False,
     same: SameOption = None,
@@ -104,26 +97,25 @@ def run(
     Stop with Ctrl-C at any time; the same command continues where it stopped. More --seeds or --epochs add to
     earlier results; repeating a finished command does nothing.
 
-    Example: qrlsuite run --task beam6g --model vqc-pennylane --set qubits=6 --seeds 20
+    Examples: qrlsuite run mlp width=16 --task beam6g --seeds 20; qrlsuite run --task beam6g --model vqc-pennylane
+    --set qubits=6
     """
-    chosen = [options.parse_setting(word) for word in settings or []]
-    if quick:
-        chosen = _quick_settings(model, chosen)
-    entry = entries.resolve(task, model, algorithm, chosen, preset)
+    written = _written(entry or [], model, settings or [])
+    resolved = resolve(task, _quick(written) if quick else written)
     if track:
         trackers.ask(track)
     seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
     last = epochs or (QUICK_EPOCHS if quick else None)
-    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
-    missing.check_minutes(minutes, where)
-    for line in missing.require_same_code(runs, [entry], where):
+    where = where_of(engine, workers, device, fresh, same)
+    missing.check_budget(budget, where)
+    for line in missing.require_same_code(runs, [resolved], where):
         typer.echo(line, err=True)
-    work = missing.find(runs, entry, where, seed_numbers, last)
+    work = missing.find(runs, resolved, where, seed_numbers, last)
     display = RunDisplay(work, where.workers, quiet=json_output)
     if not json_output:
         display.expected = missing.expected(work, where)
     try:
-        outcome = missing.train(work, where, display, minutes, confirmed=yes)
+        outcome = missing.train(work, where, display, budget, confirmed=yes)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     if outcome.submitted is not None:
@@ -136,9 +128,18 @@ def run(
         display.finished(summary)
 
 
-def _quick_settings(model: str, chosen: list[Any]) -> list[Any]:
-    """Reduce the qubits of a circuit, unless they were set by hand."""
-    names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, model).options))
-    if "qubits" in names and not any(word.name == "qubits" for word in chosen):
-        return [options.Setting("model", "qubits", QUICK_QUBITS), *chosen]
-    return chosen
+def _written(words: list[str], model: str | None, settings: list[str]) -> Written:
+    """Read the entry, given as arguments or by --model, and what --set adds."""
+    if bool(words) == (model is not None):
+        problem = f"'{' '.join(words)}' and --model {model}: give one of them" if words else "name a model"
+        raise OptionError(f"{problem}, for example: qrlsuite run mlp width=16 --task beam6g")
+    text = " ".join(words) or str(model)
+    return parse_entry(text).given(settings=tuple(map(options.parse_setting, settings)))
+
+
+def _quick(written: Written) -> Written:
+    """Reduce the qubits of a circuit, unless they are written."""
+    names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, written.model).options))
+    if "qubits" not in names or any(setting.name == "qubits" for setting in written.settings):
+        return written
+    return written.given(settings=(options.Setting("model", "qubits", QUICK_QUBITS),))

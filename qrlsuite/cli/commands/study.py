@@ -14,17 +14,15 @@ from rich.table import Table
 from qrlsuite import api, options, registry, specs
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption
 from qrlsuite.cli.training import (
+    BudgetOption,
     DeviceOption,
     EngineOption,
-    EngineOptionsOption,
     FreshOption,
-    PartitionOption,
     SameOption,
-    TimeOption,
     WorkersOption,
-    seconds,
     where_of,
 )
+from qrlsuite.engine import budget as budgets
 from qrlsuite.engine.missing import require_same_code
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.engine.where import Where
@@ -169,12 +167,7 @@ def run(
     name: StudyOrAll,
     seeds: SeedsOption = None,
     epochs: EpochsOption = None,
-    budget: Annotated[
-        str | None,
-        typer.Option(
-            "--budget", metavar="TIME", help="90s, 30min, 2h: stop at a group's end when it is used up."
-        ),
-    ] = None,
+    budget: BudgetOption = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would be trained, and train nothing.")
     ] = False,
@@ -184,9 +177,6 @@ def run(
     format_: OutOption = "png",
     workers: WorkersOption = None,
     engine: EngineOption = "local",
-    partition: PartitionOption = None,
-    time: TimeOption = None,
-    engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
     fresh: FreshOption = False,
     same: SameOption = None,
@@ -205,8 +195,8 @@ def run(
     Examples: qrlsuite study run fig6 --seeds 20 --budget 30min; qrlsuite study run all --budget 8h
     """
     _check_format(format_)
-    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
-    limit = seconds(budget) if budget is not None else None
+    where = where_of(engine, workers, device, fresh, same)
+    limit = budgets.seconds(budget, where.workers)
     if name != ALL and studies.find(name).file.looks is not None:
         _require_none(name, seeds=seeds, epochs=epochs, set=settings, model_map=models, only=only)
         _require_none(name, fresh=fresh, dry_run=dry_run)

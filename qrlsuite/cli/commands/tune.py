@@ -4,46 +4,31 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from qrlsuite import options
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
     EngineOption,
-    EngineOptionsOption,
     FreshOption,
-    PartitionOption,
     SameOption,
-    TimeOption,
     WorkersOption,
-    seconds,
     where_of,
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
+from qrlsuite.notation import write_setting
 from qrlsuite.results.text import hours_text
-from qrlsuite.tuning import runner, search, space
+from qrlsuite.tuning import runner, search
 from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.search import Search
 
 LARGE = 200
 """Trials from which a search without a budget has to be asked for twice."""
-
-
-class SamplerName(StrEnum):
-    """In which order settings are tried; `qrlsuite.tuning.samplers.NAMES` says what each does."""
-
-    halving = "halving"
-    grid = "grid"
-    one_at_a_time = "one-at-a-time"
-    random = "random"
-    tpe = "tpe"
 
 
 class Goal(StrEnum):
@@ -55,65 +40,36 @@ class Goal(StrEnum):
 
 
 def tune(
+    entries: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="ENTRY...",
+            help="'[ALGORITHM] MODEL [NAME=VALUE ...]': a model, and options that all trials share. Several get equal "
+            "budgets.",
+        ),
+    ],
     task: Annotated[
         str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
     ],
-    models: Annotated[
-        list[str],
-        typer.Option(
-            "--model",
-            metavar="'NAME [SETTING=VALUE ...]'",
-            help="A function approximator (see `qrlsuite list models`), with settings if need be: 'mlp width=16'. "
-            "Repeat it to tune several with equal budgets.",
-        ),
-    ],
-    algorithm: Annotated[
-        str | None, typer.Option("--algorithm", help="A learning algorithm; default: the task's.")
-    ] = None,
-    grid: Annotated[
-        str | None,
-        typer.Option(
-            "--grid",
-            help="What is varied: `paper`, or a grid file's path; default: the options that models and algorithms "
-            "name for tuning.",
-        ),
-    ] = None,
     vary: Annotated[
         list[str] | None,
         typer.Option(
-            "--vary", metavar="NAME=[...]", help="What is varied, without a file: 'lr=[1e-3, 5e-4]'."
+            "--vary",
+            metavar="NAME=VALUES",
+            help="What is varied: 'lr=1e-3,5e-4', 'lr={low=1e-4, high=1e-2, log=true}', or a grid: `paper`, or a "
+            "file's path. Default: the options that models and algorithms name for tuning.",
         ),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A value that all trials share; not varied then."),
     ] = None,
     sampler: Annotated[
-        SamplerName | None,
+        str | None,
         typer.Option(
             "--sampler",
-            help="Successive halving, all combinations, one option at a time, at random, or Optuna's TPE; default: "
-            "halving, or all combinations of a --grid or --vary.",
+            metavar="NAME",
+            help="Successive halving (`halving`), all combinations (`grid`), `one-at-a-time`, `random` or Optuna's "
+            "`tpe`, with `trials` and `seed`: 'random trials=50', 'halving trials=16' (per varied option). Default: "
+            "halving, or all combinations of a --vary.",
         ),
     ] = None,
-    trials: Annotated[
-        int | None,
-        typer.Option(
-            "--trials",
-            min=1,
-            max=100_000,
-            help="How many settings: for random and tpe in all, for halving per varied option (default 8).",
-        ),
-    ] = None,
-    core_hours: Annotated[
-        float | None,
-        typer.Option(
-            "--core-hours", help="For halving: as many settings as so many core-hours of each model hold."
-        ),
-    ] = None,
-    sampler_seed: Annotated[
-        int, typer.Option("--sampler-seed", min=0, help="For random and tpe: the seed of the proposals.")
-    ] = 0,
     seeds: Annotated[
         str,
         typer.Option(
@@ -139,7 +95,8 @@ def tune(
         typer.Option(
             "--budget",
             metavar="TIME",
-            help="Time for all trials, 30min or 2h; a trial that would take longer is not begun.",
+            help="Time for all trials, 30min or 8h: one that would take longer is not begun. For halving, 2core-hours: "
+            "as many settings as that holds, for each entry.",
         ),
     ] = None,
     out: Annotated[
@@ -150,43 +107,26 @@ def tune(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would be, and stop.")] = False,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
-    partition: PartitionOption = None,
-    time: TimeOption = None,
-    engine_options: EngineOptionsOption = None,
     device: DeviceOption = "cpu",
     fresh: FreshOption = False,
     same: SameOption = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Find settings with which models learn in few steps, and write them to preset files for `run --preset`.
+    """Find settings with which models learn in few steps, and write them to preset files.
 
-    Several models get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries
+    Several entries get equal budgets. Every trial is an ordinary set of runs below RUNS/tuning, on seeds that entries
     are never judged by. Stop with Ctrl-C at any time; the same command continues, and ends with the same presets as
     if it had never stopped.
 
-    Example: qrlsuite tune --task beam6g --model "mlp width=16" --model "vqc-native qubits=6"
+    Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
-    if out is not None and (len(models) > 1 or out.suffix != ".toml"):
-        raise OptionError(f"--out {out}: one file ending in .toml, for one model")
-    limit = None if budget is None else seconds(budget)
-    shared = search.Request(
-        task=task,
-        entry="",
-        algorithm=algorithm,
-        settings=tuple(options.parse_setting(word) for word in settings or []),
-        grid=None if grid is None else space.load(grid),
-        varied=tuple(space.parse_varied(word) for word in vary or []),
-        sampler=sampler.value if sampler else search.default_sampler(grid or vary),
-        trials=trials,
-        core_hours=core_hours,
-        sampler_seed=sampler_seed,
-        seeds=search.tuning_seeds(seeds),
-        epochs=epochs,
-        objective=objective.value,
+    requests = search.read_requests(
+        task, entries, vary or (), sampler, search.tuning_seeds(seeds), epochs, objective.value, budget
     )
-    searches = runner.build([replace(shared, entry=each) for each in models], runs)
-    where = where_of(engine, workers, partition, time, engine_options, device, fresh, same)
+    path = search.preset_path(out, requests)
+    searches = runner.build(requests, runs)
+    where = where_of(engine, workers, device, fresh, same)
     display = TuneDisplay(searches, where, quiet=json_output)
     display.begin()
     if dry_run:
@@ -194,10 +134,10 @@ def tune(
             content = {"searches": [search.as_dict(each) for each in searches], "complete": False}
             typer.echo(json.dumps(content))
         return
-    if not yes and limit is None:
+    if not yes and budget is None:
         _require_few(searches)
     try:
-        complete = runner.run(searches, runs, where, display, limit, out)
+        complete = runner.run(searches, runs, where, display, path)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     if json_output:
@@ -217,7 +157,7 @@ def _require_few(searches: Sequence[Search]) -> None:
     if planned > LARGE:
         raise OptionError(
             f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "
-            "--sampler one-at-a-time or --sampler random --trials 50 tries fewer"
+            "--sampler one-at-a-time or --sampler 'random trials=50' tries fewer"
         )
 
 
@@ -246,9 +186,6 @@ def _report(searches: Sequence[Search], runs: Path, complete: bool) -> None:
     for each in searches:
         if each.written is None:
             continue
-        base = each.base
-        arguments = ["run", "--task", each.request.task, "--model", base.model.name]
-        if base.algorithm.name != base.task.file.default_algorithm:
-            arguments += ["--algorithm", base.algorithm.name]
-        line = command(*arguments, "--preset", str(each.written), runs=runs)
+        words = [each.base.model.name, write_setting("preset", str(each.written))]
+        line = command("run", *words, "--task", each.request.task, runs=runs)
         wide.print(f"next: {line}", markup=False, soft_wrap=True)
