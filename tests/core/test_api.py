@@ -177,7 +177,7 @@ def test_bad_input_of_the_others(tiny_task: str, tmp_path: Path) -> None:
         api.evaluate("mlp", best=0, runs=tmp_path)
     with pytest.raises(OptionError, match="tuning uses seeds from 1000000 up"):
         api.tune(tiny_task, "mlp", vary={"lr": [1e-3]}, seeds=[0, 1], runs=tmp_path)
-    with pytest.raises(OptionError, match=r"ends in \.toml"):
+    with pytest.raises(OptionError, match=r"ending in \.toml"):
         api.tune(tiny_task, "mlp", vary={"lr": [1e-3]}, out="best.txt", runs=tmp_path)
     with pytest.raises(UnknownNameError, match="did you mean 'fig6'"):
         api.run_study("fig66", runs=tmp_path)

@@ -86,7 +86,7 @@ def test_the_parser_finds_what_is_wrong() -> None:
     assert "No such command" in parse(["runn"])
     assert "No such option" in parse(["run", "--task", "beam6g", "--model", "mlp", "--quickly"])
     assert "is not one of" in parse(["leaderboard", "--format", "pdf"])
-    assert "Missing option '--model'" in parse(["run", "--task", "beam6g"])
+    assert "Missing option '--task'" in parse(["run", "mlp"])
 
 
 @pytest.mark.parametrize(("page", "line"), commands())
@@ -112,6 +112,8 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
     plain = list(itertools.takewhile(lambda word: not word.startswith("-"), words[1:]))
     settings = [parse_setting(value) for key, value in itertools.pairwise(words) if key == "--set"]
     entries = plain if words[0] == "tune" else [named.get("--model") or " ".join(plain)]
+    if entries == [""] and (page, line) in IN_SENTENCES:
+        return
     for entry in entries:
         resolve(named["--task"], entry, settings=settings)
 
