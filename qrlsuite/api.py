@@ -854,7 +854,7 @@ def run_study(
         subject = StudyWithLooks(study, folder)
         known = speed.known(subject.folder, folder)
         return study_runner.take_looks(
-            subject, study_runner.Session(subject.folder, where, known, budget, not progress, "call")
+            subject, study_runner.Session(subject.folder, where, known, limit, not progress, "call")
         )
     members = study_runner.select(study, from_mapping(options), models, names)
     speeds = speed.known(folder)
