@@ -65,6 +65,7 @@ def _mean_field_values(
             continue
         a, b = operation.qubits
         together = (matrix @ np.kron(states[a], states[b]) @ matrix.conj().T).reshape(2, 2, 2, 2)
+        together /= np.einsum("ijij", together)  # else the rounding of the trace grows with every gate
         states[a], states[b] = np.einsum("ikjk->ij", together), np.einsum("kikj->ij", together)
     return np.array([float(np.trace(_Z @ states[q]).real) for (q,) in circuit.measured])
 

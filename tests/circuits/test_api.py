@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, ansatz, api, expectations
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.plugins.circuits.native import cpu, program
@@ -56,10 +55,6 @@ def test_a_seed_makes_samples_repeatable(circuit, parameters):
 
     assert torch.equal(run(1), run(1))
     assert not torch.equal(run(1), run(2))
-
-
-def test_the_default_backend_is_registered():
-    assert "pennylane" in registry.load().names(specs.CircuitBackendSpec)
 
 
 ONES = np.ones((3, 2))

@@ -13,11 +13,13 @@ import torch
 from qiskit.providers.fake_provider import GenericBackendV2
 
 from qrlsuite import registry, specs
-from qrlsuite.circuit import GATES, Circuit, ansatz, create_backend, expectations
+from qrlsuite.circuit import Circuit, ansatz, create_backend, expectations
 from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError
 from qrlsuite.options import field_names
 from qrlsuite.plugins.circuits.qiskit import QiskitBackend
+from qrlsuite.testing.dense import expectation_values
+from tests.testing.broken import assert_all_good
 
 BACKENDS = registry.load().names(specs.CircuitBackendSpec)
 VARIANTS = [
@@ -73,99 +75,11 @@ def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate
     assert_close(got, expected, 1e-10)
 
 
-# An independent simulation: dense matrices, a few lines.
-
-
-def rotation(pauli, angle):
-    return np.cos(angle / 2) * np.eye(2) - 1j * np.sin(angle / 2) * pauli
-
-
-X, Y, Z = np.array([[0, 1], [1, 0]]), np.array([[0, -1j], [1j, 0]]), np.diag([1, -1])
-FIXED = {
-    "H": (X + Z) / np.sqrt(2), "X": X, "Y": Y, "Z": Z, "S": np.diag([1, 1j]), "T": np.diag([1, np.exp(0.25j * np.pi)]),
-    "CNOT": np.eye(4)[[0, 1, 3, 2]], "CZ": np.diag([1, 1, 1, -1]), "SWAP": np.eye(4)[[0, 2, 1, 3]],
-}  # fmt: skip
-
-
-def matrix(gate, angles):
-    if gate in FIXED:
-        return FIXED[gate]
-    if gate == "Rot":
-        return rotation(Z, angles[2]) @ rotation(Y, angles[1]) @ rotation(Z, angles[0])
-    if gate == "U3":
-        t, p, d = angles
-        phases = np.exp(1j * np.array([[0, d], [p, p + d]]))
-        return phases * [[np.cos(t / 2), -np.sin(t / 2)], [np.sin(t / 2), np.cos(t / 2)]]
-    return rotation({"RX": X, "RY": Y, "RZ": Z}[gate], angles[0])
-
-
-def dense(circuit, inputs, parameters):
-    """Expectation values (observables,) for one input; qubit 0 is the first axis of the state."""
-    state = np.zeros([2] * circuit.qubits, complex)
-    state[(0,) * circuit.qubits] = 1
-    for op in circuit:
-        angles = []
-        for a in op.angles:
-            term = 0.0 if a.input is None else inputs[a.input]
-            if a.scale is not None:
-                term *= parameters[a.scale.parameter].reshape(-1)[a.scale.index]
-            if a.weight is not None:
-                term += parameters[a.weight.parameter].reshape(-1)[a.weight.index]
-            angles.append(a.constant + term)
-        gate = np.asarray(matrix(op.gate, angles), complex)
-        if op.control is not None:
-            gate = np.block([[np.eye(2), np.zeros((2, 2))], [np.zeros((2, 2)), gate]])
-        k = len(op.qubits)
-        state = np.tensordot(gate.reshape([2] * 2 * k), state, (range(k, 2 * k), op.qubits))
-        state = np.moveaxis(state, range(k), op.qubits)
-    probability = np.abs(state) ** 2
-    sums = [
-        probability.sum(axis=tuple(i for i in range(circuit.qubits) if i != q)) for q in circuit.observables
-    ]
-    return np.array([p[0] - p[1] for p in sums])
-
-
-def every_gate():
-    """A circuit with every gate, controlled and not, constants, shared parameters, bare inputs, 2 of 3 qubits."""
-    circuit = Circuit(3, inputs=2)
-    w = circuit.parameter("w", (4, 6))
-    for q in range(3):
-        circuit.append("RY", q, 0.4 + q)
-    for k, (gate, signature) in enumerate(GATES.items()):
-        wires = [(k + i) % 3 for i in range(signature.wires)]
-        angles = [
-            w[0, 0] * circuit.input(0) + w[k % 4, i] if i % 2 == 0 else circuit.input(1) + 0.3
-            for i in range(signature.angles)
-        ]
-        circuit.append(gate, wires, *angles)
-        if signature.controllable:
-            circuit.append(gate, wires, *angles[:-1], w[k % 4, 3 + k % 3] if k else 0.7, control=(k + 2) % 3)
-    circuit.measure([2, 0])
-    return circuit
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_every_gate_against_dense_matrices(backend):
-    circuit = every_gate()
-    inputs, parameters, cotangent = draw(circuit, 2, 3)
-    got = evaluate(create_backend(backend, circuit), inputs, parameters, cotangent)
-    tolerance = 1e-10
-
-    def values(x, w):
-        return np.array([[dense(circuit, row, {"w": w[s]}) for row in x[s]] for s in range(len(x))])
-
-    x, w, c = inputs.numpy(), parameters["w"].numpy(), cotangent.numpy()
-    np.testing.assert_allclose(got[0], values(x, w), atol=tolerance)
-    step = 1e-5  # central differences: exact to about step^2
-    for which, gradient in ((x, got[1].numpy()), (w, got[2].numpy())):
-        for index in np.ndindex(which.shape):
-            kept = which[index]
-            which[index] = kept + step
-            up = values(x, w)
-            which[index] = kept - step
-            down = values(x, w)
-            which[index] = kept
-            assert gradient[index] == pytest.approx(((up - down) * c).sum() / (2 * step), abs=1e-6)
+@pytest.mark.parametrize(
+    ("backend", "options"), [("pennylane", {"device": "lightning.qubit"}), ("qiskit", {"estimator": "aer"})]
+)
+def test_devices_pass_the_checks_of_backends(backend, options):
+    assert "shots" in assert_all_good(registry.get(specs.CircuitBackendSpec, backend), options)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -183,21 +97,11 @@ def test_constants_may_stand_beside_variable_angles(backend, gate, control):
     w = parameters["w"].detach().numpy()[0]
 
     def total(w):
-        return dense(circuit, None, {"w": w}).sum()
+        return expectation_values(circuit, np.zeros(2), {"w": w}).sum()
 
     assert float(values.detach().sum()) == pytest.approx(total(w), abs=1e-10)
     slopes = [(total(w + step) - total(w - step)) / 2e-5 for step in 1e-5 * np.eye(3)]
     np.testing.assert_allclose(parameters["w"].grad[0].numpy(), slopes, atol=1e-8)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_rotation_by_the_input_gives_its_cosine(backend):
-    circuit = Circuit(2, inputs=1)
-    circuit.append("RX", 1, circuit.input(0))
-    x = torch.tensor([[0.0], [np.pi / 3], [np.pi / 2], [np.pi]], dtype=torch.float64)
-    values = expectations(circuit, x, {}, backend=backend)
-    expected = torch.tensor([[1.0, 1.0], [1.0, 0.5], [1.0, 0.0], [1.0, -1.0]])
-    assert_close([values], [expected.double()], 1e-12)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -317,33 +221,6 @@ def test_sampled_gradients_scatter_about_the_exact_gradient(backend, options):
         assert 0 < float((a - b).abs().max()) < 0.1
 
 
-@pytest.mark.parametrize(("backend", "options"), SAMPLING)
-def test_the_sampling_of_a_seed_depends_on_its_own_seed_alone(backend, options):
-    circuit = ansatz("cz", 2, 1)
-    inputs, parameters, cotangent = draw(circuit, 3, 2)
-    sampler = create_backend(backend, circuit, shots=50, **options)
-    together = evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 12, 2**62])
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(together, evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 12, 2**62]))
-    )
-    for s, seed in enumerate([11, 12, 2**62]):
-        one = {name: value[s : s + 1] for name, value in parameters.items()}
-        alone = evaluate(sampler, inputs[s : s + 1], one, cotangent[s : s + 1], seeds=[seed])
-        assert all(torch.equal(a[0], b[s]) for a, b in zip(alone, together))
-    other = evaluate(sampler, inputs, parameters, cotangent, seeds=[11, 13, 2**62])
-    assert torch.equal(other[0][[0, 2]], together[0][[0, 2]])
-    assert not torch.equal(other[0][1], together[0][1])
-
-
-@pytest.mark.parametrize(("backend", "options"), SAMPLING)
-def test_without_seeds_samples_are_fresh(backend, options):
-    circuit = ansatz("cz", 2, 1)
-    inputs, parameters, _ = draw(circuit, 1, 8)
-    sampler = create_backend(backend, circuit, shots=50, **options)
-    assert not torch.equal(sampler(inputs, parameters), sampler(inputs, parameters))
-
-
 @pytest.mark.parametrize(
     ("backend", "where", "argument"),
     [
@@ -383,35 +260,24 @@ def test_sampling_leaves_global_random_numbers_alone():
         assert all(np.array_equal(a, b) for a, b in zip(before, state()))
 
 
-# What "auto" chooses.
-
-
 @pytest.mark.parametrize(
-    ("options", "method"),
+    ("backend", "options", "chosen"),
     [
-        ({}, "backprop"),
-        ({"shots": 10}, "parameter-shift"),
-        ({"device": "lightning.qubit"}, "adjoint"),
-        ({"device": "lightning.qubit", "shots": 10}, "parameter-shift"),
-        ({"device": "default.mixed"}, "parameter-shift"),
-        ({"diff_method": "parameter-shift"}, "parameter-shift"),
+        ("pennylane", {}, "backprop"),
+        ("pennylane", {"shots": 10}, "parameter-shift"),
+        ("pennylane", {"device": "lightning.qubit"}, "adjoint"),
+        ("pennylane", {"device": "lightning.qubit", "shots": 10}, "parameter-shift"),
+        ("pennylane", {"device": "default.mixed"}, "parameter-shift"),
+        ("pennylane", {"diff_method": "parameter-shift"}, "parameter-shift"),
+        ("qiskit", {}, "adjoint"),
+        ("qiskit", {"estimator": "aer"}, "adjoint"),
+        ("qiskit", {"shots": 10}, "parameter-shift"),
+        ("qiskit", {"estimator": "aer", "noise_model": "depolarizing"}, "parameter-shift"),
     ],
 )
-def test_pennylane_differentiates_by_the_fastest_way_that_the_device_has(options, method):
-    assert create_backend("pennylane", ansatz("cz", 2, 1), **options).diff_method == method
-
-
-@pytest.mark.parametrize(
-    ("options", "gradient"),
-    [
-        ({}, "adjoint"),
-        ({"estimator": "aer"}, "adjoint"),
-        ({"shots": 10}, "parameter-shift"),
-        ({"estimator": "aer", "noise_model": "depolarizing"}, "parameter-shift"),
-    ],
-)
-def test_qiskit_differentiates_by_the_adjoint_method_where_it_is_exact(options, gradient):
-    assert create_backend("qiskit", ansatz("cz", 2, 1), **options).gradient == gradient
+def test_gradients_are_by_the_fastest_way_that_the_device_has(backend, options, chosen):
+    made = create_backend(backend, ansatz("cz", 2, 1), **options)
+    assert getattr(made, "diff_method" if backend == "pennylane" else "gradient") == chosen
 
 
 # What cannot be done.

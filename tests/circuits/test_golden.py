@@ -24,32 +24,22 @@ def largest_error(case, dtype, **backend):
     )
 
 
-def test_there_are_eighteen_cases():
-    assert len(CASES) == 18
-    assert len(SMALL) == 9
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_pennylane_in_float64(name):
-    assert largest_error(CASES[name], torch.float64, backend="pennylane") < 1e-10
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_pennylane_in_float32(name):
-    assert largest_error(CASES[name], torch.float32, backend="pennylane") < 1e-5
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_pennylane_by_parameter_shift(name):
-    assert (
-        largest_error(CASES[name], torch.float64, backend="pennylane", diff_method="parameter-shift") < 1e-10
-    )
-
-
-@pytest.mark.parametrize("name", SMALL)
-@pytest.mark.parametrize("device", ["lightning.qubit", "default.mixed"])
-def test_other_devices_in_float64(name, device):
-    assert largest_error(SMALL[name], torch.float64, backend="pennylane", device=device) < 1e-10
+@pytest.mark.parametrize(
+    ("names", "dtype", "tolerance", "options"),
+    [
+        (CASES, torch.float64, 1e-10, {"backend": "pennylane"}),
+        (CASES, torch.float32, 1e-5, {"backend": "pennylane"}),
+        (CASES, torch.float64, 1e-10, {"backend": "pennylane", "diff_method": "parameter-shift"}),
+        (SMALL, torch.float64, 1e-10, {"backend": "pennylane", "device": "lightning.qubit"}),
+        (SMALL, torch.float64, 1e-10, {"backend": "pennylane", "device": "default.mixed"}),
+        (SMALL, torch.float64, 1e-10, {"backend": "qiskit"}),
+        (SMALL, torch.float32, 1e-5, {"backend": "qiskit"}),
+    ],
+)
+def test_every_device_gives_the_released_numbers(names, dtype, tolerance, options):
+    assert (len(CASES), len(SMALL)) == (18, 9)
+    errors = {name: largest_error(CASES[name], dtype, **options) for name in names}
+    assert max(errors.values()) < tolerance, errors
 
 
 @pytest.mark.parametrize("name", sorted(set(CASES) - set(SMALL))[::4])
@@ -72,9 +62,3 @@ def test_qiskit_on_four_qubits(name):
     expected = torch.tensor(case["grad_inputs"][0], dtype=torch.float64)
     assert float((inputs.grad[0] - expected).abs().max()) < 1e-10
     assert float(inputs.grad[1:].abs().max()) == 0
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_qiskit(name):
-    assert largest_error(SMALL[name], torch.float64, backend="qiskit") < 1e-10
-    assert largest_error(SMALL[name], torch.float32, backend="qiskit") < 1e-5

@@ -23,6 +23,7 @@ from qrlsuite.circuit.description import GATES
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import NativeBackend, dense
 from qrlsuite.plugins.circuits.native.program import HADAMARD, JOINED, PERMUTE, ROTATE, SIGN, compile_circuit
+from qrlsuite.testing.dense import expectation_values
 from tests.conftest import HANGS, golden
 
 GOLDEN = golden("vqc")
@@ -59,62 +60,6 @@ def test_the_released_codes_numbers(case: dict[str, object], dtype: torch.dtype,
     for name, got in (("inputs", x), *parameters.items()):
         atol = 1e-10 if exact else 1e-4
         np.testing.assert_allclose(got.grad[0], case[f"grad_{name}"], rtol=0, atol=atol, err_msg=name)
-
-
-MATRICES = {
-    "H": np.array([[1, 1], [1, -1]]) / math.sqrt(2),
-    "X": np.array([[0, 1], [1, 0]]),
-    "Y": np.array([[0, -1j], [1j, 0]]),
-    "Z": np.diag([1, -1]),
-    "S": np.diag([1, 1j]),
-    "T": np.diag([1, np.exp(0.25j * math.pi)]),
-    "CNOT": np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]]),
-    "CZ": np.diag([1, 1, 1, -1]),
-    "SWAP": np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]),
-}
-
-
-def matrix(gate: str, angles: list[float]) -> np.ndarray:
-    """The definition of every gate, written out once more."""
-    if gate in MATRICES:
-        return MATRICES[gate]
-    half = [a / 2 for a in angles]
-    if gate == "RX":
-        return np.array(
-            [[math.cos(half[0]), -1j * math.sin(half[0])], [-1j * math.sin(half[0]), math.cos(half[0])]]
-        )
-    if gate == "RY":
-        return np.array([[math.cos(half[0]), -math.sin(half[0])], [math.sin(half[0]), math.cos(half[0])]])
-    if gate == "RZ":
-        return np.diag([np.exp(-1j * half[0]), np.exp(1j * half[0])])
-    if gate == "Rot":
-        return matrix("RZ", [angles[2]]) @ matrix("RY", [angles[1]]) @ matrix("RZ", [angles[0]])
-    t, p, d = angles
-    c, s = math.cos(t / 2), math.sin(t / 2)
-    return np.array([[c, -np.exp(1j * d) * s], [np.exp(1j * p) * s, np.exp(1j * (p + d)) * c]])
-
-
-def by_linear_algebra(circuit: Circuit, x: np.ndarray, values: dict[str, np.ndarray]) -> np.ndarray:
-    """One sample by dense matrices on a state of shape (2,) * n."""
-    n = circuit.qubits
-    state = np.zeros((2,) * n, complex)
-    state[(0,) * n] = 1
-    for operation in circuit:
-        angles = []
-        for a in operation.angles:
-            scale = 1.0 if a.scale is None else values[a.scale.parameter].ravel()[a.scale.index]
-            weight = 0.0 if a.weight is None else values[a.weight.parameter].ravel()[a.weight.index]
-            angles.append(a.constant + (0.0 if a.input is None else scale * x[a.input]) + weight)
-        u = matrix(operation.gate, angles)
-        if operation.control is not None:
-            u = np.block([[np.eye(2), np.zeros((2, 2))], [np.zeros((2, 2)), u]])
-        wires = operation.qubits
-        u = u.reshape((2,) * (2 * len(wires)))
-        state = np.tensordot(u, state, axes=(range(len(wires), 2 * len(wires)), wires))
-        state = np.moveaxis(state, range(len(wires)), wires)
-    probability = np.abs(state) ** 2
-    marginals = [probability.sum(axis=tuple(k for k in range(n) if k != q)) for q in circuit.observables]
-    return np.array([m[0] - m[1] for m in marginals])
 
 
 @st.composite
@@ -158,7 +103,7 @@ def random_values(
 def test_any_circuit_equals_linear_algebra(circuit: Circuit) -> None:
     x, parameters = random_values(circuit, 1, 2, torch.float64)
     values = {name: p[0].numpy() for name, p in parameters.items()}
-    expected = [by_linear_algebra(circuit, sample, values) for sample in x[0].numpy()]
+    expected = [expectation_values(circuit, sample, values) for sample in x[0].numpy()]
     for path in PATHS:
         got = run(NativeBackend(circuit), path, x, parameters)[0]
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12, err_msg=path)
@@ -186,15 +131,6 @@ def test_any_circuits_gradients_equal_pennylanes(circuit: Circuit) -> None:
     for other in results[1:]:
         for mine, theirs in zip(other, results[0]):
             torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("gate", ["rot", "u3"])
-def test_gradients_are_those_of_finite_differences(gate: str) -> None:
-    circuit = ansatz("iqp", qubits=3, layers=2, gate=gate)
-    x, parameters = random_values(circuit, 2, 3, torch.float64)
-    backend = NativeBackend(circuit)
-    leaves = [x.requires_grad_(), *(p.requires_grad_() for p in parameters.values())]
-    assert torch.autograd.gradcheck(lambda x, *p: backend(x, dict(zip(parameters, p))), leaves)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)

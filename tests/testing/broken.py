@@ -86,8 +86,8 @@ def assert_breaks(spec: Spec, rule: str, message: str, also: frozenset[str] = fr
     assert broken.keys() == {rule} | also, f"also broken: {broken.keys() - {rule}}"
 
 
-def assert_all_good(spec: Spec) -> set[str]:
+def assert_all_good(spec: Spec, settings: Mapping[str, Any] | None = None) -> set[str]:
     """Assert that no rule is broken; return the rules."""
-    findings = own_rules(spec)
+    findings = own_rules(spec, settings)
     assert all(finding.ok for finding in findings), findings
     return {finding.rule for finding in findings}
