@@ -31,7 +31,7 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     num_envs / len(streams), in lane order, so that an episode never depends on lanes of another stream.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
     streams: list[np.random.Generator]
     autoreset: bool = True
     """False in validation: an ended lane need not be reset; stepping it on is allowed and means nothing."""

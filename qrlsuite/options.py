@@ -24,6 +24,12 @@ from qrlsuite.errors import OptionError, PluginError, nearest
 Values = dict[str, Any]
 
 
+class Table(pydantic.BaseModel):
+    """A table of a TOML file: unknown keys are refused, and nothing changes after reading."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
 @dataclass(frozen=True)
 class Since:
     """Marks an option that was added to a released options class, with the version that brought it.

@@ -105,7 +105,7 @@ class Planted(gymnasium.Env[NDArray[np.float32], np.int64]):
     """(steps, 2): what is shown in this episode."""
     classes: NDArray[np.int64]
     """(steps,): the right answers."""
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": []}
 
     def __init__(self, steps: int = 20) -> None:
         self.options: PlantedOptions = option_words.build(

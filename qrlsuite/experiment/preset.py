@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError, TaskError, nearest
@@ -23,11 +23,7 @@ TUNING_SEEDS = 1_000_000
 """Seeds from here on are for tuning; protocol seeds lie below."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TuningRecord(_Table):
+class TuningRecord(options.Table):
     """How settings were found, and what it took; None is what is not known."""
 
     task: Annotated[str | None, Field(max_length=80)] = None
@@ -87,7 +83,7 @@ class EntryTuning(TuningRecord):
         return self.model_dump(mode="json", exclude=unknown)  # 0.1.0 reads records without these keys only
 
 
-class PresetFile(_Table):
+class PresetFile(options.Table):
     """A whole preset file."""
 
     format_version: Literal[1]

@@ -10,8 +10,6 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
     model_serializer,
@@ -26,18 +24,14 @@ from qrlsuite.statistics.grid import Grid
 FORMAT_VERSION = 1
 
 
-class _TaskTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class EnvironmentSection(_TaskTable):
+class EnvironmentSection(options.Table):
     """Which environment, with which options."""
 
     name: Annotated[str, Field(description="a registered environment")]
     options: Annotated[dict[str, Any], Field(description="its options; absent ones take their defaults")] = {}
 
 
-class ProtocolSection(_TaskTable):
+class ProtocolSection(options.Table):
     """How much each seed interacts, and how it is validated."""
 
     seeds: Annotated[int, Field(ge=1, description="independent runs of a complete entry")] = 100
@@ -67,7 +61,7 @@ class ProtocolSection(_TaskTable):
         return self.interactions // self.environments
 
 
-class ScoreSection(_TaskTable):
+class ScoreSection(options.Table):
     """How an episode's score in [0, 1] comes about."""
 
     source: Annotated[
@@ -86,7 +80,7 @@ class ScoreSection(_TaskTable):
     ] = None
 
 
-class Cell(_TaskTable):
+class Cell(options.Table):
     """One cell of a ranking grid: a threshold, relative (`epsilon`) or absolute, and a probability."""
 
     epsilon: Annotated[float | None, Field(ge=0, lt=1)] = None
@@ -94,7 +88,7 @@ class Cell(_TaskTable):
     delta: Annotated[float, Field(gt=0, le=1)]
 
 
-class RankingSection(_TaskTable):
+class RankingSection(options.Table):
     """On which cells entries are compared."""
 
     epsilons: Annotated[
@@ -160,7 +154,7 @@ class RankingSection(_TaskTable):
 Family = Literal["all", "classical", "quantum"]
 
 
-class TaskFile(_TaskTable):
+class TaskFile(options.Table):
     """A whole task file."""
 
     format_version: Literal[1]

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 import qrlsuite
 from qrlsuite import options, registry, specs
@@ -128,8 +128,7 @@ class Estimate:
         return self.seconds * epochs / self.within, self.seconds * epochs * self.within
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Row(options.Table):
     environment: str
     algorithm: str
     model: str
@@ -140,13 +139,12 @@ class _Row(BaseModel):
     source: Annotated[str, Field(description="where the seconds are from, if not from the benchmark")] = ""
 
 
-class SpeedFile(BaseModel):
+class SpeedFile(options.Table):
     """A file of reference speeds: where they were measured, and one row per measurement.
 
     Without `calibration`, the speeds are taken as they are on every machine.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     format_version: Literal[1]
     machine: str
     calibration: Annotated[float | None, Field(gt=0, lt=1e9, description="of that machine, in seconds")] = (

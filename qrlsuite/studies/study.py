@@ -16,14 +16,14 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 import tomli_w
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.options import Setting
+from qrlsuite.options import Setting, Table
 from qrlsuite.results.text import counted
 from qrlsuite.studies.sizes import nearest_size
 
@@ -32,11 +32,7 @@ LARGEST = 1000
 """Entries that a study may have."""
 
 
-class _StudyTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class MatchSection(_StudyTable):
+class MatchSection(Table):
     """An option that is computed: the value whose parameter count is nearest to that of another group's entry."""
 
     option: Annotated[
@@ -45,7 +41,7 @@ class MatchSection(_StudyTable):
     group: Annotated[str, Field(description="the group of entries whose parameter counts are matched")]
 
 
-class EntriesSection(_StudyTable):
+class EntriesSection(Table):
     """A group of entries: every combination of its tasks, models and grid."""
 
     name: Annotated[
@@ -78,14 +74,14 @@ class EntriesSection(_StudyTable):
     ] = None
 
 
-class Question(_StudyTable):
+class Question(Table):
     """What a study with looks asks, and the pairs of entries whose verdicts answer it."""
 
     text: Annotated[str, Field(min_length=1, max_length=200)]
     pairs: Annotated[list[tuple[str, str]], Field(min_length=1)]
 
 
-class LooksSection(_StudyTable):
+class LooksSection(Table):
     """When entries are compared, at which error and on which seeds: fixed once the first seed is begun."""
 
     looks: Annotated[list[int], Field(min_length=1, description="seeds of each entry at each look")] = [
@@ -128,7 +124,7 @@ class LooksSection(_StudyTable):
         return range(self.first_seed, self.first_seed + self.looks[-1])
 
 
-class DeploymentSection(_StudyTable):
+class DeploymentSection(Table):
     """A circuit backend on which trained agents act, with several values of one of its options."""
 
     backend: Annotated[str, Field(min_length=1)]
@@ -141,7 +137,7 @@ class DeploymentSection(_StudyTable):
         return {**self.options, self.vary: value}
 
 
-class EvaluationSection(_StudyTable):
+class EvaluationSection(Table):
     """For a picture of episodes: how many of each entry's runs play how many episodes."""
 
     best: Annotated[int, Field(ge=1)] = 10
@@ -151,7 +147,7 @@ class EvaluationSection(_StudyTable):
     ] = None
 
 
-class PictureSection(_StudyTable):
+class PictureSection(Table):
     """A picture of the study's entries."""
 
     name: Annotated[Name, Field(description="part of the file's name")] = "picture"
@@ -161,7 +157,7 @@ class PictureSection(_StudyTable):
     evaluation: EvaluationSection | None = None
 
 
-class StudyFile(_StudyTable):
+class StudyFile(Table):
     """A whole study file."""
 
     format_version: Literal[1]

@@ -28,22 +28,20 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
-from qrlsuite.options import Setting
+from qrlsuite.options import Setting, Table
 
 FOLDER = "search"
 Point = dict[str, Any]
 """A value for every dimension, by its full name (`algorithm.lr`)."""
 
 
-class Range(BaseModel):
+class Range(Table):
     """All numbers from `low` to `high`: integers if both are."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     low: int | FiniteFloat
     high: int | FiniteFloat
@@ -81,10 +79,8 @@ Space = tuple[Dimension, ...]
 Tables = dict[str, dict[Literal["all", "classical", "quantum"], dict[str, list[Any] | Range]]]
 
 
-class GridFile(BaseModel):
+class GridFile(Table):
     """A whole grid file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format_version: Literal[1]
     summary: str = ""

@@ -70,7 +70,7 @@ def put(store: EntryStore, seed: int, epochs: int, start: int) -> None:
 class Scripted:
     """An engine whose runs are known: each reaches the goal when `STARTS` says."""
 
-    trained: list[tuple[str, int, int]] = []  # noqa: RUF012 - emptied by the fixture
+    trained: list[tuple[str, int, int]] = []
     interrupt_at = -1
     """The group before which Ctrl-C comes."""
 

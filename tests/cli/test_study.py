@@ -69,7 +69,7 @@ settings = { by = "width" }
 class Here:
     """An engine that trains in this process: quick, where starting processes would take most of the time."""
 
-    trained: list[tuple[str, tuple[int, ...]]] = []  # noqa: RUF012 - emptied by the fixture
+    trained: list[tuple[str, tuple[int, ...]]] = []
 
     def __init__(self, options: None = None) -> None:
         pass
@@ -91,7 +91,7 @@ class Here:
 class Queue(Here):
     """An engine that hands work over and leaves."""
 
-    waiting: dict[str, set[int]] = {}  # noqa: RUF012 - emptied by the fixture
+    waiting: dict[str, set[int]] = {}
 
     def queued(self, store: EntryStore) -> set[int]:
         return self.waiting.get(store.path.name, set())

@@ -239,7 +239,7 @@ class Hop(gymnasium.Env[Any, Any]):
 
 
 class LanesShareAList(Hop):
-    episodes: list[int] = []  # noqa: RUF012
+    episodes: list[int] = []
 
     def draw(self) -> int:
         self.episodes.append(super().draw())

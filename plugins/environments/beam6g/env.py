@@ -105,7 +105,7 @@ class BeamManagement6G(gymnasium.Env[NDArray[np.float32], np.int64]):
     """
 
     # Gymnasium's checker tries every declared mode, so a window is declared where one can be shown.
-    metadata = {  # noqa: RUF012
+    metadata = {
         "render_modes": [mode for mode in RENDER_MODES if mode != "human" or find_spec("pygame")],
         "render_fps": 20,
     }
