@@ -68,7 +68,7 @@ def _speeds(spec: specs.StudySpec) -> None:
 
 def _show(spec: specs.StudySpec) -> None:
     """Have the command show the file: what pictures there are is known to the part that draws them."""
-    command = [sys.executable, "-W", "ignore", "-m", "qrlsuite", "study", "show", spec.path, "--json"]
+    command = [sys.executable, "-W", "ignore", "-m", "qrlsuite", "show", "study", spec.path, "--json"]
     with tempfile.TemporaryDirectory() as runs:
         done = subprocess.run(
             [*command, "--runs", runs], capture_output=True, text=True, check=False, env=environment()
