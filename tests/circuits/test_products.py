@@ -170,7 +170,7 @@ def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
     import dataclasses
 
     single = dataclasses.replace(spec, products=False)
-    monkeypatch.setattr(registry, "circuit_backend", lambda name: single)
+    monkeypatch.setattr(registry, "get", lambda kind, name: single)
     with pytest.raises(OptionError, match="'pennylane' measures Pauli Z of single qubits"):
         create_backend("pennylane", circuit)
     monkeypatch.undo()
