@@ -35,8 +35,12 @@ PLUGIN = """
 from qrlsuite import hookimpl, specs
 
 @hookimpl
-def register(register):
+def register_ansatzes(register):
     register(specs.AnsatzSpec("own", "a circuit", "own_circuit:Options", "own_circuit:build"))
+
+
+@hookimpl
+def register_models(register):
     register(specs.ModelSpec("line", "a layer", "classical", "own_model:Options", "own_model:build"))
 """
 CIRCUIT = '''
@@ -344,7 +348,7 @@ kind = "curves"
 def test_searches_studies_and_python_stop_as_well(author: Author) -> None:
     (author.folder / "lines.toml").write_text(STUDY)
     budget = ("--seeds", "1", "--epochs", "1", "--workers", "1")
-    tune = ("tune", "--task", str(author.task), "--model", "line", "--vary", "lr=1e-2,1e-3", *budget)
+    tune = ("tune", "line", "--task", str(author.task), "--vary", "lr=1e-2,1e-3", *budget)
     study = ("study", "run", "lines.toml", *budget)
     for words in (tune, study):
         assert (done := author.command(*words)).returncode == 0, done.stderr
@@ -492,9 +496,9 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
         codes.set_aside(runs, store, now)
     claim.release()
     edit_json(folder / "entry.json", plan="1a2b3c4d5e6f7a8b")
-    with pytest.raises(StoreError, match="write another plan"):
+    with pytest.raises(StoreError, match="write another study"):
         codes.set_aside(runs, store, now)
-    with pytest.raises(StoreError, match="Restore that code, or write another plan"):
+    with pytest.raises(StoreError, match="Restore that code, or write another study"):
         codes.require(store, now)
     edit_json(folder / "entry.json", plan=None)
     submitted = store.path / "slurm" / "submitted.json"

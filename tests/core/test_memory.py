@@ -131,10 +131,10 @@ def test_it_is_refused_before_an_entry_s_folder_is_made(
 ) -> None:
     monkeypatch.setattr(memory, "available", lambda: GB)
     runs = tmp_path / "runs"
-    settings = ["--task", "beam6g", "--model", "mlp", "--runs", str(runs), "--seeds", "4"]
+    where = ["--task", "beam6g", "--runs", str(runs), "--seeds", "4"]
     for words in (
-        ["run", *settings, "--set", "width=4096"],
-        ["tune", *settings, "--set", "width=4096", "--vary", "lr=[1e-2, 1e-3]"],
+        ["run", "mlp", "width=4096", *where],
+        ["tune", "mlp width=4096", *where, "--vary", "lr=[1e-2, 1e-3]"],
     ):
         said = CliRunner().invoke(build(), words)
         assert isinstance(said.exception, OptionError)
