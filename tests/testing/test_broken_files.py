@@ -133,7 +133,7 @@ STUDIES = [
     edit("format", r"^studies.toml: not valid TOML", "[[pictures]]", "[[pictures]"),
     edit("format", r"no group 'dep'; did you mean 'deep'", '["mlp", "deep"]', '["mlp", "dep"]'),
     edit("format", r"^studies.toml is not text in UTF-8, as TOML is", "Two sizes", "Zwei Größen"),
-    edit("says what is registered", r"as 'small', .* name = 'tiny': `qrlsuite study", '"small"', '"tiny"'),
+    edit("says what is registered", r"as 'small', .* name = 'tiny': `qrlsuite list studies`", '"small"', '"tiny"'),
     edit("says what is registered", r"with the summary .* read it from the file", "Two sizes", "Sizes"),
     edit("entries", r"group 'mlp': unknown task 'beam5g'; did you mean 'beam6g", '"beam6g"', '"beam5g"'),
     edit("entries", r"group 'mlp': unknown model 'mpl'; did you mean 'mlp'", '"mlp"\ngrid', '"mpl"\ngrid'),
