@@ -87,14 +87,21 @@ def judge(section: Section) -> Judgement:
     entries, horizon, board = [row.entry for row in section.rows], section.horizon, section.pairs
     grid = ranking_of(entries).grid
     curves = tuple(learning_curves(entry).cut(horizon) for entry in entries)
-    evidence = {(i, curve.n_runs): Evidence(curve, grid, curve.n_runs) for i, curve in enumerate(curves)}
     places = [board.names.index(entry.name) for entry in entries]
+    evidence: dict[tuple[int, int], Evidence] = {}
+
+    def rest_on(place: int, n_runs: int) -> None:
+        if (place, n_runs) not in evidence:
+            known = board.evidence.get((places[place], n_runs))
+            evidence[place, n_runs] = known or Evidence(curves[place], grid, n_runs)
+
+    for place, curve in enumerate(curves):
+        rest_on(place, curve.n_runs)
     pairs = []
     for i, j in itertools.combinations(range(len(curves)), 2):
         n_runs = min(curves[i].n_runs, curves[j].n_runs)
         for place in (i, j):
-            if (place, n_runs) not in evidence:
-                evidence[place, n_runs] = Evidence(curves[place], grid, n_runs)
+            rest_on(place, n_runs)
         nothing = bool(board.not_reached[[places[i], places[j]]].all())
         pairs.append(Pair(i, j, n_runs, _cells(board, places[i], places[j]), nothing))
     return Judgement(grid, horizon, curves, tuple(pairs), evidence)

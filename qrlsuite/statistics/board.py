@@ -6,8 +6,8 @@ per number of runs and horizon that its pairs need, and a rule that can judge on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Board:
         Shape (M, M): whether both have at least 20 runs.
     not_reached:
         Shape (M,): whether S_hat is the horizon in every cell.
+    evidence:
+        By entry and number of runs, what the verdicts rest on, where all entries were judged at one horizon.
     """
 
     names: tuple[str, ...]
@@ -46,6 +48,7 @@ class Board:
     capped: BoolArray
     decided: BoolArray
     not_reached: BoolArray
+    evidence: Mapping[tuple[int, int], Evidence] = field(default_factory=dict, repr=False)
 
     @property
     def better_cells(self) -> IntArray:
@@ -98,10 +101,13 @@ def outperformance(
     np.fill_diagonal(decided, False)
     todo = np.triu(decided)
     _check_horizons(entries, horizon, todo, shared_ends)
+    kept: dict[tuple[int, int], Evidence] = {}
     for n_runs, end in sorted(set(zip(shared_runs[todo].tolist(), shared_ends[todo].tolist()))):
         group = todo & (shared_runs == n_runs) & (shared_ends == end)
         members = np.flatnonzero(group.any(axis=0) | group.any(axis=1)).tolist()
         evidence = {i: Evidence(entries[i].cut(end), grid, n_runs, resampling) for i in members}
+        if len(set(ends.tolist())) == 1:
+            kept |= {(i, n_runs): each for i, each in evidence.items()}
         for first in np.flatnonzero(group.any(axis=1)).tolist():
             others = np.flatnonzero(group[first]).tolist()
             signs, capped = judge_cells(chosen, evidence[first], [evidence[other] for other in others], end)
@@ -115,6 +121,7 @@ def outperformance(
         capped=all_capped,
         decided=decided,
         not_reached=np.array(reached_nothing, dtype=bool),
+        evidence=kept,
     )
 
 

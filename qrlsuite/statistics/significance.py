@@ -88,6 +88,7 @@ class Evidence:
         self.n_runs = whole(n_runs, "n_runs", at_least=1)
         self.resampling = resampling or Resampling()
         self._intervals: dict[tuple[float, float], FloatArray] = {}
+        self._center: FloatArray | None = None
         if grid.epsilons is not None:
             entry.require_unit_interval()
         if n_runs > entry.n_runs:
@@ -103,18 +104,19 @@ class Evidence:
         """S_hat of every resample in epochs, shape (E, D, R)."""
         return self._draw()
 
-    @functools.cached_property
+    @property
     def point(self) -> FloatArray:
         """The estimate in environment steps, shape (E, D).
 
         S_hat where `n_runs` is all the entry has; else the median of `epoch_draws`, because S_hat at another
         number of runs is another quantity.
         """
-        if self.n_runs == self.entry.n_runs:
+        if self._center is None and self.n_runs == self.entry.n_runs:
             return complexity(self.entry.values, self.grid, self.steps_per_epoch).astype(np.float64)
-        return (
-            central_epochs(self.entry.values, self.grid, self.epoch_draws, self.n_runs) * self.steps_per_epoch
-        )
+        if self._center is None:
+            self.interval()
+        assert self._center is not None
+        return self._center * self.steps_per_epoch
 
     def interval(self, percentiles: tuple[float, float] = PERCENTILES) -> FloatArray:
         """Return the percentile interval in steps, widened to contain `point`, shape (E, D, 2)."""
@@ -122,8 +124,8 @@ class Evidence:
         if key not in self._intervals:
             # on a board of hundreds the draws of an entry are not kept unless a rule asks for them
             drawn = self.epoch_draws if "epoch_draws" in self.__dict__ else self._draw()
-            center = central_epochs(self.entry.values, self.grid, drawn, self.n_runs)
-            self._intervals[key] = widened_percentiles(drawn, center, key, self.steps_per_epoch)
+            self._center = central_epochs(self.entry.values, self.grid, drawn, self.n_runs)
+            self._intervals[key] = widened_percentiles(drawn, self._center, key, self.steps_per_epoch)
         return self._intervals[key]
 
     def _draw(self) -> NDArray[np.int32]:
