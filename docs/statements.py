@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite import api
-from qrlsuite.leaderboard import across
-from qrlsuite.leaderboard.board import ranking_of
+from qrlsuite.leaderboard.ranked import ranking_of
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.leaderboard.times import percent
@@ -301,7 +300,7 @@ def slopes() -> tuple[str, str, str]:
 def against(count: int) -> tuple[list[int], list[str], Counter[Verdict]]:
     """Return signs, texts and the paper's cells of 10 qubits against each network, across a count's placements."""
     tasks = [f"beam6g-a{count}-{place}" for place in range(5)]
-    board = across.compare(across.collected(Path("none"), tasks, published=True)[0], tasks).results
+    board = api.board(tasks, runs="none", published=True).sections[0].results
     circuit = board.names.index(f"ddqn {MODELS[3]}")
     signs, texts, verdicts = [], [], Counter[Verdict]()
     for model in MODELS[:3]:

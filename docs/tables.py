@@ -17,7 +17,7 @@ from pathlib import Path
 from statements import MODELS, each_model, load
 
 from qrlsuite import api
-from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published_studies import PublishedStudy
 from qrlsuite.results.text import hours_text, steps_text
@@ -108,7 +108,7 @@ def tiers(task: str) -> Rows:
 
 def executions(task: str) -> Rows:
     """The entries that execute circuits, by what these cost."""
-    [section] = api.costs(task, by="executions", published=True, runs="none").sections
+    [section] = api.board(task, by="executions", published=True, runs="none").sections
     kept = replace(section, rows=tuple(row for row in section.rows if not row.price.problem))
     return _chosen(kept.sheet(), kept.columns()[:5])
 

@@ -8,22 +8,28 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard.board import learning_curves, ranking_of
-from qrlsuite.leaderboard.sheet import Sheet
-from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard import costs
+from qrlsuite.leaderboard.ranked import learning_curves, ranking_of
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import ALPHA
-from qrlsuite.results.text import steps_text
-from qrlsuite.statistics import MIN_RUNS, AcrossTasks, across_tasks, horizon_shares, rliable_arrays
+from qrlsuite.results.text import counted, steps_text
+from qrlsuite.statistics import (
+    MIN_RUNS,
+    AcrossTasks,
+    LearningCurves,
+    across_tasks,
+    horizon_shares,
+    rliable_arrays,
+)
 from qrlsuite.statistics.grid import FloatArray
 
 
@@ -53,12 +59,13 @@ class Shares:
 
 
 @dataclass(frozen=True, eq=False)
-class AcrossBoard:
-    """The result of `compare`."""
+class AcrossSection:
+    """The result of `section`."""
 
     shares: Shares
     results: AcrossTasks
     alpha: float
+    by: str = "steps"
 
     @property
     def title(self) -> str:
@@ -67,17 +74,15 @@ class AcrossBoard:
             f"{task} ({steps_text(horizon)} steps)"
             for task, horizon in zip(self.shares.tasks, self.shares.horizons)
         )
-        return f"across {', '.join(parts)}: time below threshold as a share of the horizon"
+        what = "time below threshold as a share of the horizon"
+        if self.by != "steps":
+            what = f"{self.by} below threshold as a share of what the cheapest entry spent"
+        return f"across {', '.join(parts)}: {what}"
 
     @property
     def order(self) -> tuple[int, ...]:
         """Indices in `results` by mean, least first."""
         return self.results.order
-
-    @property
-    def refused(self) -> tuple[str, ...]:
-        """Lines about entries that were left out, and why."""
-        return self.shares.refused
 
     def columns(self) -> tuple[str, ...]:
         """Return the heads of the table that `cells` fills."""
@@ -96,7 +101,9 @@ class AcrossBoard:
         """Return the comparison as a table; `explain` adds all its notes."""
         rows = [self.cells(place) for place in range(len(self.order))]
         words = ("entry", "needs less than", "needs more than")
-        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, "across", explain)
+        return Sheet.of(
+            self.title, self.columns(), rows, self.notes(), words, "across", explain, "Across tasks"
+        )
 
     def cells(self, place: int) -> tuple[str, ...]:
         """Return the row at a place of the order as text."""
@@ -148,7 +155,6 @@ class AcrossBoard:
                 for row in results.adjusted[np.ix_(order, order)]
             ],
             "better": results.better[np.ix_(order, order)].tolist(),
-            "refused": list(self.refused),
         }
 
     def flat(self) -> list[dict[str, object]]:
@@ -189,42 +195,25 @@ class AcrossBoard:
 
 
 def collected(
-    runs: Path,
-    tasks: Sequence[str],
-    names: Iterable[str] = (),
-    published: bool = False,
-    horizon: int | None = None,
-    min_seeds: int = 1,
+    tasks: Sequence[str], select: Callable[[str], tuple[list[EntryResults], list[str]]]
 ) -> tuple[list[EntryResults], list[str]]:
-    """Read the entries of several tasks.
-
-    Parameters
-    ----------
-    tasks:
-        Two or more.
-    names, published, horizon, min_seeds:
-        As for `qrlsuite.leaderboard.shelf.collect.select`; every name must be found on every task.
+    """Read the entries of several tasks, every one of which must have some; `select` reads one task's.
 
     Raises
     ------
     OptionError
-        If there are fewer than two tasks, or one is named twice.
+        If one is named twice.
     UnknownNameError
-        If a task is unknown or without results, or a name is not found on one.
+        If a task has no results.
     """
     if len(set(tasks)) < len(tasks):
         twice = next(task for task in tasks if tasks.count(task) > 1)
-        raise OptionError(f"--across: task {twice} is named twice")
-    if len(tasks) < 2:
-        raise OptionError(f"--across {' '.join(tasks)}: name two tasks or more; `qrlsuite runs` lists them")
-    collect.check_tasks(runs, tasks, published)
+        raise OptionError(f"--task: {twice} is named twice")
     selected, refused = list[EntryResults](), list[str]()
     for task in tasks:
-        of_task, left_out = collect.select(runs, [task], names, published, horizon, min_seeds)
+        of_task, left_out = select(task)
         if not of_task:
-            raise UnknownNameError(
-                f"--across: {runs} holds no results of task {task}: qrlsuite run --task {task}"
-            )
+            raise UnknownNameError(f"there are no results of task {task}: qrlsuite run --task {task}")
         selected += of_task
         refused += [f"{task}: {line}" for line in left_out]
     return selected, refused
@@ -236,6 +225,7 @@ def shares(
     horizon: int | None = None,
     refused: Sequence[str] = (),
     least: int = 2,
+    by: str = "steps",
 ) -> Shares:
     """Return the entries of one configuration that have a result on every task.
 
@@ -251,6 +241,8 @@ def shares(
         Lines about entries that were left out already.
     least:
         Seeds that an entry needs on every task.
+    by:
+        `steps`, or a key of `qrlsuite.leaderboard.costs.UNITS`.
 
     Raises
     ------
@@ -258,30 +250,64 @@ def shares(
         If no configuration is left; the message says what stood against it.
     """
     lines = list(refused)
-    by_configuration: dict[str, dict[str, EntryResults]] = {}
-    horizons, labels = [], dict[str, str]()
+    reached: dict[str, dict[str, EntryResults]] = {}
+    horizons = []
     for task in tasks:
-        members = [entry for entry in entries if entry.task == task]
-        definition = Counter(entry.task_hash for entry in members).most_common(1)[0][0]
-        end = horizon or min(ranking_of(members).horizons)
+        end, of_task, left_out = _reaching(task, [each for each in entries if each.task == task], horizon)
         horizons.append(end)
-        for entry in members:
-            if entry.task_hash != definition:
-                lines.append(f"{task}: {entry.label}: made under another definition of the task")
-                continue
-            reached = entry.reaching(end // entry.steps_per_epoch)
-            if reached is None:
-                steps = entry.longest * entry.steps_per_epoch
-                lines.append(f"{task}: {entry.label}: ends at {steps} of {end} steps")
-                continue
-            key = configuration(entry)
-            labels.setdefault(key, entry.label)
-            other = by_configuration.setdefault(key, {}).get(task)
-            if other is None or len(other.seeds) < len(reached.seeds):
-                by_configuration[key][task] = reached
-    values: dict[str, tuple[FloatArray, ...]] = {}
+        lines += left_out
+        for key, entry in of_task.items():
+            reached.setdefault(key, {})[task] = entry
+    whole, left_out = _on_every_task(reached, tasks, least)
+    if by != "steps":
+        whole, unpriced = _priced(whole, by)
+        left_out += unpriced
+    lines += left_out
+    if not whole:
+        raise OptionError(
+            f"--task {' --task '.join(tasks)}: no entry has {least} seeds or more with the same algorithm, model and "
+            f"options on every task; left out: {listed(lines, 3)}"
+        )
+    by_task = []
+    for task, end in zip(tasks, horizons):
+        members = [of_entry[task] for of_entry in whole.values()]
+        curves = (
+            [learning_curves(entry).cut(end) for entry in members] if by == "steps" else _along(members, by)
+        )
+        by_task.append([horizon_shares(each, ranking_of([e]).grid) for e, each in zip(members, curves)])
+    return Shares(tuple(tasks), tuple(horizons), dict(zip(whole, zip(*by_task))), tuple(lines))
+
+
+def _reaching(
+    task: str, members: Sequence[EntryResults], horizon: int | None
+) -> tuple[int, dict[str, EntryResults], list[str]]:
+    """Return the horizon of a task, the entries that reach it by configuration, and lines about the others."""
+    lines, found = list[str](), dict[str, EntryResults]()
+    definition = Counter(entry.task_hash for entry in members).most_common(1)[0][0]
+    end = horizon or min(ranking_of(members).horizons)
+    for entry in members:
+        if entry.task_hash != definition:
+            lines.append(f"{task}: {entry.label}: made under another definition of the task")
+            continue
+        reached = entry.reaching(end // entry.steps_per_epoch)
+        if reached is None:
+            steps = entry.longest * entry.steps_per_epoch
+            lines.append(f"{task}: {entry.label}: ends at {steps} of {end} steps")
+            continue
+        key = configuration(entry)
+        if key not in found or len(found[key].seeds) < len(reached.seeds):
+            found[key] = reached
+    return end, found, lines
+
+
+def _on_every_task(
+    reached: Mapping[str, Mapping[str, EntryResults]], tasks: Sequence[str], least: int
+) -> tuple[dict[str, Mapping[str, EntryResults]], list[str]]:
+    """Return by name the entries with so many seeds on every task, and lines about the others."""
+    labels = {key: next(iter(by_task.values())).label for key, by_task in reached.items()}
     seen = Counter(labels.values())
-    for key, by_task in by_configuration.items():
+    whole, lines = dict[str, Mapping[str, EntryResults]](), list[str]()
+    for key, by_task in reached.items():
         name = labels[key] if seen[labels[key]] == 1 else f"{labels[key]} {key[:8]}"
         missing = [task for task in tasks if task not in by_task]
         few = [task for task in tasks if task in by_task and len(by_task[task].seeds) < least]
@@ -289,45 +315,45 @@ def shares(
             lines.append(f"{name}: no result with these options on {listed(missing)}")
         elif few:
             count = len(by_task[few[0]].seeds)
-            lines.append(
-                f"{name}: {count} seed{'s' * (count != 1)} on {few[0]}, fewer than {least}: undecided"
-            )
+            lines.append(f"{name}: {counted(count, 'seed')} on {few[0]}, fewer than {least}: undecided")
         else:
-            values[name] = tuple(
-                horizon_shares(learning_curves(by_task[task]).cut(end), ranking_of([by_task[task]]).grid)
-                for task, end in zip(tasks, horizons)
-            )
-    if not values:
-        raise OptionError(
-            f"--across {' '.join(tasks)}: no entry has {least} seeds or more with the same algorithm, model and "
-            f"options on every task; left out: {listed(lines, 3)}"
-        )
-    return Shares(tuple(tasks), tuple(horizons), values, tuple(lines))
+            whole[name] = by_task
+    return whole, lines
 
 
-def compare(
+def _priced(
+    whole: Mapping[str, Mapping[str, EntryResults]], by: str
+) -> tuple[dict[str, Mapping[str, EntryResults]], list[str]]:
+    """Return the entries whose steps have a cost on every task, and lines about the others."""
+    problems = dict[str, str]()
+    for task in next(iter(whole.values()), {}):
+        for name, found in zip(whole, costs.prices([of_entry[task] for of_entry in whole.values()], by)):
+            if found.problem:
+                problems.setdefault(name, f"{name}: not ranked: {found.problem} ({task})")
+    return {name: entry for name, entry in whole.items() if name not in problems}, list(problems.values())
+
+
+def _along(members: Sequence[EntryResults], by: str) -> list[LearningCurves]:
+    return costs.along(members, [found.per_step for found in costs.prices(members, by)])[3]
+
+
+def section(
     entries: Sequence[EntryResults],
     tasks: Sequence[str],
     horizon: int | None = None,
     alpha: float = ALPHA,
     refused: Sequence[str] = (),
-) -> AcrossBoard:
-    """Compare all configurations that have 20 seeds or more on every task.
+    by: str = "steps",
+) -> AcrossSection:
+    """Compare all configurations that have 20 seeds or more on every task; arguments as for `shares`.
 
     Parameters
     ----------
-    entries, tasks, horizon, refused:
-        As for `shares`.
     alpha:
         In (0, 1): probability of any false decision; intervals have level 1 - alpha.
-
-    Raises
-    ------
-    OptionError
-        If no configuration is left, or `alpha` is not between 0 and 1.
     """
-    configurations = shares(entries, tasks, horizon, refused, MIN_RUNS)
-    return AcrossBoard(configurations, across_tasks(configurations.values, alpha), alpha)
+    configurations = shares(entries, tasks, horizon, refused, MIN_RUNS, by)
+    return AcrossSection(configurations, across_tasks(configurations.values, alpha), alpha, by)
 
 
 def configuration(entry: EntryResults) -> str:

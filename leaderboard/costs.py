@@ -16,20 +16,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.text import Text
 
-from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError, listed, nearest
-from qrlsuite.leaderboard.board import Complexity, cell_text, complexity_at, of_one_definition, ranking_of
-from qrlsuite.leaderboard.sheet import Sheet
+from qrlsuite.engine.sheet import Sheet, flat_row
+from qrlsuite.errors import listed
+from qrlsuite.leaderboard.ranked import Complexity, cell_text, complexity_at, ranking_of
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
-from qrlsuite.statistics.times import check_probability
 
 CELLS = 1000
 """Parts of the budget at which curves are read where the epochs of entries cost differently."""
@@ -179,6 +175,8 @@ class CostSection:
         What all of these have spent in all, at least.
     part:
         Cost of one part.
+    exact:
+        Whether curves are read at the ends of epochs, which cost the same for all.
     """
 
     task: str
@@ -188,6 +186,7 @@ class CostSection:
     compared: TimesBoard | None
     budget: float
     part: float
+    exact: bool
     alpha: float
 
     @property
@@ -211,8 +210,8 @@ class CostSection:
         """Return the section as a table; `explain` adds all its notes."""
         rows = [self.cells(row) for row in self.rows]
         words = ("entry", "needs less than", "needs more than")
-        label = f"{self.task}-{self.unit.name}"
-        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, label, explain)
+        label, name = f"{self.task}-{self.unit.name}", f"{self.task} by {self.unit.name}"
+        return Sheet.of(self.title, self.columns(), rows, self.notes(), words, label, explain, name)
 
     def cells(self, row: CostRow) -> tuple[str, ...]:
         """Return a row as text."""
@@ -320,11 +319,23 @@ class CostSection:
             lines.append(TOO_FEW)
         return lines
 
-    @property
-    def exact(self) -> bool:
-        """Whether curves are read at the ends of epochs, which cost the same for all."""
-        costs = [row.price.per_step * row.entry.steps_per_epoch for row in self.rows if row.index is not None]
-        return _equal(costs)
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            "task": self.task,
+            "by": self.unit.name,
+            "budget": self.budget if self.compared is not None else None,
+            "alpha": self.alpha,
+            "cell": self.cell,
+            "rows": [self.row_dict(row) for row in self.rows],
+            "notes": self.notes(),
+        }
+
+    def flat(self) -> list[dict[str, object]]:
+        """Return one row of values per entry, for a spreadsheet."""
+        budget = self.budget if self.compared is not None else None
+        facts = {"by": self.unit.name, "budget": budget}
+        return [flat_row({"task": self.task}, self.row_dict(row), facts) for row in self.rows]
 
     def row_dict(self, row: CostRow) -> dict[str, Any]:
         """Return one entry's plain values, costs in the unit."""
@@ -351,108 +362,32 @@ class CostSection:
         }
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class CostBoard(Shown):
-    """The result of `build`: a section for each task, and lines about entries that were left out.
+def sections(
+    task: str,
+    entries: Sequence[EntryResults],
+    by: str,
+    alpha: float = ALPHA,
+) -> tuple[list[CostSection], list[str]]:
+    """Rank the entries of a task by what learning costs; arguments as for `qrlsuite.leaderboard.board.build`.
 
-    It shows itself as a table per section.
+    Returns
+    -------
+    tuple
+        The section; and one line for each entry that was left out. Those that do not reach the task's shortest
+        horizon, where others do, are.
     """
-
-    sections: tuple[CostSection, ...]
-    refused: tuple[str, ...]
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for section in self.sections:
-            yield section.sheet()
-        for line in self.refused:
-            yield Text(f"left out: {line}")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {
-            "sections": [
-                {
-                    "task": section.task,
-                    "by": section.unit.name,
-                    "budget": section.budget if section.compared is not None else None,
-                    "alpha": section.alpha,
-                    "cell": section.cell,
-                    "rows": [section.row_dict(row) for row in section.rows],
-                    "notes": section.notes(),
-                }
-                for section in self.sections
-            ],
-            "refused": list(self.refused),
-        }
-
-    def flat(self) -> list[dict[str, object]]:
-        """Return one row of columns per entry, for a spreadsheet."""
-        rows: list[dict[str, object]] = []
-        for section in self.sections:
-            for row in section.rows:
-                values = section.row_dict(row)
-                for name in ("ranks", "interval", "mean_cost_interval"):
-                    first, last = values.pop(name) or (None, None)
-                    low, high = ("best", "worst") if name == "ranks" else ("low", "high")
-                    stem = "rank" if name == "ranks" else name
-                    values |= {f"{stem}_{low}": first, f"{stem}_{high}": last}
-                budget = section.budget if section.compared is not None else None
-                rows.append({"task": section.task, "by": section.unit.name, "budget": budget, **values})
-        return rows
-
-
-def build(
-    entries: Sequence[EntryResults], by: str, alpha: float = ALPHA, refused: Sequence[str] = ()
-) -> CostBoard:
-    """Rank entries by what learning costs, task by task.
-
-    Parameters
-    ----------
-    entries:
-        Of any tasks. Those that do not reach the task's shortest horizon, where others do, are left out.
-    by:
-        A key of `UNITS`.
-    alpha:
-        In (0, 1): probability of any false decision among entries of equal laws.
-    refused:
-        Lines about what could not be read, passed on.
-
-    Raises
-    ------
-    OptionError
-        If there is no such unit, or `alpha` is not between 0 and 1.
-    """
-    check_probability(alpha, "alpha")
-    if by == "steps":
-        raise OptionError("by = 'steps': the board of `api.board` is by steps")
-    if by not in UNITS:
-        raise OptionError(f"by = '{by}': choose among steps, {', '.join(UNITS)}{nearest(by, UNITS)}")
-    good, problems = of_one_definition(entries)
-    sections = []
-    for task in sorted({entry.task for entry in good}):
-        members, short = collect.equally_long([entry for entry in good if entry.task == task])
-        problems += short
-        sections.append(_section(task, members, UNITS[by], alpha))
-    return CostBoard(tuple(sections), (*refused, *problems))
+    members, short = collect.equally_long(entries)
+    return [_section(task, members, UNITS[by], alpha)], short
 
 
 def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: float) -> CostSection:
     ranking = ranking_of(entries)
-    prices = _prices(entries, unit.name)
-    costs = {
-        place: found.per_step * entries[place].steps_per_epoch
-        for place, found in enumerate(prices)
-        if not found.problem
-    }
-    budget, part, compared = math.nan, math.nan, None
-    if costs:
-        budget = min(cost * entries[place].curves.shape[1] for place, cost in costs.items())
-        parts = round(budget / min(costs.values())) if _equal(list(costs.values())) else CELLS
-        part = budget / parts
-        compared = times_board(
-            [_along(entries[place], cost, part, parts) for place, cost in costs.items()], ranking.grid, alpha
-        )
-    places = list(costs)
+    paid = prices(entries, unit.name)
+    places = [place for place, found in enumerate(paid) if not found.problem]
+    budget, part, exact, compared = math.nan, math.nan, True, None
+    if places:
+        budget, part, exact, curves = along([entries[p] for p in places], [paid[p].per_step for p in places])
+        compared = times_board(curves, ranking.grid, alpha)
     order = [places[index] for index in compared.order] if compared is not None else []
     order += sorted(set(range(len(entries))) - set(order), key=lambda place: entries[place].label)
     rows = []
@@ -460,29 +395,42 @@ def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: floa
         entry = entries[place]
         horizon = int(entry.curves.shape[1]) * entry.steps_per_epoch
         complexity = complexity_at(entry.curves, ranking, entry.steps_per_epoch, horizon)
-        rows.append(
-            CostRow(entry, prices[place], complexity, places.index(place) if place in costs else None)
-        )
-    return CostSection(task, cell_text(ranking), unit, tuple(rows), compared, budget, part, alpha)
+        rows.append(CostRow(entry, paid[place], complexity, places.index(place) if place in places else None))
+    return CostSection(task, cell_text(ranking), unit, tuple(rows), compared, budget, part, exact, alpha)
 
 
-def _prices(entries: Sequence[EntryResults], unit: str) -> list[Price]:
+def prices(entries: Sequence[EntryResults], unit: str) -> list[Price]:
     """Return every entry's price; core-hours of a processor that most of the others were not made on are no price."""
-    prices = [price(entry, unit) for entry in entries]
+    paid = [price(entry, unit) for entry in entries]
     if unit != "core-hours":
-        return prices
-    made_on = Counter(e.processors[0] for e, found in zip(entries, prices) if not found.problem)
+        return paid
+    made_on = Counter(e.processors[0] for e, found in zip(entries, paid) if not found.problem)
     usual = min(made_on, key=lambda name: (-made_on[name], name), default="")
     return [
         found
         if found.problem or entry.processors[0] == usual
         else replace(found, problem=f"made on {entry.processors[0]}, the others on {usual}")
-        for entry, found in zip(entries, prices)
+        for entry, found in zip(entries, paid)
     ]
 
 
-def _equal(costs: Sequence[float]) -> bool:
-    return bool(np.allclose(costs, costs[0], rtol=1e-9, atol=0)) if costs else True
+def along(
+    entries: Sequence[EntryResults], per_step: Sequence[float]
+) -> tuple[float, float, bool, list[LearningCurves]]:
+    """Return curves along the cost, for entries whose steps have these costs.
+
+    Returns
+    -------
+    tuple
+        What the cheapest entry spent in all: the budget of each; the cost of one of its equal parts; whether these are
+        the epochs, which cost the same for all; and the curves, an epoch for each part.
+    """
+    costs = [price * entry.steps_per_epoch for price, entry in zip(per_step, entries)]
+    budget = min(cost * entry.curves.shape[1] for cost, entry in zip(costs, entries))
+    exact = bool(np.allclose(costs, costs[0], rtol=1e-9, atol=0))
+    parts = round(budget / min(costs)) if exact else CELLS
+    curves = [_along(entry, cost, budget / parts, parts) for entry, cost in zip(entries, costs)]
+    return budget, budget / parts, exact, curves
 
 
 def _along(entry: EntryResults, cost: float, part: float, parts: int) -> LearningCurves:

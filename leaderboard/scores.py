@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.sheet import Sheet
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.steps import by_horizon
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
@@ -29,7 +30,7 @@ OF_RUNS = {"score": final_scores, "area": areas}
 
 
 @dataclass(frozen=True, eq=False)
-class ScoreRanking:
+class ScoreSection:
     """The result of `rank_by_score`.
 
     Attributes
@@ -44,6 +45,8 @@ class ScoreRanking:
         Epochs that a final score is the mean of.
     unranked:
         Labels of the entries with fewer than 20 seeds.
+    shown:
+        Names of the entries that have a row; None means all. What is shown changes no rank.
     """
 
     task: str
@@ -54,6 +57,7 @@ class ScoreRanking:
     results: ScoreBoard
     n_last: int
     unranked: tuple[str, ...]
+    shown: frozenset[str] | None = None
 
     @property
     def title(self) -> str:
@@ -120,15 +124,24 @@ class ScoreRanking:
             *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
         ]
 
-    def sheet(self, explain: bool = False, shown: Collection[str] | None = None) -> Sheet:
-        """Return the table; `shown` names the entries that have a row, None all. What is shown changes no rank."""
-        places = [
-            place
-            for place, index in enumerate(self.order)
-            if shown is None or self.entries[index].name in shown
+    def sheet(self, explain: bool = False) -> Sheet:
+        """Return the table; `explain` adds all its notes."""
+        rows = [self.cells(place) for place in self._places()]
+        label, name = f"{self.task}-{self.by}", f"{self.task} by {self.by}"
+        return Sheet.of(self.title, self.columns(), rows, self.notes(), ("entry",), label, explain, name)
+
+    def _places(self) -> list[int]:
+        """Return the places of the order that are shown."""
+        names = [self.entries[index].name for index in self.order]
+        return [place for place, name in enumerate(names) if self.shown is None or name in self.shown]
+
+    def flat(self) -> list[dict[str, object]]:
+        """Return one row of values per entry, for a spreadsheet."""
+        rows = self.as_dict()["entries"]
+        first = {"task": self.task, "horizon": self.horizon}
+        return [
+            flat_row(first, rows[place], {"by": self.by, "alpha": self.alpha}) for place in self._places()
         ]
-        rows = [self.cells(place) for place in places]
-        return Sheet.of(self.title, self.columns(), rows, self.notes(), ("entry",), explained=explain)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON. Matrices are in the order of `entries`, from the row's side."""
@@ -165,7 +178,7 @@ class ScoreRanking:
 
 def rank_by_score(
     entries: Sequence[EntryResults], horizon: int, by: str = "score", alpha: float = 0.05
-) -> ScoreRanking:
+) -> ScoreSection:
     """Rank the entries of one task at one horizon by their scores, more is better.
 
     Parameters
@@ -190,7 +203,7 @@ def rank_by_score(
     if not ranked:
         raise OptionError(f"--by {by}: no entry has {MIN_RUNS} seeds")
     curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label).cut(horizon) for each in ranked]
-    return ScoreRanking(
+    return ScoreSection(
         task=ranked[0].task,
         horizon=horizon,
         by=by,
@@ -200,6 +213,24 @@ def rank_by_score(
         n_last=last_epochs(curves[0].values.shape[1]),
         unranked=tuple(entry.label for entry in entries if len(entry.seeds) < MIN_RUNS),
     )
+
+
+def sections(
+    task: str,
+    entries: Sequence[EntryResults],
+    horizon: int | None,
+    by: str,
+    alpha: float = 0.05,
+    shown: Callable[[EntryResults], bool] | None = None,
+) -> tuple[list[ScoreSection], list[str]]:
+    """Rank a task's entries by score at the horizon that most of them reach; see `qrlsuite.leaderboard.board.build`."""
+    groups = by_horizon(entries, horizon)
+    if not groups or not (shown is None or any(map(shown, entries))):
+        return [], []
+    end, _, members = max(groups, key=lambda group: (not group[1], len(group[2]), group[0]))
+    section = rank_by_score(members, end, by, alpha)
+    names = None if shown is None else frozenset(entry.name for entry in members if shown(entry))
+    return [replace(section, shown=names)], []
 
 
 def _interval(value: float, low: float, high: float) -> str:

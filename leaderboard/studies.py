@@ -14,8 +14,8 @@ from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.board import ranking_of
 from qrlsuite.leaderboard.pictures import cells, style
+from qrlsuite.leaderboard.ranked import ranking_of
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.times import rank_by_time

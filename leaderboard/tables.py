@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.table import Table
-from rich.text import Text
-
-from qrlsuite.leaderboard.sheet import Column, Sheet
+from qrlsuite.engine.sheet import Column, Sheet
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.leaderboard.times import p_text, percent
 from qrlsuite.results.text import counted, hours_text, steps_text
-from qrlsuite.statistics import Comparison, Direction
+from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
-    from qrlsuite.leaderboard.board import Leaderboard, Row, Section
-    from qrlsuite.leaderboard.pair import PairVerdict
     from qrlsuite.leaderboard.shelf.curves import EntryResults
+    from qrlsuite.leaderboard.steps import Row, Section
 
-SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
-"""What a spreadsheet shows of the win that a tier rests on."""
 MARKS = {
     "†": "settings chosen after seeing runs on protocol seeds, which may flatter",
     "*": "fewer than the protocol's {protocol} seeds",
@@ -43,7 +35,7 @@ def sheets(sections: Sequence[Section], explain: bool = False, pairs: bool = Fal
         of_task = [section for section in sections if section.task == task]
         main = main_section(of_task)
         made.append(replace(sheet(main, explain), lines=tuple(_elsewhere(main, of_task))))
-        made += [pairs_sheet(main)] * pairs
+        made += [pairs_sheet(main)] * (pairs and len(main.rows) > 1)
     return made
 
 
@@ -64,6 +56,8 @@ def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
             lines.append(
                 f"shorter: {row.entry.label}, {counted(len(row.entry.seeds), 'seed')}, {steps_text(section.horizon)} "
                 f"steps, {_mean(row.mean.mean, low, high)} of them below threshold"
+                + f"; diverged: {_of_seeds(row.entry)}"
+                * bool(row.entry.diverged)
             )
     others = [each for each in sections if each is not main]
     lines += [
@@ -270,11 +264,15 @@ def _marks(section: Section) -> list[str]:
 
 def _diverged(section: Section) -> list[str]:
     found = [row.entry for row in section.rows if row.entry.diverged]
-    told = ", ".join(f"{entry.label} ({len(entry.diverged)} of {len(entry.seeds)} seeds)" for entry in found)
+    told = ", ".join(f"{entry.label} ({_of_seeds(entry)})" for entry in found)
     line = (
         f"diverged (numbers of the agents are no longer finite), ranked with the scores that they had: {told}"
     )
     return [line] * bool(found)
+
+
+def _of_seeds(entry: EntryResults) -> str:
+    return f"{len(entry.diverged)} of {len(entry.seeds)} seeds"
 
 
 def facts(section: Section) -> list[str]:
@@ -306,6 +304,11 @@ def facts(section: Section) -> list[str]:
         lines.append(
             "made with several versions, see `qrlsuite show ENTRY`: "
             + ", ".join(f"{entry.label} ({', '.join(entry.mixed_versions)})" for entry in mixed)
+        )
+    merged = [row.entry.label for row in section.rows if len(row.entry.codes) > 1]
+    if merged:
+        lines.append(
+            "seeds of several codes that `--same` joined, see `qrlsuite show ENTRY`: " + ", ".join(merged)
         )
     devices = [row.entry for row in section.rows if len(row.entry.devices) > 1]
     if devices:
@@ -391,125 +394,3 @@ def _cells_text(section: Section, i: int, j: int) -> str:
         return "?"
     wins, losses = int(board.better_cells[i, j]), int(board.better_cells[j, i])
     return f"{f'+{wins}' * bool(wins)}{f'-{losses}' * bool(losses)}" or "."
-
-
-def flat(board: Leaderboard) -> list[dict[str, object]]:
-    """Return one row of values per entry and section, for a spreadsheet."""
-    rows: list[dict[str, object]] = []
-    for made, section in zip(board.sections, board.as_dict()["sections"]):
-        for of, row in zip(made.rows, section["rows"]):
-            low, high = row.pop("interval")
-            count = row.pop("parameters")
-            tuning = row.pop("tuning") or {}
-            tuned, on_protocol_seeds = bool(tuning), bool(tuning.get("on_protocol_seeds"))
-            support = row.pop("rests_on") or {}
-            flat = {
-                **{name: section[name] for name in ("task", "horizon", "cell")},
-                **row,
-                "parameters_classical": count["classical"],
-                "parameters_quantum": count["quantum"],
-                "parameters_fixed": count["fixed"],
-                "networks": count["networks"],
-                **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
-                "interval_low": low,
-                "interval_high": high,
-                "tuned": tuned,
-                "tuned_on_protocol_seeds": on_protocol_seeds,
-                "rule": section["rule"],
-                **made.times.flat(of.entry),
-            }
-            rows.append(flat)
-    return rows
-
-
-def table(
-    columns: Sequence[str],
-    *,
-    title: str | None = None,
-    caption: str | None = None,
-    left: Sequence[str] = (),
-    fixed: Sequence[str] = (),
-) -> Table:
-    """Return an empty table as all commands show them.
-
-    Parameters
-    ----------
-    columns:
-        Their names. Numbers stand at the right.
-    title, caption:
-        What stands above and below it.
-    left:
-        Columns of words, which stand at the left.
-    fixed:
-        Columns that are never broken into several lines.
-    """
-    result = Table(
-        title=None if title is None else Text(title),
-        title_justify="left",
-        header_style="bold",
-        box=box.SIMPLE_HEAD,
-        caption=None if caption is None else Text(caption),
-        caption_justify="left",
-        pad_edge=False,
-    )
-    for name in columns:
-        justify: Literal["left", "right"] = "left" if name in left else "right"
-        result.add_column(Text(name), justify=justify, overflow="fold", no_wrap=name in fixed)
-    return result
-
-
-SYMBOLS = {
-    "win": ("+", "bold bright_blue", "significantly fewer samples"),
-    "loss": ("-", "bold dark_orange", "significantly more samples"),
-    "tie": (".", "dim", "no significant difference"),
-    "both-at-cap": ("^", "dim", "both at the cap"),
-    "undecided": ("?", "yellow", "undecided"),
-}
-"""What a cell of a comparison looks like; the sign says everything, the color only helps."""
-
-
-def pair_table(pair: PairVerdict) -> Table:
-    """Return two entries threshold by threshold as a table."""
-    heading, *labels, size, p, verdict = pair.columns()
-    heads = ("\n".join(textwrap.wrap(label, 9, break_long_words=False)) for label in labels)
-    columns = (heading, *heads, size, p, verdict)
-    result = table(columns, caption="\n".join(pair.notes), left=columns[-1:], fixed=columns[:-1])
-    result.show_edge = False  # so that its numbers fit into 80 characters
-    for row in pair.rows():
-        result.add_row(*map(Text, row))
-    return result
-
-
-def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
-    """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
-    grid = comparison.grid
-    rows = [f"{float(level):g}" for level in grid.levels]
-    return f"{grid.level_name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]
-
-
-def comparison_table(comparison: Comparison) -> Table:
-    """Return a comparison as a table: a sign per cell of the grid."""
-    heading, rows, deltas = _levels(comparison)
-    result = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(heading), title_justify="left")
-    result.add_column("", justify="right")
-    for delta in deltas:
-        result.add_column(Text(delta), justify="center")
-    for name, verdicts in zip(rows, comparison.verdicts):
-        result.add_row(Text(name), *(Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts))
-    return result
-
-
-def legend(comparison: Comparison) -> str:
-    """Explain the signs that occur in a comparison's table."""
-    occurring = {str(verdict) for row in comparison.verdicts for verdict in row}
-    return ", ".join(f"{sign} {meaning}" for name, (sign, _, meaning) in SYMBOLS.items() if name in occurring)
-
-
-def comparison_html(comparison: Comparison, headline: str) -> str:
-    """Return a comparison's cells as HTML for a notebook: the result in words, and a sign per cell of the grid."""
-    heading, rows, deltas = _levels(comparison)
-    signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
-    remarks = [heading, legend(comparison)]
-    return Sheet.of(
-        f"{headline}: {comparison.sentence}", ["", *deltas], signs, remarks, explained=True
-    ).html()

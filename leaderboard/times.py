@@ -177,8 +177,8 @@ class TimeRanking:
         difference = row.difference or (None, None, None)
         names = self.board.names
         return {
-            "time_rank_best": None if row.ranks is None else row.ranks[0],
-            "time_rank_worst": None if row.ranks is None else row.ranks[1],
+            "rank": None if row.ranks is None else row.ranks[0],
+            "rank_worst": None if row.ranks is None else row.ranks[1],
             "time_place": row.place,
             "time_place_at_half": row.place_at_half,
             "mean_time": row.mean.mean,

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from qrlsuite import api as api
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
-    from qrlsuite.api import costs as costs
     from qrlsuite.api import evaluate as evaluate
     from qrlsuite.api import load as load
     from qrlsuite.api import new_study as new_study
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "costs", "evaluate", "hookimpl", "layer", "load", "new_study", "plot",
+    "__version__", "api", "board", "compare", "evaluate", "hookimpl", "layer", "load", "new_study", "plot",
     "read_study", "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 

@@ -6,7 +6,7 @@
     large = api.load("mlp width=64", task="beam6g", published=True)
     api.compare(large, small)
     api.board("beam6g", published=True)
-    api.costs("beam6g", by="executions", published=True)
+    api.board("beam6g", by="executions", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
     api.run_study("width.toml")
@@ -35,11 +35,11 @@ from qrlsuite.engine.terminal import Shown, show_figures_in_notebook
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard import across, rules, studies
 from qrlsuite.leaderboard import board as boards
-from qrlsuite.leaderboard import costs as by_cost
-from qrlsuite.leaderboard import rules, studies
-from qrlsuite.leaderboard.board import EntryComparison, Leaderboard
-from qrlsuite.leaderboard.costs import CostBoard
+from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.compared import EntryComparison, compare_entries
+from qrlsuite.leaderboard.costs import UNITS
 from qrlsuite.leaderboard.pair import on_board
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from qrlsuite.leaderboard.evaluation import Evaluation
 
 __all__ = [
-    "board", "compare", "costs", "evaluate", "load", "new_study", "plot", "read_study", "run_study", "train", "tune",
+    "board", "compare", "evaluate", "load", "new_study", "plot", "read_study", "run_study", "train", "tune",
 ]  # fmt: skip
 
 show_figures_in_notebook()
@@ -74,6 +74,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+Selected = tuple[list[EntryResults], list[str]]
 Seeds = int | str | Iterable[int]
 """100 (seeds 0 to 99), the seeds themselves, or text as on the command line: '0:20', '0,3,10:12'."""
 
@@ -122,6 +123,7 @@ def load(
 def board(
     tasks: str | Sequence[str] | None = None,
     *,
+    by: str = "steps",
     runs: str | PathLike[str] = "runs",
     published: bool = False,
     rule: str | None = None,
@@ -131,12 +133,17 @@ def board(
     study: str | None = None,
     min_seeds: int = 1,
 ) -> Leaderboard:
-    """Rank entries by significant outperformance, task by task.
+    """Rank entries by significant outperformance: on a task, on each task, or over several tasks together.
 
     Parameters
     ----------
     tasks:
-        A task or several; None means all.
+        A task; None means all, one after the other. Several are compared together: the entries that were trained on
+        all of them with the same options, by means over the tasks.
+    by:
+        `steps`; `executions` (of circuits), `shots` or `core-hours`: what learning cost, within the same budget for
+        all; `score`, the mean of the last tenth of the epochs, or `area`, that of all. Entries whose record does not
+        hold a cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
     runs, published:
         As for `load`. Published entries that answer the question of one study are not ranked beside others of their
         task: name the study.
@@ -150,7 +157,8 @@ def board(
         Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
     entries:
         Show these only: what `load` accepts. They keep the ranks that they have among all entries of their task. What
-        `load` returns is compared by itself, without others.
+        `load` returns is compared by itself, without others; and so is all by cost, for the cheapest entry sets the
+        budget.
     study:
         Rank the entries of this study only: its name, or a study file's path.
     min_seeds:
@@ -167,7 +175,7 @@ def board(
     UnknownNameError
         If a task, an entry or the rule is unknown, or no entry is left.
     OptionError
-        If the horizon is no whole number of epochs, or both `entries` and `study` are given.
+        If there is no such axis, the horizon is no whole number of epochs, or both `entries` and `study` are given.
     StoreError
         If there is no results folder, and `published` is false.
     PluginError
@@ -178,14 +186,30 @@ def board(
     >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
     >>> [(row.rank_text, row.entry.label) for row in found.sections[0].times.rows]
     [('1-2', 'ddqn mlp width=64'), ('11', 'ddqn mlp width=16')]
+    >>> names = ["vqc-native qubits=6", "mlp width=16"]
+    >>> found = board("beam6g", by="executions", runs="none-yet", published=True, entries=names)
+    >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
+    [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
     folder, task_names = Path(runs), _several(tasks)
     collect.check_tasks(folder, task_names, published)
-    shown, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
+    together = task_names if len(task_names) > 1 else ()
+    if rule is not None and (together or by != "steps"):
+        other = "several tasks" if together else f"by = '{by}'"
+        raise OptionError(f"--rule {rule} judges cells of one task in environment steps: not {other}")
+
+    def select(names: Sequence[str], chosen: Sequence[str | EntryResults], least: int) -> Selected:
+        return _selected(folder, names, chosen, study, published, horizon, least)
+
+    if together:
+        found, left_out = across.collected(together, lambda task: select([task], entries, min_seeds))
+        return boards.build(found, left_out, None, horizon, alpha, by=by, together=together)
+    shown, left_out = select(task_names, entries, min_seeds)
     keys = {(entry.task_hash, entry.name) for entry in shown}
     family = shown
-    if (entries or min_seeds > 1) and not any(isinstance(entry, EntryResults) for entry in entries):
-        family = _family(shown, _selected(folder, task_names, (), study, published, horizon, 1)[0])
+    read = any(isinstance(entry, EntryResults) for entry in entries)
+    if (entries or min_seeds > 1) and not read and by not in UNITS:
+        family = _family(shown, select(task_names, (), 1)[0])
     return boards.build(
         family,
         left_out,
@@ -193,55 +217,8 @@ def board(
         horizon,
         alpha,
         lambda entry: (entry.task_hash, entry.name) in keys,
+        by,
     )
-
-
-def costs(
-    tasks: str | Sequence[str] | None = None,
-    *,
-    by: str = "executions",
-    runs: str | PathLike[str] = "runs",
-    published: bool = False,
-    alpha: float = ALPHA,
-    horizon: int | None = None,
-    entries: Sequence[str | EntryResults] = (),
-    study: str | None = None,
-    min_seeds: int = 1,
-) -> CostBoard:
-    """Rank entries by what their learning cost, task by task, within the same budget for all.
-
-    Parameters
-    ----------
-    by:
-        `executions` (of circuits), `shots` or `core-hours`.
-    tasks, runs, published, alpha, horizon, entries, study, min_seeds:
-        As for `board`.
-
-    Returns
-    -------
-    CostBoard
-        `sections`, one per task, with a row per entry; `refused`; `as_dict()`. Entries whose record does not hold the
-        cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
-
-    Raises
-    ------
-    UnknownNameError
-        If a task or an entry is unknown, or no entry is left.
-    OptionError
-        If there is no such cost, the horizon is no whole number of epochs, or both `entries` and `study` are given.
-    StoreError
-        If there is no results folder, and `published` is false.
-
-    Examples
-    --------
-    >>> found = costs("beam6g", runs="none-yet", published=True, entries=["vqc-native qubits=6", "mlp width=16"])
-    >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
-    [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
-    """
-    folder, task_names = Path(runs), _several(tasks)
-    collect.check_tasks(folder, task_names, published)
-    selected, left_out = _selected(folder, task_names, entries, study, published, horizon, min_seeds)
-    return by_cost.build(selected, by, alpha, left_out)
 
 
 def compare(
@@ -292,7 +269,7 @@ def compare(
         entry if isinstance(entry, EntryResults) else load(entry, task=task, runs=runs, published=published)
         for entry in (first, second)
     )
-    compared = boards.compare_entries(left, other, rules.load(rule) if rule else None)
+    compared = compare_entries(left, other, rules.load(rule) if rule else None)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared
     others, _ = collect.collect(Path(runs), [left.task], published)

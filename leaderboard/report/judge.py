@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.leaderboard.board import Section, learning_curves, ranking_of
+from qrlsuite.leaderboard.ranked import learning_curves, ranking_of
+from qrlsuite.leaderboard.steps import Section
 from qrlsuite.statistics import Board, Evidence, Grid, LearningCurves, Outcome
 from qrlsuite.statistics.compare import in_words, overall
 

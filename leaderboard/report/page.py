@@ -12,9 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import qrlsuite
-from qrlsuite.leaderboard.across import AcrossBoard
 from qrlsuite.leaderboard.board import Leaderboard
-from qrlsuite.leaderboard.costs import CostBoard
 from qrlsuite.leaderboard.report import entries, sections
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
@@ -32,8 +30,7 @@ def render(
     board: Leaderboard,
     title: str = "Sample complexity leaderboard",
     studies: Sequence[StudyOutcome] = (),
-    across: AcrossBoard | None = None,
-    costs: CostBoard | None = None,
+    beside: Leaderboard | None = None,
 ) -> str:
     """Return a leaderboard as one self-contained HTML page.
 
@@ -48,10 +45,8 @@ def render(
         The page's heading.
     studies:
         Studies with looks, for a section of their own.
-    across:
-        A comparison over several tasks, for a section of its own.
-    costs:
-        The same entries by cost, for sections of their own.
+    beside:
+        The same entries by another axis or over several tasks, for sections of their own.
     """
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
@@ -71,8 +66,7 @@ def render(
             sections=boards,
             entries=shown,
             studies=[looks_report.view(study) for study in studies],
-            across=across,
-            costs=() if costs is None else costs.sections,
+            beside=[] if beside is None else beside.sheets(explain=True),
             tasks=len({section.task for section in board.sections}),
             refused=[clean(line, LONGEST_REASON) for line in board.refused],
             min_runs=MIN_RUNS,

@@ -48,7 +48,6 @@ BUILT_IN = {
             "leaderboard",
             "Rank entries by significant outperformance.",
             f"{_ROOM}.leaderboard:leaderboard",
-            "qrlsuite.cli.across:SeveralTasksCommand",
         ),
         LazyCommand("compare", "Say which of two entries needs fewer steps.", f"{_ROOM}.compare:compare"),
         LazyCommand(
@@ -66,7 +65,6 @@ BUILT_IN = {
             "export",
             "Write entries to publish on a leaderboard.",
             f"{_ROOM}.export:export",
-            "qrlsuite.cli.across:SeveralTasksCommand",
         ),
         LazyCommand("verify", "Check published entries, and train seeds again.", f"{_ROOM}.verify:verify"),
         LazyCommand("list", "List what the suite and plugins register.", f"{_ROOM}.listing:list_things"),
@@ -108,6 +106,8 @@ RENAMED_OPTIONS = {
         **dict.fromkeys(("--trials", "--sampler-seed"), "--sampler 'random trials=50 seed=1'"),
         "--core-hours": "--budget 2core-hours",
     },
+    "leaderboard": {"--across": "--task A --task B"},
+    "export": {"--across": "--rliable FILE --task A --task B"},
     "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'"},
     "": {
         "--minutes": "--budget 30min",

@@ -23,6 +23,14 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
 TaskOption = Annotated[
     str | None, typer.Option("--task", help="Only this task.", autocompletion=names_of("tasks"))
 ]
+TasksOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--task",
+        help="Only this task. Repeat it to compare the entries that were trained on all of these tasks, by means.",
+        autocompletion=names_of("tasks"),
+    ),
+]
 AmongOption = Annotated[
     str | None, typer.Option("--task", help="Look for ENTRY among the entries of this task only.")
 ]
@@ -68,11 +76,3 @@ PublishedOption = Annotated[
     typer.Option("--published", help="With the published entries that come with the suite."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
-AcrossOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--across",
-        metavar="TASK TASK ...",
-        help="Compare entries that were trained on all of these tasks, by means over the tasks.",
-    ),
-]

@@ -15,6 +15,7 @@ from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.leaderboard import board, rules
+from qrlsuite.leaderboard.compared import compare_entries
 from qrlsuite.statistics import Evidence, Grid, IntervalRule, LearningCurves, compare, outperformance
 from tests.leaderboard.test_pictures import learner
 
@@ -107,8 +108,8 @@ def test_a_third_partys_rule_judges_pairs_and_boards(third_party: Callable[[type
     entries = [learner("ddqn fast", 10), learner("ddqn slow", 31)]
     made = board.build(entries, rule=rule)
     assert (made.rule, made.promise) == ("half", Half.promise)
-    assert board.as_dict(made)["rule"] == "half"
-    assert board.compare_entries(*entries, rule).rule == "half"
+    assert made.as_dict()["rule"] == "half"
+    assert compare_entries(*entries, rule).rule == "half"
 
 
 @pytest.mark.parametrize(

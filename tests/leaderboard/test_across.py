@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import doctest
 import io
 import json
 import re
@@ -15,7 +14,6 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from qrlsuite.cli import across as words
 from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
@@ -48,7 +46,7 @@ def both(label: str, share: float, seeds: int = 20) -> list[EntryResults]:
 
 
 def test_shares_means_and_decided_pairs_by_hand() -> None:
-    board = across.compare([*both("slow", 0.6), *both("quick", 0.2)], TASKS)
+    board = across.section([*both("slow", 0.6), *both("quick", 0.2)], TASKS)
     assert board.shares.horizons == (200_000, 500_000)
     assert [board.results.names[i] for i in board.order] == ["quick", "slow"]
     assert board.results.mean[list(board.order)] == pytest.approx([0.225, 0.625])
@@ -70,31 +68,31 @@ def test_a_configuration_is_algorithm_model_and_options() -> None:
     options = {"algorithm_options": {"gamma": 0.9}}
     assert across.configuration(runs_of("same", "beam6g", [1], **options)) != across.configuration(one)
     mixed = [one, runs_of("same", "cartpole", [1] * 20, **options)]
-    board = across.compare([*both("quick", 0.2), *mixed], TASKS)
+    board = across.section([*both("quick", 0.2), *mixed], TASKS)
     assert board.results.names == ("quick",)
-    assert {line.partition(":")[2] for line in board.refused} == {
+    assert {line.partition(":")[2] for line in board.shares.refused} == {
         " no result with these options on cartpole",
         " no result with these options on beam6g",
     }
     with pytest.raises(OptionError, match="no entry has 20 seeds or more with the same algorithm, model and"):
-        across.compare(mixed, TASKS)
+        across.section(mixed, TASKS)
 
 
 def test_what_is_left_out_says_why() -> None:
     short = replace(runs_of("short", "cartpole", [1] * 20), curves=np.ones((20, 100)))
     entries = [*both("quick", 0.2), *both("few", 0.2, 19), runs_of("short", "beam6g", [1] * 20), short]
-    board = across.compare(entries, TASKS)
-    assert "cartpole: short: ends at 100000 of 500000 steps" in board.refused
-    assert "few: 19 seeds on beam6g, fewer than 20: undecided" in board.refused
-    cut = across.compare(entries, TASKS, horizon=100_000)
+    board = across.section(entries, TASKS)
+    assert "cartpole: short: ends at 100000 of 500000 steps" in board.shares.refused
+    assert "few: 19 seeds on beam6g, fewer than 20: undecided" in board.shares.refused
+    cut = across.section(entries, TASKS, horizon=100_000)
     assert set(cut.results.names) == {"quick", "short"}
     assert cut.shares.horizons == (100_000, 100_000)
     with pytest.raises(OptionError, match=r"alpha = 1.5 is outside \(0, 1\)"):
-        across.compare(entries, TASKS, alpha=1.5)
+        across.section(entries, TASKS, alpha=1.5)
 
 
 def test_latex_of_several_tasks() -> None:
-    text = across.compare([*both("a & b", 0.2), *both("c_d", 0.6)], TASKS).sheet().latex()
+    text = across.section([*both("a & b", 0.2), *both("c_d", 0.6)], TASKS).sheet().latex()
     assert r"a \& b" in text
     assert r"c\_d" in text
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
@@ -115,7 +113,7 @@ def test_rliable_says_the_same() -> None:
     for label, shift in (("one", 10), ("two", 20)):
         entries.append(runs_of(label, "beam6g", (shift + generator.integers(0, 40, 25)).tolist()))
         entries.append(runs_of(label, "cartpole", (5 * shift + generator.integers(0, 200, 25)).tolist()))
-    board = across.compare(entries, TASKS)
+    board = across.section(entries, TASKS)
     arrays = board.shares.rliable()
     for index, name in enumerate(board.results.names):
         assert 1 - metrics.aggregate_mean(arrays[name]) == pytest.approx(board.results.mean[index])
@@ -145,33 +143,33 @@ def qrlsuite(runs: Path, *given: str) -> Result:
 
 
 def test_the_commands_on_stored_runs(trained: Path, tmp_path: Path) -> None:
-    board = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", "json")
-    told = json.loads(board.stdout)
+    board = qrlsuite(trained, "leaderboard", "--task", "tiny", "--task", "pole", "--format", "json")
+    (told,), refused = (json.loads(board.stdout)[name] for name in ("sections", "refused"))
     assert [each["task"] for each in told["tasks"]] == ["tiny", "pole"]
     assert {row["label"] for row in told["entries"]} == {"ddqn mlp width=4", "ddqn mlp width=8"}
-    assert told["refused"] == ["ddqn mlp width=6: no result with these options on pole"]
+    assert refused == ["ddqn mlp width=6: no result with these options on pole"]
     for format_, mark in (("table", "IQM (95%)"), ("markdown", "| entry | seeds |"), ("latex", r"\toprule")):
-        result = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", format_)
+        result = qrlsuite(trained, "leaderboard", "--task", "tiny", "--task", "pole", "--format", format_)
         assert mark in result.stdout
         assert "left out: ddqn mlp width=6" in result.stderr
-    written = qrlsuite(trained, "leaderboard", "--across", "tiny", "pole", "--format", "csv").stdout
+    written = qrlsuite(trained, "leaderboard", "--task", "tiny", "--task", "pole", "--format", "csv").stdout
     rows = list(csv.DictReader(io.StringIO(written)))
     assert [float(row["mean"]) for row in rows] == [row["mean"] for row in told["entries"]]
 
     page = tmp_path / "page.html"
     result = qrlsuite(
-        trained, "leaderboard", "--across", "tiny", "pole", "--format", "html", "--out", str(page)
+        trained, "leaderboard", "--task", "tiny", "--task", "pole", "--format", "html", "--out", str(page)
     )
     assert result.exit_code == 0, result.output
     text = page.read_text()
     assert re.findall(r'<section class="board" id="([^"]*)"', text) == ["board-0", "board-1"]
-    table = text.partition('<section id="across"')[2].partition("</section>")[0]
+    table = text.partition('<section id="beside-1"')[2].partition("</section>")[0]
     assert table.count('<th scope="row">ddqn mlp width=') == 2
     assert "No result with these options" not in table
     assert "ddqn mlp width=6: no result with these options on pole" in text
 
     file = tmp_path / "scores.npz"
-    result = qrlsuite(trained, "export", "--rliable", str(file), "--across", "tiny", "pole")
+    result = qrlsuite(trained, "export", "--rliable", str(file), "--task", "tiny", "--task", "pole")
     assert result.exit_code == 0, result.output
     with np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
@@ -186,17 +184,24 @@ def test_the_commands_on_stored_runs(trained: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["leaderboard", "--across", "tiny"], "name two tasks or more"),
-        (["leaderboard", "--across", "tiny", "tiny"], "task tiny is named twice"),
-        (["leaderboard", "--across", "tiny", "pola"], "unknown task 'pola'; did you mean 'pole'"),
-        (["leaderboard", "--across", "tiny", "cartpole"], "holds no results of task cartpole"),
-        (["leaderboard", "--across", "tiny", "pole", "--rule", "times"], "judges single tasks"),
-        (["leaderboard", "--across", "tiny", "pole", "--task", "tiny"], "leave --task tiny out"),
-        (["leaderboard", "--across", "tiny", "pole", "--alpha", "0"], "alpha = 0.0 is outside (0, 1)"),
-        (["leaderboard", "--across", "tiny", "pole", "--horizon", "60", "--entry", "mlp width=9"], "width=9"),
-        (["export", "--rliable", "a.npz"], "--rliable: add --across TASK TASK"),
-        (["export", "--across", "tiny", "pole"], "--across: add --rliable FILE"),
-        (["export", "--rliable", "a.csv", "--across", "tiny", "pole"], "must be .npz"),
+        (["leaderboard", "--task", "tiny", "--task", "tiny"], "--task: tiny is named twice"),
+        (["leaderboard", "--task", "tiny", "--task", "pola"], "unknown task 'pola'; did you mean 'pole'"),
+        (["leaderboard", "--task", "tiny", "--task", "cartpole"], "no results of task cartpole"),
+        (["leaderboard", "--task", "tiny", "--task", "pole", "--rule", "times"], "judges cells of one task"),
+        (
+            ["leaderboard", "--task", "tiny", "--task", "pole", "--by", "area"],
+            "--by area: scores of several tasks have no common scale",
+        ),
+        (
+            ["leaderboard", "--task", "tiny", "--task", "pole", "--alpha", "0"],
+            "alpha = 0.0 is outside (0, 1)",
+        ),
+        (
+            ["leaderboard", "--task", "tiny", "--task", "pole", "--horizon", "60", "--entry", "mlp width=9"],
+            "width=9",
+        ),
+        (["export", "--rliable", "a.npz"], "--rliable: name two tasks or more"),
+        (["export", "--rliable", "a.csv", "--task", "tiny", "--task", "pole"], "must be .npz"),
     ],
 )
 def test_wrong_input_says_what_to_type(given: list[str], message: str, trained: Path) -> None:
@@ -204,11 +209,3 @@ def test_wrong_input_says_what_to_type(given: list[str], message: str, trained: 
     assert result.exception is not None
     assert message in str(result.exception)
     assert "\n" not in str(result.exception)
-
-
-def test_words_up_to_the_next_option_belong_to_it() -> None:
-    assert doctest.testmod(words).failed == 0
-    assert words.spread(["--across", "a", "b", "c"]) == ["--across", "a", "--across", "b", "--across", "c"]
-    assert words.spread(["x", "--across", "a", "--across", "b", "c", "-h"]) == [
-        *("x", "--across", "a", "--across", "b", "--across", "c", "-h"),
-    ]

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from qrlsuite import api
+from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import board, report, tables
+from qrlsuite.leaderboard import board, report, steps
+from qrlsuite.leaderboard.compared import compare_entries
 from qrlsuite.leaderboard.pictures import tiers
-from qrlsuite.leaderboard.sheet import csv_rows
 from qrlsuite.leaderboard.shelf import collect, published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
@@ -63,22 +64,20 @@ def test_entries_at_the_cap_everywhere_are_not_reached_and_below_who_reached(
         ("poor two", None, True),
     ]
     assert [row.outperformed_by for row in section.rows[1:]] == [("best one",)] * 2
-    rows = board.as_dict(mostly_at_the_cap)["sections"][0]["rows"]
+    rows = mostly_at_the_cap.as_dict()["sections"][0]["rows"]
     assert [row["verdict"].partition(":")[0] for row in rows] == ["ranked", "not reached", "not reached"]
     text = paper(mostly_at_the_cap)
     assert "| not reached | poor one |" in text
     assert "not reached: at the cap in every cell" in text
     assert "not reached: at the cap in every cell" in report.render(mostly_at_the_cap)
-    written = [
-        row["verdict"] for row in csv.DictReader(io.StringIO(csv_rows(tables.flat(mostly_at_the_cap))))
-    ]
+    written = [row["verdict"] for row in csv.DictReader(io.StringIO(csv_rows(mostly_at_the_cap.flat())))]
     assert written == [row["verdict"] for row in rows]
 
 
 def test_two_that_reached_nothing_are_not_called_equal(mostly_at_the_cap: board.Leaderboard) -> None:
     best, one, two = (row.entry for row in mostly_at_the_cap.sections[0].rows)
-    assert board.compare_entries(one, two).sentence == "not reached: both are at the cap in all 49 cells"
-    assert board.compare_entries(best, two).sentence == (
+    assert compare_entries(one, two).sentence == "not reached: both are at the cap in all 49 cells"
+    assert compare_entries(best, two).sentence == (
         "outperforms: significantly fewer samples in 7 of 49 cells, significantly more in none; "
         "both at the cap in 42"
     )
@@ -94,11 +93,11 @@ def test_a_tier_says_on_how_few_cells_it_rests() -> None:
     made = boards.of([made.sections[0].rows[0].entry, later])
     first, second = made.sections[0].rows
     assert first.rests_on is None
-    assert second.rests_on == board.Support("best one", "later one", cells=7, at_cap=42, total=49)
+    assert second.rests_on == steps.Support("best one", "later one", cells=7, at_cap=42, total=49)
     assert re.search(r"\| 2 \| later one \| [^|]* \| 7 of 7 \|", paper(made))
-    (row,) = [r for r in csv.DictReader(io.StringIO(csv_rows(tables.flat(made)))) if r["tier"] == "2"]
+    (row,) = [r for r in csv.DictReader(io.StringIO(csv_rows(made.flat()))) if r["tier"] == "2"]
     assert (row["rests_on_cells"], row["rests_on_at_cap"], row["rests_on_total"]) == ("7", "42", "49")
-    (told,) = [r["rests_on"] for r in board.as_dict(made)["sections"][0]["rows"] if r["tier"] == 2]
+    (told,) = [r["rests_on"] for r in made.as_dict()["sections"][0]["rows"] if r["tier"] == 2]
     assert json.loads(json.dumps(told))["cells"] == 7
     page = report.render(made)
     assert ">7 of 7</abbr>" in page
@@ -119,7 +118,7 @@ def test_settings_chosen_on_protocol_seeds_are_marked() -> None:
     assert f"† {note}" in markdown(made)
     assert f"| {entries[0].label} † |" in markdown(made)
     assert f"{note[1:]}: {entries[0].label}" in report.render(made)
-    rows = list(csv.DictReader(io.StringIO(csv_rows(tables.flat(made)))))
+    rows = list(csv.DictReader(io.StringIO(csv_rows(made.flat()))))
     assert [row["tuned_on_protocol_seeds"] for row in rows] == ["True", "False"]
     assert "protocol seeds, which" not in markdown(boards.of(entries))
 
@@ -142,7 +141,7 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
 
     def told() -> tuple[dict[str, int], str, str]:
         made = board.build(collect.collect(tmp_path / "runs")[0])
-        rows = board.as_dict(made)["sections"][0]["rows"]
+        rows = made.as_dict()["sections"][0]["rows"]
         counts = {row["label"].split()[0]: row["parameters"]["classical"] for row in rows}
         return counts, markdown(made), report.render(made)
 

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard import board, ranked
+from qrlsuite.leaderboard.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY
@@ -55,7 +56,7 @@ def test_entries_are_compared_at_what_both_have_reached(train: Callable[..., Pat
     first, second = (collect.read_entry(EntryStore(path)) for path in (long, short))
     assert first is not None
     assert second is not None
-    compared = board.compare_entries(first, second)
+    compared = compare_entries(first, second)
     assert compared.horizon == 180
 
 
@@ -72,10 +73,10 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     several = [drawn("mlp a"), drawn("mlp b"), drawn("mlp c")]
     object.__setattr__(several[0], "task_file", lying)
     for order in (several, several[::-1]):
-        assert board.ranking_of(order) == ranking
-        assert board.build(order).sections[0].cell == board.cell_text(ranking)
+        assert ranked.ranking_of(order) == ranking
+        assert board.build(order).sections[0].cell == ranked.cell_text(ranking)
     one, two = several[0], several[1]
-    assert board.ranking_of([one, two]) == board.ranking_of([two, one])
+    assert ranked.ranking_of([one, two]) == ranked.ranking_of([two, one])
 
 
 def test_scores_that_no_board_would_rank_end_the_run_at_once(

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import costs, report
+from qrlsuite.leaderboard import board, costs, report
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard import boards
 
@@ -44,7 +44,7 @@ def learner(
 
 
 def section(*entries: EntryResults, by: str = "executions") -> costs.CostSection:
-    (found,) = costs.build(entries, by).sections
+    (found,) = board.build(entries, by=by).sections
     return found
 
 
@@ -150,21 +150,19 @@ def test_shots_are_executions_times_shots() -> None:
 
 def test_few_seeds_and_short_entries() -> None:
     short = learner("short", 1, 0.001, epochs=3)
-    board = costs.build([learner("a", 20, 2), learner("few", 20, 2, seeds=5), short], "executions")
-    assert [board.sections[0].rank_text(row) for row in board.sections[0].rows] == ["1", "undecided"]
-    assert board.refused == ("short: ends at 6000 steps; --horizon 6000 shows it",)
-    assert board.sections[0].budget == 2 * 100 * STEPS, "the short entry does not shrink the budget"
+    made = board.build([learner("a", 20, 2), learner("few", 20, 2, seeds=5), short], by="executions")
+    (found,) = made.sections
+    assert [found.rank_text(row) for row in found.rows] == ["1", "undecided"]
+    assert made.refused == ("short: ends at 6000 steps; --horizon 6000 shows it",)
+    assert found.budget == 2 * 100 * STEPS, "the short entry does not shrink the budget"
 
 
-def test_bad_units() -> None:
-    with pytest.raises(OptionError, match=r"the board of `api\.board` is by steps"):
-        costs.build([], "steps")
+def test_an_unknown_axis_is_one_error() -> None:
     with pytest.raises(
-        OptionError, match="choose among steps, executions, shots, core-hours; did you mean 'shots'"
+        OptionError,
+        match="choose among steps, executions, shots, core-hours, score, area; did you mean 'shots'",
     ):
-        costs.build([learner("a", 20, 2)], "shot")
-    with pytest.raises(OptionError, match="alpha"):
-        costs.build([learner("a", 20, 2)], "shots", alpha=2)
+        board.build([learner("a", 20, 2)], by="shot")
 
 
 def say(*words: str) -> Result:
@@ -184,7 +182,7 @@ def test_the_board_in_every_format(tmp_path: Any) -> None:
     assert circuit["sample_complexity"] == pytest.approx(166_000 * circuit["per_step"])
     assert network["problem"] == "executes no circuits"
     rows = list(csv.DictReader(io.StringIO(say("--by", "executions", *PAIR, "--format", "csv").stdout)))
-    assert [row["rank_best"] for row in rows] == ["1", ""]
+    assert [row["rank"] for row in rows] == ["1", ""]
     markdown = say("--by", "executions", *PAIR, "--format", "markdown").stdout
     assert "### beam6g by executions, within 375M" in markdown
     latex = say("--by", "executions", *PAIR, "--format", "latex").stdout
@@ -195,7 +193,7 @@ def test_the_board_in_every_format(tmp_path: Any) -> None:
     )
     page = tmp_path / "page.html"
     assert say("--by", "executions", *PAIR, "--format", "html", "--out", str(page)).exit_code == 0
-    assert '<a href="#cost-1">beam6g by executions</a>' in page.read_text()
+    assert '<a href="#beside-1">beam6g by executions</a>' in page.read_text()
     assert "1.87k" in page.read_text()
 
 
@@ -213,20 +211,20 @@ def test_what_is_left_out_is_said_on_stderr_and_the_table_stays_a_table(tmp_path
 
 def test_the_page_shows_costs_beside_steps() -> None:
     entries = [learner("a", 20, 2), learner("<b>", 30, 2)]
-    page = report.render(boards.of(entries), costs=costs.build(entries, "executions"))
-    assert page.count('id="cost-1-title"') == 1
+    page = report.render(boards.of(entries), beside=board.build(entries, by="executions"))
+    assert page.count('id="beside-1-title"') == 1
     assert '<th scope="row">&lt;b&gt;</th>' in page
 
 
 def test_costs_are_not_mixed_with_what_counts_steps() -> None:
-    for words in (("--rule", "times"), ("--across", "beam6g", "cartpole")):
+    for words in (("--rule", "times"), ("--rule", "paper")):
         result = CliRunner().invoke(build(), ["leaderboard", "--by", "shots", *words])
         assert result.exit_code != 0
-        assert "which counts in environment steps" in str(result.exception) + result.output
+        assert "judges cells of one task in environment steps" in str(result.exception) + result.output
 
 
 def test_an_object_shows_itself() -> None:
-    board = api.costs("beam6g", by="executions", runs="none", published=True, entries=["vqc-native qubits=6"])
-    assert "375M" in board._repr_html_()
-    assert "375M" in repr(board)
-    assert board.as_dict()["refused"] == []
+    made = api.board("beam6g", by="executions", runs="none", published=True, entries=["vqc-native qubits=6"])
+    assert "375M" in made._repr_html_()
+    assert "375M" in repr(made)
+    assert made.as_dict()["refused"] == []

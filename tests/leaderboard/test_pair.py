@@ -12,7 +12,8 @@ import pytest
 from rich.console import Console
 
 from qrlsuite import api
-from qrlsuite.leaderboard import board, pair, tables
+from qrlsuite.leaderboard import pair
+from qrlsuite.leaderboard.compared import compare_entries, pair_table
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards
@@ -44,14 +45,14 @@ def test_the_helpers_are_right_by_hand() -> None:
 def test_the_winner_is_the_subject_whatever_the_order() -> None:
     fast, slow = entry("fast", spread(18)), entry("slow", spread(38))
     sentence = "fast needs 50% fewer steps than slow (48% to 51%, 30 seeds each, p < .0001)"
-    assert board.compare_entries(fast, slow).verdict == sentence
-    assert board.compare_entries(slow, fast).verdict == sentence
+    assert compare_entries(fast, slow).verdict == sentence
+    assert compare_entries(slow, fast).verdict == sentence
 
 
 def test_every_threshold_has_numbers_of_its_own() -> None:
     """Both reach .75 at epoch 20 on average and the first alone .95: thresholds above .75 are never reached."""
     first, second = entry("first", spread(18)), entry("second", spread(18), score=0.75)
-    compared = board.compare_entries(first, second)
+    compared = compare_entries(first, second)
     rows = {row[0]: row[1:] for row in compared.pair.rows()}
     assert rows["0.9"][:2] == ("40k", "never")
     assert rows["0.9"][2].startswith("-80% (")
@@ -66,7 +67,7 @@ def test_a_verdict_that_rests_on_one_threshold_names_it_with_its_interval() -> N
     for each, seed in ((first, 0), (second, 7)):
         for run in range(30):
             each.curves[run, noise.integers(30, 100) + seed // 20 :] = 0.95
-    said = board.compare_entries(first, second).verdict
+    said = compare_entries(first, second).verdict
     assert said.startswith(
         "first needs fewer steps than second at threshold 0.6 (19% fewer, 16% to 21%) (30 seeds"
     )
@@ -75,23 +76,23 @@ def test_a_verdict_that_rests_on_one_threshold_names_it_with_its_interval() -> N
 
 def test_two_that_reached_nothing_are_told_what_to_do() -> None:
     first, second = entry("first", spread(18), 0.5), entry("second", spread(18), 0.2)
-    said = board.compare_entries(first, second).verdict
+    said = compare_entries(first, second).verdict
     assert said == "neither reached any of the 7 thresholds within 200k steps: train longer, or lower them"
-    assert "difference +0.3 (+0.3 to +0.3, p < .0001)" in board.compare_entries(first, second).pair.final
+    assert "difference +0.3 (+0.3 to +0.3, p < .0001)" in compare_entries(first, second).pair.final
 
 
 def test_equals_are_not_told_apart_and_few_are_undecided() -> None:
     first, second = entry("first", spread(20)), entry("second", spread(20))
-    assert board.compare_entries(first, second).verdict == (
+    assert compare_entries(first, second).verdict == (
         "not told apart: first needs 0.0% fewer steps than second, 3.3% fewer to 3.4% more (30 seeds each, p = 1)"
     )
-    few = board.compare_entries(entry("few", spread(20, 10)), second)
+    few = compare_entries(entry("few", spread(20, 10)), second)
     assert few.verdict.startswith(
         "undecided: fewer than 20 seeds (10 and 30 seeds); few needs 0.0% fewer steps"
     )
     assert {row[-2:] for row in few.pair.rows()} == {("-", "undecided")}
     assert "p " not in few.pair.final.partition(";")[0]
-    one = board.compare_entries(entry("one", spread(20, 1)), second)
+    one = compare_entries(entry("one", spread(20, 1)), second)
     assert (
         one.verdict
         == "undecided: fewer than 20 seeds (1 and 30 seeds); one needs 9.1% fewer steps than second"
@@ -102,7 +103,7 @@ def test_equals_are_not_told_apart_and_few_are_undecided() -> None:
 def test_a_trade_off_names_both_sides() -> None:
     early, late = entry("early", spread(18), 0.72), entry("late", spread(40))
     early.curves[:, 90:] = 0.95
-    compared = board.compare_entries(early, late)
+    compared = compare_entries(early, late)
     assert compared.pair.times.direction is Direction.TRADE_OFF
     assert compared.verdict.startswith("trade-off: early needs fewer steps at thresholds 0.7 (52% fewer, ")
     assert ", late at thresholds 0.9 (53% fewer, " in compared.verdict
@@ -111,7 +112,7 @@ def test_a_trade_off_names_both_sides() -> None:
 def test_the_board_of_more_entries_is_stricter() -> None:
     first = entry("first", np.arange(10, 50))
     second = entry("second", np.arange(16, 56))
-    alone = board.compare_entries(first, second)
+    alone = compare_entries(first, second)
     assert alone.pair.times.direction is Direction.FEWER
     others = [entry(f"other {k}", spread(20 + k)) for k in range(6)]
     few = entry("few", spread(30, 19))
@@ -130,9 +131,9 @@ def test_the_board_of_more_entries_is_stricter() -> None:
 
 
 def test_numbers_in_a_label_are_never_cut_by_a_narrow_terminal() -> None:
-    compared = board.compare_entries(entry("mlp width=16", spread(18)), entry("mlp width=64", spread(38)))
+    compared = compare_entries(entry("mlp width=16", spread(18)), entry("mlp width=64", spread(38)))
     console = Console(width=80, file=io.StringIO())
-    console.print(tables.pair_table(compared.pair))
+    console.print(pair_table(compared.pair))
     shown = console.file.getvalue()
     assert "width=16   width=64" in shown
     for cells in compared.pair.rows():
@@ -160,7 +161,7 @@ def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
     kept = first.task_file.ranking.grid.thresholds
     changed, same = replace(first, first_thresholds=(0.9, 0.8)), replace(second, first_thresholds=kept[::-1])
     said = "thresholds changed after the first seed: first"
-    assert said in board.compare_entries(changed, same).remarks
+    assert said in compare_entries(changed, same).remarks
     (named,), (unchanged,) = (boards.of([one, same]).sheets(explain=True) for one in (changed, first))
     assert said in named.markdown()
     assert "thresholds changed" not in unchanged.markdown()

@@ -25,6 +25,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import board, costs, studies
+from qrlsuite.leaderboard.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
@@ -455,7 +456,7 @@ def test_seeds_that_may_have_been_chosen_are_not_ranked(folder: Path, tmp_path: 
     assert "not ranked" in verify.verify(folder).message
     (entry,), _ = collect.collect(tmp_path / "entries")
     with pytest.raises(QrlSuiteError, match="3 is missing"):
-        board.compare_entries(entry, entry)
+        compare_entries(entry, entry)
 
 
 def test_two_seeds_with_one_curve_are_refused(folder: Path) -> None:
@@ -629,7 +630,7 @@ def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
     assert entry.seeds == (0,)
     there = published.read(export(entry, tmp_path / "entries")).entry_results()
     for found in (entry, there):
-        assert board.as_dict(board.build([found]))["sections"][0]["rows"][0]["tuning"] == {"steps": 7}
+        assert board.build([found]).as_dict()["sections"][0]["rows"][0]["tuning"] == {"steps": 7}
 
 
 STUDY = """

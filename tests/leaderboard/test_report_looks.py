@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.leaderboard import across, board
+from qrlsuite.leaderboard import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
@@ -113,8 +113,8 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
     entries = []
     for task in ("beam6g", "cartpole"):
         entries += [replace(each, task=task, task_hash=task) for each in boards.graded(2, seeds=30)]
-    compared = across.compare(entries, ["beam6g", "cartpole"])
-    page = render(board.build(entries), studies=in_folder(runs)[0], across=compared)
+    compared = board.build(entries, together=["beam6g", "cartpole"])
+    page = render(board.build(entries), studies=in_folder(runs)[0], beside=compared)
     tab = opened(page, width=width)
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.locator("nav a[href='#studies']").count() == 1
@@ -126,6 +126,6 @@ def test_decisions_and_several_tasks_in_a_browser(opened: Callable[..., Any], ru
     looks = studies.first.locator("details")
     looks.locator("summary").click()
     assert "0.026" in looks.inner_text()
-    table = tab.locator("#across tbody")
+    table = tab.locator("#beside-1 tbody")
     assert table.locator("tr").count() == 2
     assert "model-0 width=1" in table.locator("tr").first.inner_text()

@@ -19,9 +19,11 @@ from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.cli.app import build
+from qrlsuite.engine import sheet
 from qrlsuite.errors import OptionError, TaskError
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board, report, sheet, tables
+from qrlsuite.leaderboard import board, report
+from qrlsuite.leaderboard.compared import compare_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction
@@ -147,7 +149,7 @@ def four() -> board.Leaderboard:
 
 def test_json_holds_the_matrix_of_adjusted_p() -> None:
     made = four()
-    (section,) = json.loads(json.dumps(board.as_dict(made), allow_nan=False))["sections"]
+    (section,) = json.loads(json.dumps(made.as_dict(), allow_nan=False))["sections"]
     found = section["times"]
     p = np.array(found["adjusted_p"], dtype=float)
     assert p.shape == (5, 5)
@@ -166,10 +168,10 @@ def test_json_holds_the_matrix_of_adjusted_p() -> None:
 
 def test_csv_holds_the_same_numbers() -> None:
     made = four()
-    (section,) = board.as_dict(made)["sections"]
+    (section,) = made.as_dict()["sections"]
     found = section["times"]
     names = [row["entry"] for row in found["entries"]]
-    written = list(csv.DictReader(io.StringIO(sheet.csv_rows(tables.flat(made)))))
+    written = list(csv.DictReader(io.StringIO(sheet.csv_rows(made.flat()))))
     assert len(written) == 5
     for row in written:
         place = names.index(row["entry"])
@@ -380,7 +382,7 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
     }
     assert set(made.rules) == {"intervals", "times"}
     assert "<q>times, intervals</q>" in report.render(made)
-    assert board.compare_entries(ruled, replace(ruled, name="b")).rule == "times"
+    assert compare_entries(ruled, replace(ruled, name="b")).rule == "times"
 
 
 def test_an_unknown_rule_is_one_line_with_the_nearest(tmp_path: Path) -> None:

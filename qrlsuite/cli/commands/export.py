@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from qrlsuite import registry
-from qrlsuite.cli.arguments import AcrossOption, JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TasksOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.leaderboard import across as several
@@ -35,7 +35,7 @@ def export(
             help="Its name or label, or the beginning of one, after [TASK/]; or a study, by its name or file.",
         ),
     ] = None,
-    task: TaskOption = None,
+    task: TasksOption = None,
     everything: Annotated[bool, typer.Option("--all", help="Every complete entry of the folder.")] = False,
     out: Annotated[
         Path | None,
@@ -50,10 +50,9 @@ def export(
         typer.Option(
             "--rliable",
             metavar="FILE",
-            help="Instead, write the scores of --across as rliable's arrays, {entry: (runs, tasks)}, to FILE.npz.",
+            help="Instead, write the scores of the entries of several --task for rliable, {entry: (runs, tasks)}.",
         ),
     ] = None,
-    across: AcrossOption = None,
     force: Annotated[
         bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
     ] = False,
@@ -67,13 +66,14 @@ def export(
     (`qrlsuite show DIR/NAME`) and go on with it (`qrlsuite import DIR/NAME`); it may be written again while it goes on.
 
     With --rliable, the share of the horizon that each run spends at or above threshold, mean over the task's
-    thresholds (in [0, 1], more is better), of every entry that was trained on all tasks of --across with the same
+    thresholds (in [0, 1], more is better), of every entry that was trained on all these --task with the same
     options. Read the file for rliable by `dict(numpy.load("FILE.npz"))`.
 
     Example: qrlsuite export "mlp width=64" --out leaderboard/entries
     """
-    if rliable is not None or across is not None:
-        _rliable(rliable, across, task, entries or [], runs, json_output)
+    tasks = task or []
+    if rliable is not None:
+        _rliable(rliable, tasks, entries or [], runs, json_output)
         return
     if everything == bool(entries):
         raise OptionError("name the entries to export, or say --all: qrlsuite runs lists them")
@@ -88,8 +88,7 @@ def export(
         _with_looks(with_looks, out or Path("leaderboard/plans"), runs, json_output)
         return
     out = out or Path("leaderboard/unranked" if named else "leaderboard/entries")
-    lookup.check_tasks(runs, task)
-    tasks = [task] if task else []
+    lookup.check_tasks(runs, *tasks)
     if everything or named:
         chosen = [studies.select(name, runs, tasks) for name in named] or [collect.collect(runs, tasks)]
         selected = list({entry.folder: entry for entries, _ in chosen for entry in entries}.values())
@@ -147,25 +146,20 @@ def _with_looks(chosen: Sequence[Study], out: Path, runs: Path, json_output: boo
 
 
 def _rliable(
-    file: Path | None,
-    across: list[str] | None,
-    task: str | None,
+    file: Path,
+    tasks: list[str],
     names: list[str],
     runs: Path,
     json_output: bool,
 ) -> None:
     """Write rliable's arrays."""
-    if file is None or across is None:
-        option, missing = (
-            ("--rliable", "--across TASK TASK") if across is None else ("--across", "--rliable FILE")
-        )
-        raise OptionError(f"{option}: add {missing}")
-    if task is not None:
-        raise OptionError(f"--task {task}: --across names the tasks; leave it out")
+    if len(tasks) < 2:
+        raise OptionError("--rliable: name two tasks or more, as --task A --task B")
     if file.suffix != ".npz":
         raise OptionError(f"--rliable {file}: the file's ending must be .npz")
-    entries, refused = several.collected(runs, across, names)
-    shares = several.shares(entries, across, refused=refused)
+    collect.check_tasks(runs, tasks)
+    entries, refused = several.collected(tasks, lambda task: collect.select(runs, [task], names))
+    shares = several.shares(entries, tasks, refused=refused)
     arrays: dict[str, Any] = shares.rliable()
     content = io.BytesIO()
     np.savez(content, **arrays)

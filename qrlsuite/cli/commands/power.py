@@ -17,7 +17,7 @@ from rich.text import Text
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard import ranked
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results import speed
@@ -70,10 +70,10 @@ def power(
         raise OptionError(
             f"'{entries[0].label}' is of task {entries[0].task}, '{entries[1].label}' of {entries[1].task}"
         )
-    curves = [board.learning_curves(entry) for entry in entries]
+    curves = [ranked.learning_curves(entry) for entry in entries]
     horizon = common_horizon(curves[0], curves[-1])
     curves = [each.cut(horizon) for each in curves]
-    ranking = board.ranking_of(entries)
+    ranking = ranked.ranking_of(entries)
     grid = ranking.grid
     bounds = (0.0, 1.0) if ranking.thresholds is None else None
     pilots = [SmoothedRuns(each, bounds=bounds) for each in curves]

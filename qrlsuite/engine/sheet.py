@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Literal
+from typing import Any, Literal
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -80,6 +80,8 @@ class Sheet:
         What stands below the table in any case.
     label:
         By which LaTeX refers to it.
+    name:
+        What a page with several tables calls it.
     """
 
     title: str
@@ -88,6 +90,7 @@ class Sheet:
     explained: bool = False
     lines: tuple[str, ...] = ()
     label: str = ""
+    name: str = ""
 
     @classmethod
     def of(
@@ -99,12 +102,13 @@ class Sheet:
         words: Sequence[str] = (),
         label: str = "",
         explained: bool = False,
+        name: str = "",
     ) -> Sheet:
         """Return the sheet of some rows; `words` names the columns of words."""
         columns = (
             Column(head, tuple(row[place] for row in rows), head in words) for place, head in enumerate(heads)
         )
-        return cls(title, tuple(columns), tuple(notes), explained, label=label)
+        return cls(title, tuple(columns), tuple(notes), explained, label=label, name=name)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
@@ -243,6 +247,25 @@ def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
         flat = {name: "; ".join(value) if isinstance(value, list) else value for name, value in row.items()}
         writer.writerow({name: _harmless(value) for name, value in flat.items()})
     return buffer.getvalue()
+
+
+def flat_row(
+    first: Mapping[str, object], values: Mapping[str, Any], last: Mapping[str, object]
+) -> dict[str, object]:
+    """Return a row for a spreadsheet: `ranks` and intervals of `values` become two columns each, the rank comes first.
+
+    >>> flat_row({"task": "a"}, {"entry": "b", "ranks": [1, 3], "mean_interval": None}, {"alpha": 0.05})
+    {'task': 'a', 'rank': 1, 'rank_worst': 3, 'entry': 'b', 'mean_low': None, 'mean_high': None, 'alpha': 0.05}
+    """
+    flat: dict[str, object] = {**first, "rank": None, "rank_worst": None}
+    for name, value in values.items():
+        if name == "ranks" or name.endswith("interval"):
+            stem = name.removesuffix("_interval")
+            ends = ("rank", "rank_worst") if name == "ranks" else (f"{stem}_low", f"{stem}_high")
+            flat |= dict(zip(ends, value or (None, None)))
+        else:
+            flat[name] = value
+    return flat | dict(last)
 
 
 def _harmless(value: object) -> object:

@@ -1,0 +1,207 @@
+"""Two entries compared: the verdict by steps below threshold, and the cells of the sample-complexity surface."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from qrlsuite.engine.sheet import Sheet
+from qrlsuite.engine.terminal import Shown
+from qrlsuite.errors import QrlSuiteError
+from qrlsuite.leaderboard import tables
+from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
+from qrlsuite.leaderboard.ranked import WITH_LOOKS, learning_curves, ranking_of, rule_of
+from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.times import ALPHA
+from qrlsuite.statistics import Comparison, SignificanceRule, compare
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class EntryComparison(Shown, Comparison):
+    """The result of `compare_entries`. It shows itself as a verdict, a table of thresholds, and the cells in a line.
+
+    Attributes
+    ----------
+    labels:
+        What the two entries are called.
+    pair:
+        The verdict by steps below threshold, and the final scores.
+    remarks:
+        What may flatter one of them.
+    show_cells:
+        Whether the cells are shown one by one: a rule was asked for.
+    among:
+        The same pair on the board of its task; None where it was not looked for, or there is no other entry.
+    """
+
+    labels: tuple[str, str]
+    pair: PairVerdict
+    remarks: tuple[str, ...] = ()
+    show_cells: bool = False
+    among: OnBoard | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Which entry needs fewer steps, by how much and how surely, in a sentence."""
+        return self.pair.sentence
+
+    @property
+    def headline(self) -> str:
+        """Who is compared with whom cell by cell, and at how many seeds and steps."""
+        one, other = self.labels
+        rule = "" if self.rule == DEFAULT else f", rule '{self.rule}'"
+        return f"{one} against {other}, {self.n_runs} seeds each, {self.horizon} steps{rule}"
+
+    @property
+    def cells_line(self) -> str:
+        """What the rule for cells of the sample-complexity surface says."""
+        rule = "the paper's rule" if self.rule == DEFAULT else f"rule '{self.rule}'"
+        return f"by {rule}, cell by cell: {self.sentence}"
+
+    @property
+    def further(self) -> list[str]:
+        """What follows the table of thresholds, line by line."""
+        board = self.among.text if self.among is not None else ""
+        return [line for line in (board, self.pair.final, self.cells_line, *self.remarks) if line]
+
+    @property
+    def legend(self) -> str:
+        """What the signs in the table of cells mean."""
+        return legend(self)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the comparison as plain values, for JSON: the cells, and `verdict` and `times` beside them."""
+        return {
+            **super().as_dict(),
+            "verdict": self.verdict,
+            "times": self.pair.as_dict(),
+            "board": None if self.among is None else asdict(self.among),
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self.verdict)
+        yield pair_table(self.pair)
+        yield Text("\n".join(self.further))
+        if self.show_cells:
+            yield Text(f"\n{self.headline}:")
+            yield comparison_table(self)
+            yield Text(self.legend)
+
+    def _repr_html_(self) -> str:
+        pair = self.pair
+        notes = [*pair.notes, *self.further]
+        shown = Sheet.of(self.verdict, pair.columns(), pair.rows(), notes, explained=True).html()
+        return shown + (comparison_html(self, self.headline) if self.show_cells else "")
+
+
+def compare_entries(
+    first: EntryResults, second: EntryResults, rule: SignificanceRule | None = None
+) -> EntryComparison:
+    """Compare two entries of one task: by steps below threshold, by final score, and cell by cell of its ranking grid.
+
+    Parameters
+    ----------
+    first, second:
+        The entries.
+    rule:
+        What counts as significant in a cell; None means the task's own, the paper's where it names none.
+
+    Raises
+    ------
+    QrlSuiteError
+        If they belong to different tasks, one is of a study with looks, or their lengths have no common horizon.
+    """
+    if first.task_hash != second.task_hash:
+        raise QrlSuiteError(
+            f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
+            f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
+        )
+    for entry in (first, second):
+        if entry.plan:
+            raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")
+        if entry.chosen_seeds:
+            raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
+    epochs = min(first.curves.shape[1], second.curves.shape[1])
+    first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
+    grid, asked = ranking_of([first, second]).grid, rule is not None
+    pair = judge_pair(first, second, grid, ALPHA)
+    rule = rule or rule_of([first, second])
+    comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
+    values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
+    remarks = tables.changed_thresholds([first, second]) + [
+        f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
+        for entry in (first, second)
+        if entry.on_protocol_seeds
+    ]
+    return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
+
+
+SYMBOLS = {
+    "win": ("+", "bold bright_blue", "significantly fewer samples"),
+    "loss": ("-", "bold dark_orange", "significantly more samples"),
+    "tie": (".", "dim", "no significant difference"),
+    "both-at-cap": ("^", "dim", "both at the cap"),
+    "undecided": ("?", "yellow", "undecided"),
+}
+"""What a cell of a comparison looks like; the sign says everything, the color only helps."""
+
+
+def pair_table(pair: PairVerdict) -> Table:
+    """Return two entries threshold by threshold as a table."""
+    heading, *labels, size, p, verdict = pair.columns()
+    heads = ("\n".join(textwrap.wrap(label, 9, break_long_words=False)) for label in labels)
+    result = Table(
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        show_edge=False,
+        caption="\n".join(pair.notes),
+        caption_justify="left",
+    )
+    for name in (heading, *heads, size, p):
+        result.add_column(Text(name), justify="right", no_wrap=True)
+    result.add_column(Text(verdict), overflow="fold")
+    for row in pair.rows():
+        result.add_row(*map(Text, row))
+    return result
+
+
+def _levels(comparison: Comparison) -> tuple[str, list[str], list[str]]:
+    """Return what the rows of a comparison's grid are, their levels, and the deltas across."""
+    grid = comparison.grid
+    rows = [f"{float(level):g}" for level in grid.levels]
+    return f"{grid.level_name} down, delta across", rows, [f"{float(delta):g}" for delta in grid.deltas]
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Return a comparison as a table: a sign per cell of the grid."""
+    heading, rows, deltas = _levels(comparison)
+    result = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=Text(heading), title_justify="left")
+    result.add_column("", justify="right")
+    for delta in deltas:
+        result.add_column(Text(delta), justify="center")
+    for name, verdicts in zip(rows, comparison.verdicts):
+        result.add_row(Text(name), *(Text(*SYMBOLS[str(verdict)][:2]) for verdict in verdicts))
+    return result
+
+
+def legend(comparison: Comparison) -> str:
+    """Explain the signs that occur in a comparison's table."""
+    occurring = {str(verdict) for row in comparison.verdicts for verdict in row}
+    return ", ".join(f"{sign} {meaning}" for name, (sign, _, meaning) in SYMBOLS.items() if name in occurring)
+
+
+def comparison_html(comparison: Comparison, headline: str) -> str:
+    """Return a comparison's cells as HTML for a notebook: the result in words, and a sign per cell of the grid."""
+    heading, rows, deltas = _levels(comparison)
+    signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
+    remarks = [heading, legend(comparison)]
+    return Sheet.of(
+        f"{headline}: {comparison.sentence}", ["", *deltas], signs, remarks, explained=True
+    ).html()

@@ -1,0 +1,114 @@
+"""What every board is made of: which entries are ranked together, on which cells, and their sample complexity there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.experiment.task import RankingSection
+from qrlsuite.leaderboard import rules
+from qrlsuite.leaderboard.rules import DEFAULT
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.text import steps_text
+from qrlsuite.statistics import (
+    LearningCurves,
+    SignificanceRule,
+    at_cap,
+    bootstrap_interval,
+    sample_complexity,
+    unsettled,
+)
+
+
+@dataclass(frozen=True)
+class Complexity:
+    """Sample complexity at one cell: steps, its 5th to 95th percentile, and both marks."""
+
+    steps: int
+    low: int
+    high: int
+    at_cap: bool
+    unsettled: bool
+
+    @property
+    def text(self) -> str:
+        """Steps with interval and marks: `>= 64k (52k to 200k, at cap)`."""
+        sign = ">= " if self.unsettled else ""
+        mark = ", at cap" if self.at_cap else ""
+        return f"{sign}{steps_text(self.steps)} ({steps_text(self.low)} to {steps_text(self.high)}{mark})"
+
+
+def learning_curves(entry: EntryResults) -> LearningCurves:
+    """Return an entry's curves as the statistics take them."""
+    return LearningCurves(entry.curves, entry.steps_per_epoch, entry.name)
+
+
+WITH_LOOKS = (
+    "trained by a study with looks, which stops by what the seeds show, so that no rule for a fixed number of seeds "
+    "applies; `qrlsuite show STUDY` has its verdicts"
+)
+
+
+def of_one_definition(entries: Sequence[EntryResults]) -> tuple[list[EntryResults], list[str]]:
+    """Leave out entries of studies with looks or chosen seeds, and those made under another definition than most.
+
+    Returns
+    -------
+    tuple
+        The entries that stay, task by task, and one line for each that was left out.
+    """
+    problems = [f"{entry.folder}: {WITH_LOOKS}" for entry in entries if entry.plan]
+    problems += [f"{entry.folder}: {entry.chosen_seeds}" for entry in entries if entry.chosen_seeds]
+    fixed = [entry for entry in entries if not entry.plan and not entry.chosen_seeds]
+    kept = []
+    for task in sorted({entry.task for entry in fixed}):
+        members = [entry for entry in fixed if entry.task == task]
+        hashes = [entry.task_hash for entry in members]
+        definition = max(sorted(set(hashes)), key=hashes.count)
+        kept += [entry for entry in members if entry.task_hash == definition]
+        problems += [
+            f"{entry.folder}: made under another definition of task '{task}' ({entry.task_hash}, not {definition})"
+            for entry in members
+            if entry.task_hash != definition
+        ]
+    return kept, problems
+
+
+def ranking_of(entries: Sequence[EntryResults]) -> RankingSection:
+    """Return the cells and horizons that most entries of a task have; they are equal where it is registered."""
+    ranked = [entry.task_file.ranking for entry in entries]
+    return max(sorted(ranked, key=lambda r: r.model_dump_json()), key=ranked.count)
+
+
+def rule_of(entries: Sequence[EntryResults]) -> SignificanceRule:
+    """Return the rule that a task names in `[ranking]`, the paper's where it names none."""
+    return rules.load(ranking_of(entries).rule or DEFAULT)
+
+
+def cell_text(ranking: RankingSection) -> str:
+    """Return the reference cell in words."""
+    cell = ranking.reference
+    if cell.epsilon is not None:
+        return f"epsilon {cell.epsilon:g}, delta {cell.delta:g}"
+    return f"return {cell.threshold:g}, delta {cell.delta:g}"
+
+
+def complexity_at(
+    values: np.ndarray[Any, np.dtype[np.float64]], ranking: RankingSection, steps_per_epoch: int, horizon: int
+) -> Complexity:
+    """Return the sample complexity at a task's reference cell.
+
+    Parameters
+    ----------
+    values:
+        (N, T) learning curves, cut to the horizon.
+    """
+    cell = ranking.reference_grid
+    steps = sample_complexity(values, cell, steps_per_epoch)
+    interval = bootstrap_interval(values, cell, steps_per_epoch)
+    low, high = (round(float(v)) for v in interval[0, 0])
+    capped, open_end = at_cap(interval, horizon)[0, 0], unsettled(values, cell)[0, 0]
+    return Complexity(int(steps[0, 0]), low, high, bool(capped), bool(open_end))

@@ -1,0 +1,331 @@
+"""The board by environment steps: ranks by time below threshold, tiers by the paper's definition, horizon by horizon.
+
+Everything is computed here from raw curves. Entries that are shorter than the task's shortest horizon stand in
+a provisional section of their own length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.leaderboard.ranked import (
+    Complexity,
+    cell_text,
+    complexity_at,
+    learning_curves,
+    ranking_of,
+    rule_of,
+)
+from qrlsuite.leaderboard.rules import DEFAULT, TIMES
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.times import TimeRanking, rank_by_time
+from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, outperformance
+from qrlsuite.statistics.compare import TOO_FEW
+
+SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
+"""What a spreadsheet shows of the win that a tier rests on."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """The narrowest win in the chain that puts an entry into its tier.
+
+    Attributes
+    ----------
+    winner, loser:
+        Labels of the pair.
+    cells:
+        Cells in which the winner needs significantly fewer samples.
+    at_cap:
+        Cells that say nothing, because both are at the cap.
+    total:
+        Cells of the grid.
+    """
+
+    winner: str
+    loser: str
+    cells: int
+    at_cap: int
+    total: int
+
+    @property
+    def text(self) -> str:
+        """`1 of 3`: won, of the cells in which not both are at the cap."""
+        return f"{self.cells} of {self.total - self.at_cap}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One entry of a section.
+
+    Attributes
+    ----------
+    tier:
+        None for an entry that is undecided, or reached the goal of no cell.
+    wins, losses:
+        Cells of the ranking grid, over all other entries, in which it needs significantly fewer samples, and more.
+    """
+
+    entry: EntryResults
+    tier: int | None
+    reference: Complexity
+    median_score: float
+    copeland: int
+    wins: int
+    losses: int
+    outperforms: tuple[str, ...]
+    outperformed_by: tuple[str, ...]
+    provisional: bool
+    """Fewer seeds than the task's protocol asks for."""
+    not_reached: bool = False
+    """At the cap in every cell: below those that outperform it, not ranked among others like it."""
+    rests_on: Support | None = None
+    """None in the first tier, and without a tier."""
+
+    @property
+    def depth(self) -> float:
+        """What orders entries on the board: the tier, then those that reached no goal; 0 where undecided."""
+        return float("inf") if self.not_reached else float(self.tier or 0)
+
+    @property
+    def reason(self) -> str:
+        """Why the entry has no tier; empty where it has one."""
+        return "" if self.tier is not None else untiered_reason(self)
+
+
+@dataclass(frozen=True)
+class Section:
+    """The ranking of a task's entries at one horizon."""
+
+    task: str
+    summary: str
+    horizon: int
+    provisional: bool
+    """Shorter than the task's own horizons."""
+    cell: str
+    rows: tuple[Row, ...]
+    pairs: Board
+    """The verdicts of all pairs, cell by cell."""
+    times: TimeRanking
+    """The same entries by steps below threshold, which ranks them."""
+    rule: str = DEFAULT
+    """Name of the significance rule that the tiers rest on."""
+    promise: str = ""
+    """What that rule controls."""
+    by_tiers: bool = False
+    """Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            "task": self.task,
+            "horizon": self.horizon,
+            "provisional": self.provisional,
+            "cell": self.cell,
+            "rule": self.rule,
+            "times": self.times.as_dict(),
+            "rows": [_row_dict(row) for row in self.rows],
+        }
+
+    def flat(self) -> list[dict[str, object]]:
+        """Return one row of values per entry in the order of the table, for a spreadsheet."""
+        place = {id(row.entry): index for index, row in enumerate(self.times.rows)}
+        rows = self.rows if self.by_tiers else sorted(self.rows, key=lambda row: place[id(row.entry)])
+        return [self._flat_row(row) for row in rows]
+
+    def _flat_row(self, row: Row) -> dict[str, object]:
+        values = _row_dict(row)
+        low, high = values.pop("interval")
+        count = values.pop("parameters")
+        tuning = values.pop("tuning") or {}
+        support = values.pop("rests_on") or {}
+        times = self.times.flat(row.entry)
+        tiers = {name: values.pop(name) for name in ("tier", "verdict")}
+        return {
+            "task": self.task,
+            "horizon": self.horizon,
+            "rank": times.pop("rank"),
+            "rank_worst": times.pop("rank_worst"),
+            **values,
+            "interval_low": low,
+            "interval_high": high,
+            "cell": self.cell,
+            "parameters_classical": count["classical"],
+            "parameters_quantum": count["quantum"],
+            "parameters_fixed": count["fixed"],
+            "networks": count["networks"],
+            "tuned": bool(tuning),
+            "tuned_on_protocol_seeds": bool(tuning.get("on_protocol_seeds")),
+            **times,
+            "rule": self.rule,
+            **tiers,
+            **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
+        }
+
+
+def sections(
+    task: str,
+    entries: Sequence[EntryResults],
+    rule: SignificanceRule | None = None,
+    horizon: int | None = None,
+    alpha: float = 0.05,
+    shown: Callable[[EntryResults], bool] | None = None,
+) -> tuple[list[Section], list[str]]:
+    """Rank the entries of a task, horizon by horizon; arguments as for `qrlsuite.leaderboard.board.build`.
+
+    Returns
+    -------
+    tuple
+        The sections, and one line for each that cannot be made.
+    """
+    made, problems = list[Section](), list[str]()
+    for steps, provisional, group in by_horizon(entries, horizon):
+        if shown is not None and not any(map(shown, group)):
+            continue
+        try:
+            chosen = rule or rule_of(group)
+            named = rule is not None or ranking_of(group).rule is not None
+            section = _section(task, steps, provisional, group, chosen, alpha, shown)
+            made.append(replace(section, by_tiers=named and chosen.name != TIMES))
+        except PluginError:
+            raise
+        except QrlSuiteError as error:
+            problems.append(f"task '{task}' at {steps} steps: {error}")
+    return made, problems
+
+
+def by_horizon(
+    entries: Sequence[EntryResults], requested: int | None
+) -> list[tuple[int, bool, list[EntryResults]]]:
+    """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
+    horizons = sorted(ranking_of(entries).horizons)
+    groups = []
+    for horizon in horizons if requested is None else [requested]:
+        reached = [entry.reaching(horizon // entry.steps_per_epoch) for entry in entries]
+        members = [entry for entry in reached if entry is not None]
+        if members:
+            groups.append((horizon, horizon < horizons[0], members))
+    if requested is not None:
+        return groups
+    short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
+    lengths = sorted({_length(entry) for entry in short}, reverse=True)
+    return groups + [
+        (steps, True, [entry for entry in short if _length(entry) == steps]) for steps in lengths
+    ]
+
+
+def _length(entry: EntryResults) -> int:
+    return int(entry.curves.shape[1]) * entry.steps_per_epoch
+
+
+def _section(
+    task: str,
+    horizon: int,
+    provisional: bool,
+    entries: Sequence[EntryResults],
+    rule: SignificanceRule,
+    alpha: float,
+    shown: Callable[[EntryResults], bool] | None,
+) -> Section:
+    ranking = ranking_of(entries)
+    board = outperformance([learning_curves(entry) for entry in entries], ranking.grid, rule, horizon=horizon)
+    by_name = {entry.name: entry for entry in entries}
+    labels = {entry.name: entry.label for entry in entries}
+    protocol_seeds = entries[0].task_file.protocol.seeds
+    rows = []
+    places, better = board.ranking, board.better_cells
+    capped = {place.name for place in places.not_reached}
+    for place in places.entries:
+        entry = by_name[place.name]
+        if shown is not None and not shown(entry):
+            continue
+        values = entry.curves[:, : horizon // entry.steps_per_epoch]
+        rows.append(
+            Row(
+                entry=entry,
+                tier=place.tier,
+                reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
+                median_score=float(np.median(values[:, -1])),
+                copeland=place.copeland,
+                wins=int(better[board.names.index(place.name)].sum()),
+                losses=int(better[:, board.names.index(place.name)].sum()),
+                outperforms=tuple(labels[name] for name in place.outperforms),
+                outperformed_by=tuple(labels[name] for name in place.outperformed_by),
+                provisional=len(entry.seeds) < protocol_seeds,
+                not_reached=place.name in capped,
+                rests_on=_support(board, place.rests_on, labels),
+            )
+        )
+    return Section(
+        task=task,
+        summary=entries[0].task_file.summary,
+        horizon=horizon,
+        provisional=provisional,
+        cell=cell_text(ranking),
+        rows=tuple(rows),
+        pairs=board,
+        times=rank_by_time(entries, ranking.grid, horizon, alpha, shown),
+        rule=rule.name,
+        promise=rule.promise,
+    )
+
+
+def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, str]) -> Support | None:
+    if pair is None:
+        return None
+    won, lost = (board.names.index(name) for name in pair)
+    return Support(
+        winner=labels[pair[0]],
+        loser=labels[pair[1]],
+        cells=int((board.signs[won, lost] > 0).sum()),
+        at_cap=int(board.capped[won, lost].sum()),
+        total=board.signs[won, lost].size,
+    )
+
+
+def untiered_reason(row: Row) -> str:
+    """Say why an entry has no tier."""
+    if row.not_reached:
+        return "not reached: at the cap in every cell, and not ranked among each other"
+    if len(row.entry.seeds) < MIN_RUNS:
+        return TOO_FEW
+    return "undecided: nothing to compare with"
+
+
+def _row_dict(row: Row) -> dict[str, Any]:
+    entry = row.entry
+    return {
+        "tier": row.tier,
+        "verdict": "ranked" if row.tier is not None else untiered_reason(row),
+        "rests_on": None if row.rests_on is None else asdict(row.rests_on),
+        "entry": entry.name,
+        "label": entry.label,
+        "parameters": {
+            "classical": entry.parameters[0],
+            "quantum": entry.parameters[1],
+            "fixed": entry.fixed,
+            "networks": entry.networks,
+        },
+        "settings": entry.settings,
+        "seeds": len(entry.seeds),
+        "unfinished_seeds": len(entry.left_out),
+        "diverged_seeds": list(entry.diverged),
+        "provisional": row.provisional,
+        "sample_complexity": row.reference.steps,
+        "interval": [row.reference.low, row.reference.high],
+        "at_cap": row.reference.at_cap,
+        "unsettled": row.reference.unsettled,
+        "median_score": row.median_score,
+        "copeland": row.copeland,
+        "wins": row.wins,
+        "losses": row.losses,
+        "outperforms": list(row.outperforms),
+        "outperformed_by": list(row.outperformed_by),
+        "core_hours": entry.hours,
+        "tuning": entry.tuning,
+    }
