@@ -11,8 +11,8 @@ import numpy as np
 
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import steps, tables
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.steps import by_horizon
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
@@ -224,13 +224,14 @@ def sections(
     shown: Callable[[EntryResults], bool] | None = None,
 ) -> tuple[list[ScoreSection], list[str]]:
     """Rank a task's entries by score at the horizon that most of them reach; see `qrlsuite.leaderboard.board.build`."""
-    groups = by_horizon(entries, horizon)
-    if not groups or not (shown is None or any(map(shown, entries))):
-        return [], []
-    end, _, members = max(groups, key=lambda group: (not group[1], len(group[2]), group[0]))
-    section = rank_by_score(members, end, by, alpha)
+    by_steps, problems = steps.sections(task, entries, None, horizon, alpha)
+    if not by_steps or not (shown is None or any(map(shown, entries))):
+        return [], problems
+    main = tables.main_section(by_steps)
+    members = [row.entry for row in main.rows]  # in the order of tiers, from which the bootstrap draws
+    section = rank_by_score(members, main.horizon, by, alpha)
     names = None if shown is None else frozenset(entry.name for entry in members if shown(entry))
-    return [replace(section, shown=names)], []
+    return [replace(section, shown=names)], problems
 
 
 def _interval(value: float, low: float, high: float) -> str:

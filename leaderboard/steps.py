@@ -184,7 +184,7 @@ def sections(
         The sections, and one line for each that cannot be made.
     """
     made, problems = list[Section](), list[str]()
-    for steps, provisional, group in by_horizon(entries, horizon):
+    for steps, provisional, group in _by_horizon(entries, horizon):
         if shown is not None and not any(map(shown, group)):
             continue
         try:
@@ -199,7 +199,7 @@ def sections(
     return made, problems
 
 
-def by_horizon(
+def _by_horizon(
     entries: Sequence[EntryResults], requested: int | None
 ) -> list[tuple[int, bool, list[EntryResults]]]:
     """Divide entries of a task: (horizon, provisional, members); a long entry is in every section it reaches."""
