@@ -411,7 +411,7 @@ def train(
 
     Raises
     ------
-    UnknownNameError, OptionError, TaskError
+    UnknownNameError, OptionError, FileError
         For an unknown name, or an option or argument that cannot be used.
     StoreError
         If a file of the entry is damaged, or another code has begun its seeds.
@@ -649,8 +649,6 @@ def new_study(
     entries: Sequence[str],
     *,
     task: str,
-    algorithm: str | None = None,
-    preset: str | None = None,
     epochs: int | None = None,
     looks: Sequence[int] = (20, 40, 60, 80, 100),
     alpha: float = ALPHA,
@@ -668,8 +666,8 @@ def new_study(
         The file, NAME.toml. It can be edited until its first seed begins.
     entries:
         Two or more: `"mlp width=64"`, `"vqc-native qubits=10"`; tuned: `"mlp preset=FILE.toml"`.
-    task, algorithm, preset, epochs:
-        As for `train`; algorithm and preset are those of entries that name none.
+    task, epochs:
+        As for `train`.
     looks:
         Seeds of each entry at each look.
     alpha, spending:
@@ -696,8 +694,6 @@ def new_study(
         task,
         entries,
         Path(runs),
-        algorithm=algorithm,
-        preset=preset,
         first_seed=first_seed,
         epochs=epochs,
         looks=list(looks),
@@ -727,7 +723,7 @@ def read_study(
 
     Raises
     ------
-    UnknownNameError, OptionError, TaskError
+    UnknownNameError, OptionError, FileError
         If there is no such study, or it is malformed.
     StoreError
         If its results are damaged, or were changed after a look.
@@ -795,7 +791,7 @@ def run_study(
 
     Raises
     ------
-    UnknownNameError, OptionError, TaskError
+    UnknownNameError, OptionError, FileError
         For an unknown name, an option or argument that cannot be used, or a `budget` that holds not even one seed.
     QrlSuiteError
         If training failed; finished epochs are kept.

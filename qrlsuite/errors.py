@@ -18,8 +18,8 @@ class UnknownNameError(QrlSuiteError):
     """No task, model, algorithm, ansatz, option or entry has that name."""
 
 
-class TaskError(QrlSuiteError):
-    """A task file is malformed; the message lists every problem with its path in the file."""
+class FileError(QrlSuiteError):
+    """A file (task, preset, study, grid) cannot be read, or is malformed; the message lists every problem."""
 
 
 class OptionError(QrlSuiteError):

@@ -41,13 +41,7 @@ class Written:
     def given(
         self, algorithm: str | None = None, settings: tuple[Setting, ...] = (), preset: str | None = None
     ) -> Written:
-        """Return it with what was given beside the text: further settings, and what the text leaves open.
-
-        Raises
-        ------
-        OptionError
-            If the text names another algorithm or preset.
-        """
+        """Return it with what was given beside the text: further settings, and what the text leaves open."""
         for name, written, other in (
             ("algorithm", self.algorithm, algorithm),
             (PRESET, self.preset, preset),
@@ -94,11 +88,6 @@ def parse_named(text: str, prefix: str = "") -> tuple[str, dict[str, Any]]:
     ----------
     prefix:
         What stands before it where it was written, for messages.
-
-    Raises
-    ------
-    OptionError
-        If there is not one name at the beginning, or an option has no name.
     """
     names, settings = _parse(text, f"{prefix}'{text}': ")
     if len(names) != 1 or any(setting.side for setting in settings):
@@ -115,11 +104,6 @@ def _parse(text: str, prefix: str) -> tuple[list[str], list[Setting]]:
 
 def split(text: str) -> list[str]:
     """Split at white space, but not within the quotes and brackets of a value.
-
-    Raises
-    ------
-    OptionError
-        If a quote or bracket is open at the end.
 
     >>> split("mlp widths=[64, 64] title='two layers'")
     ['mlp', 'widths=[64, 64]', "title='two layers'"]

@@ -13,13 +13,14 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal
 
 import pydantic
 import pydantic_core
 from packaging.version import Version
 
 from qrlsuite.errors import OptionError, PluginError, nearest
+from qrlsuite.files import read_toml, validation_lines
 
 Values = dict[str, Any]
 
@@ -46,11 +47,6 @@ class Since:
     ----------
     version:
         Of the package that the options class belongs to.
-
-    Raises
-    ------
-    PluginError
-        If that is not a version such as 0.2.0.
     """
 
     version: str
@@ -86,11 +82,6 @@ class Tuned:
         Tuned only for models of this family; None for all.
     per_agent:
         Whether agents of one population may have different values.
-
-    Raises
-    ------
-    PluginError
-        If that is no such range.
     """
 
     low: float
@@ -212,62 +203,6 @@ def _infinite(value: Any) -> bool:
     return isinstance(value, float) and math.isinf(value)
 
 
-def validation_lines(error: pydantic.ValidationError) -> list[str]:
-    """Turn a pydantic error into lines `path = value: what is wrong`."""
-    lines = []
-    for item in error.errors(include_url=False):
-        path = ".".join(str(part) for part in item["loc"])
-        value = item.get("input")
-        value_text = "" if isinstance(value, Mapping) or item["type"] == "missing" else f" = {_short(value)}"
-        message = str(item["msg"]).removeprefix("Value error, ")
-        lines.append(f"{path}{value_text}: {message}" if path else message)
-    return lines
-
-
-def file_problems(error: pydantic.ValidationError, model: type[pydantic.BaseModel]) -> list[str]:
-    """Turn the error of a whole file into lines with paths, and the nearest known key for each unknown one.
-
-    Parameters
-    ----------
-    model:
-        What the file was validated as.
-    """
-    lines = []
-    for item, line in zip(error.errors(include_url=False), validation_lines(error)):
-        path = [str(part) for part in item["loc"]]
-        if item["type"] == "extra_forbidden":
-            *parents, key = path
-            table = f" in [{'.'.join(parents)}]" if parents else ""
-            lines.append(f"unknown key '{key}'{table}{nearest(key, _keys(model, parents))}")
-        elif item["type"] == "missing":
-            lines.append(f"missing key '{'.'.join(path)}'")
-        else:
-            lines.append(line)
-    return lines
-
-
-def _keys(model: Any, path: Sequence[str]) -> list[str]:
-    """Return the known keys of a (nested) section of a file; `path` may lead through lists, tables and options."""
-    for part in path:
-        if part.isdecimal():
-            continue
-        if get_origin(model) is dict:
-            model = get_args(model)[1]
-        else:
-            info = getattr(model, "model_fields", {}).get(part)
-            model = info.annotation if info is not None else None
-        while get_origin(model) is not dict and (
-            arguments := [each for each in get_args(model) if each is not type(None)]
-        ):
-            model = arguments[0]
-    return list(getattr(model, "model_fields", {}))
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
 def plain(options: Any) -> Values:
     """Return an options object as JSON-compatible values, every default written out."""
     result: Values = pydantic.TypeAdapter(type(options)).dump_python(options, mode="json")
@@ -313,13 +248,7 @@ def without_later(cls: type[Any], values: Mapping[str, Any]) -> Values:
 
 
 def later(cls: type[Any]) -> dict[str, tuple[str, Any]]:
-    """Return version and plain default of every option marked `Since`, by name.
-
-    Raises
-    ------
-    PluginError
-        If one has no default.
-    """
+    """Return version and plain default of every option marked `Since`, by name."""
     added = {}
     for name, info in _pydantic_fields(cls).items():
         for mark in info.metadata:
@@ -381,11 +310,6 @@ def parse_setting(word: str, prefix: str = "--set ") -> Setting:
     """Parse `[environment.|model.|ansatz.|algorithm.]name=value`; the value is read as TOML, else as text.
 
     `prefix` is what stands before it where it was written, for messages.
-
-    Raises
-    ------
-    OptionError
-        If there is no `=` or no name.
     """
     key, equals, text = word.partition("=")
     if not equals or not key.strip():
@@ -396,13 +320,7 @@ def parse_setting(word: str, prefix: str = "--set ") -> Setting:
 
 
 def from_mapping(values: Mapping[str, Any] | None) -> list[Setting]:
-    """Return settings from a mapping: `{"qubits": 6, "algorithm.gamma": 0.9}`.
-
-    Raises
-    ------
-    OptionError
-        If a name is no text.
-    """
+    """Return settings from a mapping: `{"qubits": 6, "algorithm.gamma": 0.9}`."""
     settings = []
     for key, value in (values or {}).items():
         if not isinstance(key, str) or not key.strip():
@@ -412,22 +330,6 @@ def from_mapping(values: Mapping[str, Any] | None) -> list[Setting]:
         side, dot, name = key.strip().partition(".")
         settings.append(Setting(side if dot else None, name if dot else side, value, "option "))
     return settings
-
-
-def read_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text.
-
-    Raises
-    ------
-    tomllib.TOMLDecodeError
-        If it is not valid, or Python cannot hold it: hundreds of nested arrays, integers of thousands of digits.
-    """
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        raise
-    except (RecursionError, ValueError) as error:
-        raise tomllib.TOMLDecodeError(f"too large a value: {error}") from None
 
 
 def parse_value(text: str) -> Any:
@@ -445,13 +347,7 @@ def parse_value(text: str) -> Any:
 
 
 def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[str, Values]:
-    """Distribute settings over the sides (`model`, `ansatz`, ...) that have options of that name.
-
-    Raises
-    ------
-    OptionError
-        For an unknown side or name (with the nearest match), or a bare name that several sides have.
-    """
+    """Distribute settings over the sides (`model`, `ansatz`, ...) that have options of that name."""
     result: dict[str, Values] = {side: {} for side in sides}
     every = {f"{side}.{name}" for side, cls in sides.items() for name in field_names(cls)}
     for setting in settings:

@@ -108,6 +108,7 @@ RENAMED_OPTIONS = {
     },
     "leaderboard": {"--across": "--task A --task B"},
     "export": {"--across": "--rliable FILE --task A --task B"},
+    "study new": dict.fromkeys(("--algorithm", "--preset"), f"{_ENTRY} 'ppo mlp preset=FILE'"),
     "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'"},
     "": {
         "--minutes": "--budget 30min",

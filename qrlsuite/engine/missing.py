@@ -21,7 +21,7 @@ from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing, RemoteEngine, Snapshot, raise_failures
-from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
+from qrlsuite.errors import FileError, OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import codes, probes, speed
@@ -200,7 +200,7 @@ def expected(work: Missing, where: Where) -> str | None:
         return None
     try:
         estimate = speed.known(work.runs).estimate(work.entry, work.together)
-    except TaskError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
+    except FileError:  # a plugin's file of reference speeds is malformed, which `qrlsuite check` says
         return None
     if estimate.basis != "measured":
         return None

@@ -61,12 +61,6 @@ class Where:
             A name with options: `slurm partition=gpu`.
         workers:
             Groups that are trained at a time; None lets the engine choose.
-
-        Raises
-        ------
-        UnknownNameError, OptionError, QrlSuiteError
-            If there is no such engine, it has no such option or value, a package is not installed, or there can be
-            no such device.
         """
         devices.check(device)  # the machine that trains checks whether it has this device
         name, values = parse_named(engine, "--engine ")
@@ -132,15 +126,6 @@ def build(name: str, option_values: Mapping[str, Any]) -> Engine:
     ----------
     option_values:
         Its options by name.
-
-    Raises
-    ------
-    UnknownNameError, OptionError
-        If there is no such engine, or it has no such option or value.
-    PluginError
-        If it has not the methods of an engine.
-    QrlSuiteError
-        If a package that it needs is not installed; the message has the pip command.
     """
     spec = registry.get(specs.EngineSpec, name)
     if spec.options is None and option_values:
@@ -169,13 +154,7 @@ class Queues:
         self._silent: dict[str, QrlSuiteError] = {}
 
     def waiting(self, store: EntryStore) -> set[int]:
-        """Return the seeds of an entry that were handed to a queue and are still there.
-
-        Raises
-        ------
-        QrlSuiteError
-            If a queue that was handed seeds cannot be asked on this machine.
-        """
+        """Return the seeds of an entry that were handed to a queue and are still there."""
         seeds: set[int] = set()
         for path in sorted(store.path.glob("*/submitted.json")):  # in a folder that has the engine's name
             name = path.parent.name

@@ -9,13 +9,7 @@ from qrlsuite.experiment.task import load
 
 
 def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
-    """Return a registered thing's options, protocol or file, as plain values.
-
-    Raises
-    ------
-    UnknownNameError
-        If nothing of that kind has the name.
-    """
+    """Return a registered thing's options, protocol or file, as plain values."""
     if kind is specs.TaskSpec and name.startswith("gym:"):
         return {"kind": "task", "name": name, "distribution": "gymnasium"} | _task(name)
     registered = registry.load().get(kind, name)

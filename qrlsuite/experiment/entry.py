@@ -282,13 +282,6 @@ def option_sides(
         What was set; `ansatz=NAME` among it chooses the ansatz.
     defaults:
         The model's options where nothing was set, by name; absent ones have the class's defaults.
-
-    Raises
-    ------
-    UnknownNameError
-        If no ansatz has the name that was chosen.
-    OptionError
-        If an option was set that another ansatz has, and nothing here.
     """
     own = specs.resolve(model.options)
     sides = {

@@ -7,17 +7,15 @@ record of that, so that a reader of a leaderboard knows how much was spent on th
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import pydantic
 import tomli_w
 from pydantic import Field, model_validator
 
-from qrlsuite import options
-from qrlsuite.errors import OptionError, TaskError, nearest
+from qrlsuite import files, options
+from qrlsuite.errors import OptionError
 
 TUNING_SEEDS = 1_000_000
 """Seeds from here on are for tuning; protocol seeds lie below."""
@@ -95,38 +93,8 @@ class PresetFile(options.Table):
 
 
 def load(path: Path) -> PresetFile:
-    """Read a preset file.
-
-    Raises
-    ------
-    TaskError
-        If it cannot be read or is malformed; the message lists every problem.
-    """
-    try:
-        data = options.read_toml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise TaskError(f"preset file {path} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"preset file {path}: not valid TOML: {error}") from None
-    try:
-        return PresetFile.model_validate(data)
-    except pydantic.ValidationError as error:
-        raise TaskError(f"preset file {path}: {'; '.join(_lines(error))}") from None
-
-
-def _lines(error: pydantic.ValidationError) -> list[str]:
-    lines = []
-    for item, line in zip(error.errors(include_url=False), options.validation_lines(error)):
-        *parents, key = (str(part) for part in item["loc"])
-        if item["type"] == "extra_forbidden":
-            known = (TuningRecord if parents else PresetFile).model_fields
-            table = f" in [{'.'.join(parents)}]" if parents else ""
-            lines.append(f"unknown key '{key}'{table}{nearest(key, known)}")
-        elif item["type"] == "missing":
-            lines.append(f"missing key '{'.'.join([*parents, key])}'")
-        else:
-            lines.append(line)
-    return lines
+    """Read a preset file."""
+    return files.load(path, PresetFile, "preset file")
 
 
 def require(preset: PresetFile, source: str, algorithm: str, model: str) -> None:

@@ -17,13 +17,7 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def canonical(source: bytes) -> bytes:
-    """Return a module's syntax tree as text, without docstrings, comments and places: equal on every Python.
-
-    Raises
-    ------
-    SyntaxError, ValueError
-        If this Python cannot read the source.
-    """
+    """Return a module's syntax tree as text, without docstrings, comments and places: equal on every Python."""
     return _walked(ast.parse(source))
 
 

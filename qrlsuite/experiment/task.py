@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,8 +15,8 @@ from pydantic import (
     model_validator,
 )
 
-from qrlsuite import options, registry, specs
-from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite import files, options, registry, specs
+from qrlsuite.errors import FileError, OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.preset import TuningRecord
 from qrlsuite.statistics.grid import Grid
 
@@ -218,7 +217,7 @@ class Task:
         try:
             self.environment = registry.get(specs.EnvironmentSpec, file.environment.name)
         except UnknownNameError as error:
-            raise TaskError(f"{source}: environment.name: {error}") from None
+            raise FileError(f"{source}: environment.name: {error}") from None
         cls = specs.resolve(self.environment.options)
         location = f"{source}: environment.options"
         self.environment_options = options.build(cls, file.environment.options, location)
@@ -235,11 +234,11 @@ class Task:
             try:
                 registry.load().get(specs.RuleSpec, file.ranking.rule)
             except UnknownNameError as error:
-                raise TaskError(f"{source}: ranking.rule: {error}") from None
+                raise FileError(f"{source}: ranking.rule: {error}") from None
         epoch = file.protocol.interactions
         for horizon in file.ranking.horizons:
             if horizon % epoch:
-                raise TaskError(
+                raise FileError(
                     f"{source}: ranking.horizons: {horizon} steps are not a whole number of epochs of {epoch} steps "
                     "(protocol.interactions)"
                 )
@@ -248,7 +247,7 @@ class Task:
             and file.score.max_return is None
             and file.ranking.thresholds is None
         ):
-            raise TaskError(
+            raise FileError(
                 f"{source}: without score.max_return, ranking.thresholds are needed instead of epsilons"
             )
 
@@ -274,17 +273,12 @@ class Task:
 
         Where the default preset says nothing about them, there is no preset: the algorithm's defaults are not what a
         task calls `tuned`.
-
-        Raises
-        ------
-        TaskError
-            If the task has no preset of that name, or it says nothing about the algorithm and the family.
         """
         chosen = name or self.file.default_preset
         if chosen is None:
             return None, {}
         if chosen not in self.file.presets:
-            raise TaskError(
+            raise FileError(
                 f"task '{self.name}' has no preset '{chosen}'{nearest(chosen, self.file.presets)}"
             )
         tables: dict[Any, dict[str, Any]] = dict(self.file.presets[chosen].get(algorithm, {}))
@@ -293,7 +287,7 @@ class Task:
         if name is None:
             return None, {}
         of = f" with {family} models" if tables else ""
-        raise TaskError(
+        raise FileError(
             f"task '{self.name}': preset '{chosen}' says nothing about algorithm '{algorithm}'{of}, only about "
             f"{', '.join(self.file.presets[chosen])}: leave it out, or set options one by one"
         )
@@ -304,13 +298,7 @@ class Task:
         return tables.get(family, tables.get("all"))
 
     def check_presets(self, algorithm: str, cls: type[Any]) -> None:
-        """Check every preset of an algorithm against its options class.
-
-        Raises
-        ------
-        TaskError
-            Listing every unknown name and every bad value with its path in the file.
-        """
+        """Check every preset of an algorithm against its options class."""
         problems = []
         for preset, by_algorithm in self.file.presets.items():
             for family in by_algorithm.get(algorithm, {}):
@@ -322,7 +310,7 @@ class Task:
                 except OptionError as error:
                     problems.append(str(error))
         if problems:
-            raise TaskError(f"{self.source}: " + "; ".join(dict.fromkeys(problems)))
+            raise FileError(f"{self.source}: " + "; ".join(dict.fromkeys(problems)))
 
 
 def digest(content: Any) -> str:
@@ -340,18 +328,13 @@ def parse(text: str, source: str) -> Task:
         TOML.
     source:
         Where it came from, for messages.
-
-    Raises
-    ------
-    TaskError
-        Listing every problem with its path in the file.
     """
     data = _whole(text, source)
     try:
         file = TaskFile.model_validate(data)
     except pydantic.ValidationError as error:
-        problems = [*options.file_problems(error, TaskFile), *_environment_problems(data.get("environment"))]
-        raise TaskError(f"{source}: " + "; ".join(problems)) from None
+        problems = [*files.problems(error, TaskFile), *_environment_problems(data.get("environment"))]
+        raise FileError(f"{source}: " + "; ".join(problems)) from None
     return Task(file, source)
 
 
@@ -364,28 +347,20 @@ def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any
     ----------
     below:
         The tasks whose files lead here by `extends`.
-
-    Raises
-    ------
-    TaskError
-        If a file is not TOML or cannot be read, or a task extends an unknown task or itself.
     """
-    try:
-        data = options.read_toml(text)
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"{source}: not valid TOML: {error}") from None
+    data = files.parse(text, source)
     if "extends" not in data:
         return data
     name = data.pop("extends")
     if not isinstance(name, str):
-        raise TaskError(f'{source}: extends = {name!r}: name a task, as in extends = "beam6g"')
+        raise FileError(f'{source}: extends = {name!r}: name a task, as in extends = "beam6g"')
     if name in below:
-        raise TaskError(f"{source}: a task extends itself: {' -> '.join([*below, name])}")
+        raise FileError(f"{source}: a task extends itself: {' -> '.join([*below, name])}")
     try:
         path = Path(registry.get(specs.TaskSpec, name).path)
     except UnknownNameError as error:
-        raise TaskError(f"{source}: extends: {error}") from None
-    return _merged(_whole(_read(path), path.name, (*below, name)), data)
+        raise FileError(f"{source}: extends: {error}") from None
+    return _merged(_whole(files.read(path, "task file"), path.name, (*below, name)), data)
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -396,21 +371,6 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, dict) and isinstance(base.get(key), dict)
     }
     return {**base, **changes, **tables}
-
-
-def _read(path: Path) -> str:
-    """Return a task file's text.
-
-    Raises
-    ------
-    TaskError
-        If it cannot be read, or is not UTF-8.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise TaskError(f"task file {path} cannot be read: {reason}") from None
 
 
 def _environment_problems(section: Any) -> list[str]:
@@ -439,7 +399,7 @@ def load(name: str) -> Task:
     ------
     UnknownNameError
         If no task has the name.
-    TaskError
+    FileError
         If the file cannot be read or is malformed.
     OptionError
         If Gymnasium knows no such environment, or the algorithms cannot act or observe in it.
@@ -449,4 +409,4 @@ def load(name: str) -> Task:
 
         return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.TaskSpec, name).path)
-    return parse(_read(path), path.name)
+    return parse(files.read(path, "task file"), path.name)

@@ -19,19 +19,17 @@ import math
 import os
 import statistics
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pydantic
 from pydantic import Field
 
 import qrlsuite
-from qrlsuite import options, registry, specs
-from qrlsuite.errors import StoreError, TaskError
+from qrlsuite import files, options, registry, specs
+from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore, entries, read_lines, write_atomically
@@ -192,13 +190,7 @@ class Speeds:
 
 
 def known(*folders: Path) -> Speeds:
-    """Read the speeds of results folders, and the reference speeds of all studies: the evidence of every estimate.
-
-    Raises
-    ------
-    TaskError
-        If a file of reference speeds is malformed.
-    """
+    """Read the speeds of results folders, and the reference speeds of all studies: the evidence of every estimate."""
     references = [
         registered.spec.speeds for _, registered in sorted(registry.load().of(specs.StudySpec).items())
     ]
@@ -209,13 +201,7 @@ def known(*folders: Path) -> Speeds:
 
 
 def gather(runs: Path, references: Iterable[str | None] = ()) -> Speeds:
-    """Read the speeds of every entry in a results folder, and files of reference speeds; damage is passed over.
-
-    Raises
-    ------
-    TaskError
-        If a file of reference speeds is malformed.
-    """
+    """Read the speeds of every entry in a results folder, and files of reference speeds; damage is passed over."""
     speeds = Speeds(references=[row for path in references if path is not None for row in load(Path(path))])
     for store in entries(runs) if runs.is_dir() else []:
         try:
@@ -226,19 +212,8 @@ def gather(runs: Path, references: Iterable[str | None] = ()) -> Speeds:
 
 
 def load(path: Path) -> list[Speed]:
-    """Read a file of reference speeds.
-
-    Raises
-    ------
-    TaskError
-        If it cannot be read or is malformed; every problem is listed.
-    """
-    try:
-        file = SpeedFile.model_validate(options.read_toml(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise TaskError(f"{path.name} cannot be read: {error}") from None
-    except pydantic.ValidationError as error:
-        raise TaskError(f"{path.name}: " + "; ".join(options.file_problems(error, SpeedFile))) from None
+    """Read a file of reference speeds."""
+    file = files.load(path, SpeedFile, "speeds")
     return [
         Speed(
             (row.environment, row.algorithm, row.model),
@@ -299,11 +274,6 @@ def measure(store: EntryStore) -> Speed | None:
 
     A seed's first epoch does not count: it holds the start of its process. Nor do small groups where there were larger
     ones, for a seed alone takes many times its share of a group.
-
-    Raises
-    ------
-    StoreError
-        If a file is damaged.
     """
     record = store.record()
     identity = record["identity"]

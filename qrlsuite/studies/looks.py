@@ -26,7 +26,7 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from qrlsuite import notation, options
+from qrlsuite import files, options
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
@@ -376,8 +376,6 @@ def new(
     entries: Sequence[str],
     runs: Path,
     *,
-    algorithm: str | None = None,
-    preset: str | None = None,
     first_seed: int | None = None,
     **looks: Any,
 ) -> StudyWithLooks:
@@ -407,28 +405,16 @@ def new(
             name=name,
             summary=question_of([]),
             looks=LooksSection(**{key: value for key, value in looks.items() if value is not None}),
-            entries=[_written(text, task, algorithm, preset) for text in entries],
+            entries=[EntriesSection(task=task, model=text) for text in entries],
         )
     except pydantic.ValidationError as error:
-        raise OptionError("; ".join(options.file_problems(error, StudyFile))) from None
+        raise OptionError("; ".join(files.problems(error, StudyFile))) from None
     study = StudyWithLooks(Study(file, "the study"), runs)
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
     study.file = study.file.model_copy(update={"summary": question_of(list(study.entries))})
     return study
-
-
-def _written(text: str, task: str, algorithm: str | None, preset: str | None) -> EntriesSection:
-    """Read the notation of an entry of a new study; what the text leaves open is as given beside it."""
-    entry = notation.parse_entry(text)
-    return EntriesSection(
-        task=task,
-        model=entry.model,
-        algorithm=entry.algorithm or algorithm,
-        preset=entry.preset or preset,
-        options={each.full_name: each.value for each in entry.settings},
-    )
 
 
 def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:

@@ -8,18 +8,16 @@ many seeds as it takes, on seeds of its own: see `qrlsuite.studies.looks`.
 from __future__ import annotations
 
 import itertools
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import pydantic
 import tomli_w
 from pydantic import AwareDatetime, Field, model_validator
 
-from qrlsuite import options, registry, specs
-from qrlsuite.errors import OptionError, QrlSuiteError, TaskError, nearest
+from qrlsuite import files, notation, options, registry, specs
+from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import load as load_task
@@ -53,7 +51,10 @@ class EntriesSection(Table):
         ),
     ] = None
     task: str | Annotated[list[str], Field(min_length=1)]
-    model: str | Annotated[list[str], Field(min_length=1)]
+    model: Annotated[
+        str | Annotated[list[str], Field(min_length=1)],
+        Field(description="a model, or an entry: 'mlp width=64', 'ppo mlp preset=FILE.toml'"),
+    ]
     algorithm: str | None = None
     preset: str | None = None
     options: Annotated[
@@ -247,27 +248,25 @@ class Study:
             For an unknown name or option, or a value that an option cannot have; the message names the study.
         """
         models = models or {}
-        named = {name for group in self.file.entries for name in _listed(group.model)}
-        for name in sorted(set(models) - named):
-            raise OptionError(f"study '{self.name}' has no entry with model '{name}'{nearest(name, named)}")
+        named: set[str] = set()
         by_group: dict[str | None, list[Member]] = {}
         every: list[Member] = []
         used: set[tuple[str | None, str]] = set()
         for index, group in enumerate(self.file.entries):
             members: dict[tuple[str, str], Member] = {}
-            for draft in _drafts(group):
-                targets = (
-                    [m.entry for m in by_group[group.match.group]] if group.match is not None else [None]
-                )
-                for target in targets:
-                    try:
-                        member = _member(group, draft, settings, models, target, used)
-                    except QrlSuiteError as error:
-                        place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
-                        raise type(error)(f"{self.source}, {place}: {error}") from None
+            targets = [m.entry for m in by_group[group.match.group]] if group.match is not None else [None]
+            try:
+                for draft, target in itertools.product(_drafts(group), targets):
+                    named.add(draft.written.model)
+                    member = _member(group, draft, settings, models, target, used)
                     members.setdefault((member.entry.task.name, member.entry.name), member)
+            except QrlSuiteError as error:
+                place = f"entries.{index}" if group.name is None else f"group '{group.name}'"
+                raise type(error)(f"{self.source}, {place}: {error}") from None
             by_group[group.name] = list(members.values())
             every += members.values()
+        for name in sorted(set(models) - named):
+            raise OptionError(f"study '{self.name}' has no entry with model '{name}'{nearest(name, named)}")
         for setting in settings:
             if (setting.side, setting.name) not in used:
                 raise OptionError(
@@ -280,11 +279,10 @@ class Study:
 
 @dataclass(frozen=True)
 class _Draft:
-    """Names and settings that are about to become an entry."""
+    """What is about to become an entry."""
 
     task: str
-    model: str
-    settings: tuple[Setting, ...]
+    written: notation.Written
 
 
 def _listed(names: str | list[str]) -> list[str]:
@@ -299,10 +297,12 @@ def setting(key: str, word: str, value: Any) -> Setting:
 
 def _drafts(group: EntriesSection) -> Iterator[_Draft]:
     fixed = [setting("options", word, value) for word, value in group.options.items()]
-    for task, model in itertools.product(_listed(group.task), _listed(group.model)):
+    for task, text in itertools.product(_listed(group.task), _listed(group.model)):
+        written = notation.parse_entry(text)
+        written = replace(written, settings=(*fixed, *written.settings))
         for values in itertools.product(*group.grid.values()):
             varied = [setting("grid", word, value) for word, value in zip(group.grid, values)]
-            yield _Draft(task, model, (*fixed, *varied))
+            yield _Draft(task, written.given(group.algorithm, tuple(varied), group.preset))
 
 
 def _member(
@@ -313,17 +313,17 @@ def _member(
     target: Entry | None,
     used: set[tuple[str | None, str]],
 ) -> Member:
-    model = models.get(draft.model, draft.model)
+    written = replace(draft.written, model=models.get(draft.written.model, draft.written.model))
     loaded = load_task(draft.task)
-    algorithm = registry.get(specs.AlgorithmSpec, group.algorithm or loaded.file.default_algorithm)
-    every = [*draft.settings, *settings]
-    sides = option_sides(loaded, algorithm, registry.get(specs.ModelSpec, model), every)
+    algorithm = registry.get(specs.AlgorithmSpec, written.algorithm or loaded.file.default_algorithm)
+    every = [*written.settings, *settings]
+    sides = option_sides(loaded, algorithm, registry.get(specs.ModelSpec, written.model), every)
     applicable = [s for s in settings if _has(sides, s)]
     used |= {(s.side, s.name) for s in applicable}
-    all_settings = [*draft.settings, *applicable]
+    all_settings = [*written.settings, *applicable]
 
     def entry(*more: Setting) -> Entry:
-        return resolve(draft.task, model, group.algorithm, [*all_settings, *more], group.preset)
+        return resolve(draft.task, replace(written, settings=(*all_settings, *more)))
 
     if target is not None and group.match is not None:
         option = group.match.option
@@ -331,7 +331,13 @@ def _member(
             size = nearest_size(lambda size: entry(Setting("model", option, size)), target)
             all_settings.append(Setting("model", option, size))
     options_ = {s.full_name: s.value for s in all_settings}
-    alone = {"task": draft.task, "model": model, "options": options_, "grid": {}, "match": None}
+    alone = {
+        "task": draft.task,
+        "model": written.model,
+        "algorithm": written.algorithm,
+        "preset": written.preset,
+    }
+    alone |= {"options": options_, "grid": {}, "match": None}
     return Member(group.name or "", entry(), group.model_copy(update=alone))
 
 
@@ -347,21 +353,9 @@ def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:
 
 
 def parse(text: str, source: str) -> Study:
-    """Parse and validate a study; the entries are resolved by `Study.members`.
-
-    Raises
-    ------
-    TaskError
-        Listing every problem with its path in the file.
-    """
-    try:
-        data = options.read_toml(text)
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"{source}: not valid TOML: {error}") from None
-    try:
-        return Study(StudyFile.model_validate(_with_table(data)), source)
-    except pydantic.ValidationError as error:
-        raise TaskError(f"{source}: " + "; ".join(options.file_problems(error, StudyFile))) from None
+    """Parse and validate a study; the entries are resolved by `Study.members`."""
+    data = _with_table(files.parse(text, source))
+    return Study(files.validate(data, StudyFile, source), source)
 
 
 def _with_table(data: dict[str, Any]) -> dict[str, Any]:
@@ -399,18 +393,6 @@ def dumps(file: StudyFile) -> str:
 
 
 def load(name: str) -> Study:
-    """Load a registered study by name, or a study file by path (anything that ends in `.toml`).
-
-    Raises
-    ------
-    UnknownNameError
-        If no study has the name.
-    TaskError
-        If the file cannot be read or is malformed.
-    """
+    """Load a registered study by name, or a study file by path (anything that ends in `.toml`)."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TaskError(f"study file {path} cannot be read: {error}") from None
-    return parse(text, path.name)
+    return parse(files.read(path, "study file"), path.name)

@@ -83,11 +83,6 @@ class Halving(Search):
     ----------
     settings:
         How many are tried; None while a budget in core-hours waits for the first trial, which shows what a run costs.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a name, an option or a value of the request cannot be used.
     """
 
     def _begin(self) -> None:

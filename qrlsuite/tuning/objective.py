@@ -67,13 +67,7 @@ class Merit:
 def merit(
     curves: NDArray[np.float64], ranking: RankingSection, steps_per_epoch: int, objective: Objective
 ) -> Merit:
-    """Return the worth of learning curves (N, T).
-
-    Raises
-    ------
-    OptionError
-        If the curves cannot be read as scores.
-    """
+    """Return the worth of learning curves (N, T)."""
     at_cell = sample_complexity(curves, ranking.reference_grid, steps_per_epoch)
     everywhere = sample_complexity(curves, ranking.grid, steps_per_epoch)
     times = times_below(curves, ranking.grid, steps_per_epoch)

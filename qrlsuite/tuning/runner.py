@@ -29,13 +29,6 @@ def build(requests: Sequence[Request], runs: Path) -> list[Search]:
     ----------
     runs:
         The results folder.
-
-    Raises
-    ------
-    OptionError
-        If `random`, `tpe` or `one-at-a-time` gives them different numbers of trials.
-    QrlSuiteError
-        If a name, an option or a value of a request cannot be used.
     """
     built = [Halving(r, runs) if r.sampler == "halving" else Search(r, runs) for r in requests]
     if any(isinstance(search, Halving) for search in built):

@@ -36,13 +36,7 @@ class SamplerOptions:
 
 
 def read(text: str) -> tuple[str, SamplerOptions]:
-    """Read a sampler with its options: `random trials=50 seed=1`; for `halving`, trials per varied option.
-
-    Raises
-    ------
-    UnknownNameError, OptionError
-        If there is no such sampler, or it has no such option or value.
-    """
+    """Read a sampler with its options: `random trials=50 seed=1`; for `halving`, trials per varied option."""
     name, values = notation.parse_named(text, "--sampler ")
     if name not in NAMES:
         raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
@@ -73,15 +67,6 @@ def create(name: str, space: Space, trials: int | None, seed: int, base: Point) 
         How many points to propose; None for all, which only a grid and `one-at-a-time` have.
     base:
         The point of settings without tuning, from which `one-at-a-time` starts.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such sampler.
-    OptionError
-        If it cannot be used with this space or this number of trials.
-    QrlSuiteError
-        If Optuna is not installed.
     """
     if name not in NAMES or name == "halving":  # which is a search of its own, and goes back to known points
         raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")

@@ -45,13 +45,7 @@ Train = Callable[[Sequence[Entry], Sequence[int], int], Sequence[EntryStore]]
 
 
 def tuning_seeds(requested: int | str | Iterable[int]) -> tuple[int, ...]:
-    """Return the seeds that are meant, as `read_seeds` reads them, but that a number counts from 1,000,000.
-
-    Raises
-    ------
-    OptionError
-        If they are malformed, or a seed belongs to the protocol.
-    """
+    """Return the seeds that are meant, as `read_seeds` reads them, but that a number counts from 1,000,000."""
     seeds = tuple(read_seeds(requested))
     if isinstance(requested, int) or (isinstance(requested, str) and requested.isdecimal()):
         return tuple(TUNING_SEEDS + seed for seed in seeds)
@@ -203,11 +197,6 @@ class Search(Shown):
         Entries of trials whose runs are left to another process or a queue.
     written:
         The preset file, once it is written.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a name, an option or a value of the request cannot be used.
     """
 
     def __init__(self, request: Request, results: Path) -> None:
@@ -384,13 +373,7 @@ class Search(Shown):
         return [self.request.sampler, self.planned, self.request.sampler_seed]
 
     def preset(self) -> preset.PresetFile:
-        """Return the best settings, and how they were found.
-
-        Raises
-        ------
-        OptionError
-            If no trial has finished.
-        """
+        """Return the best settings, and how they were found."""
         best = self.best
         if best is None:
             raise OptionError("no trial has finished yet, so there are no settings to write down")
@@ -429,15 +412,7 @@ class Search(Shown):
         }
 
     def write(self, path: Path) -> None:
-        """Write the best settings to a preset file, atomically.
-
-        Raises
-        ------
-        OptionError
-            If no trial has finished.
-        StoreError
-            If the file cannot be written.
-        """
+        """Write the best settings to a preset file, atomically."""
         best_preset = self.preset()
         base = self.base
         comment = (

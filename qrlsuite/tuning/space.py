@@ -21,7 +21,6 @@ beside the task files, the suite's and those of plugins.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +29,8 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field, FiniteFloat, model_validator
 
-from qrlsuite import options, registry, specs
-from qrlsuite.errors import OptionError, TaskError, UnknownNameError, nearest
+from qrlsuite import files, options, registry, specs
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.options import Setting, Table
 
@@ -100,35 +99,14 @@ def grids() -> dict[str, Path]:
 
 
 def load(name: str) -> GridFile:
-    """Read a grid by name, or by path (anything that ends in `.toml`).
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no grid of that name.
-    TaskError
-        If the file cannot be read or is malformed; the message lists every problem.
-    """
+    """Read a grid by name, or by path (anything that ends in `.toml`)."""
     known = grids()
     if not name.endswith(".toml") and name not in known:
         raise UnknownNameError(
             f"unknown grid '{name}'{nearest(name, known)}; or give a file, my-grid.toml, or 'lr=[1e-3, 5e-4]'"
         )
     path = Path(name) if name.endswith(".toml") else known[name]
-    try:
-        data = options.read_toml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise TaskError(f"grid file {path} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"grid file {path}: not valid TOML: {error}") from None
-    try:
-        return GridFile.model_validate(data)
-    except pydantic.ValidationError as error:
-        lines = "; ".join(options.validation_lines(error))
-        raise TaskError(
-            f"grid file {path}: {lines}; a grid holds format_version = 1 and [search.ALGORITHM.FAMILY] tables with "
-            "a list of values for each option"
-        ) from None
+    return files.load(path, GridFile, "grid file")
 
 
 def declared(entry: Entry) -> dict[str, Range]:
@@ -185,11 +163,6 @@ def space(
         Options that shall not be varied.
     ranges:
         What is varied without a grid file, by full name.
-
-    Raises
-    ------
-    OptionError
-        If nothing is left to vary, an option is unknown, or a value cannot be used.
     """
     sides = {"model": specs.resolve(entry.model.options), "algorithm": specs.resolve(entry.algorithm.options)}
     axes: dict[str, list[Any] | Range] = dict(ranges or {})
@@ -252,13 +225,7 @@ def _forget(space: dict[str, Any], name: str) -> None:
 
 
 def parse_varied(word: str) -> Setting:
-    """Parse a word of `--vary`: `lr=[1e-3, 5e-4]`, `lr=1e-3,5e-4`, `activation=relu,tanh`, `lr={low=.1, high=1}`.
-
-    Raises
-    ------
-    OptionError
-        If there is no `=` or no name.
-    """
+    """Parse a word of `--vary`: `lr=[1e-3, 5e-4]`, `lr=1e-3,5e-4`, `activation=relu,tanh`, `lr={low=.1, high=1}`."""
     key, equals, values_text = word.partition("=")
     if not equals or not key.strip():
         raise OptionError(f"--vary {word}: write a name and its values, --vary 'lr=[1e-3, 5e-4]'")
@@ -277,11 +244,6 @@ def read_varied(vary: str | Sequence[str] | Mapping[str, Any]) -> tuple[GridFile
     ----------
     vary:
         Words, each a grid's name, a grid file's path or `NAME=VALUES`; or a mapping of option names to values.
-
-    Raises
-    ------
-    QrlSuiteError
-        If a word is none of these, or there are several grids.
     """
     if isinstance(vary, Mapping):
         varied = {name: list(v) if isinstance(v, tuple) else v for name, v in vary.items()}
@@ -301,7 +263,7 @@ def _values(name: str, value: Any) -> list[Any] | Range:
         try:
             return Range.model_validate(value)
         except pydantic.ValidationError as error:
-            raise OptionError(f"--vary {name}: {'; '.join(options.validation_lines(error))}") from None
+            raise OptionError(f"--vary {name}: {'; '.join(files.validation_lines(error))}") from None
     raise OptionError(
         f"--vary {name}: write a list of values, --vary '{name}=[1, 2]', or {{low = 1, high = 2}}"
     )

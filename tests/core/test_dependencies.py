@@ -18,7 +18,7 @@ FOLDERS = {
     "qrlsuite.leaderboard": ROOT / "leaderboard",
 }
 TOP = {
-    "algorithm", "environment", "errors", "gymlanes", "hookspecs", "normalization", "notation", "options",
+    "algorithm", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization", "notation", "options",
     "population", "registry", "seeding", "specs",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""

@@ -12,7 +12,7 @@ import pytest
 
 import qrlsuite
 from qrlsuite import registry
-from qrlsuite.errors import TaskError
+from qrlsuite.errors import FileError
 from qrlsuite.experiment.entry import Entry, from_record, resolve
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.options import parse_setting
@@ -175,7 +175,7 @@ def test_files_of_speeds(tmp_path: Path) -> None:
     row = '[[speeds]]\nenvironment = "beam6g"\nalgorithm = "ddqn"\nmodel = "mlp"\n'
     path.write_text(f'format_version = 1\nmachine = "m"\n{row}secs = 3\n')
     with pytest.raises(
-        TaskError, match=r"missing key 'speeds.0.seconds'; unknown key 'secs' in \[speeds.0\]; did you"
+        FileError, match=r"missing key 'speeds.0.seconds'; unknown key 'secs' in \[speeds.0\]; did you"
     ):
         speed.load(path)
     path.write_text(f'format_version = 1\nmachine = "m"\n{row}seconds = 0.5\n')
@@ -185,5 +185,5 @@ def test_files_of_speeds(tmp_path: Path) -> None:
     )
     (read,) = speed.load(path)
     assert (read.group, read.alone, read.calibration) == (4, 1.5, 0.2)
-    with pytest.raises(TaskError, match=r"gone\.toml cannot be read"):
+    with pytest.raises(FileError, match=r"gone\.toml cannot be read"):
         speed.load(tmp_path / "gone.toml")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import registry, specs
-from qrlsuite.errors import OptionError, TaskError, UnknownNameError
+from qrlsuite.errors import FileError, OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import Setting, parse_setting
 from qrlsuite.studies import study
@@ -129,6 +129,22 @@ def test_entries_are_those_of_plain_runs() -> None:
     assert shared == set(), "fig6 shares every entry with fig7"
 
 
+def test_a_group_names_entries_in_their_notation() -> None:
+    text = SMALL.replace(
+        'model = "vqc-native"\ngrid',
+        'model = ["ppo mlp width=8 depth=1", "vqc-native"]\noptions = { lr = 2e-3 }\ngrid',
+    )
+    text = (
+        text.replace("{ qubits = [2, 3] }", "{ gamma = [0.9] }")
+        .replace("match = {", "#")
+        .replace('"beam6g-text"]', "]")
+    )
+    found = [m.entry.label for m in study.parse(text, "small.toml").members()]
+    assert found[0] == "ppo mlp width=8 depth=1 gamma=0.9 lr=0.002"
+    with pytest.raises(OptionError, match=r"small\.toml, group 'vqc': entry 'a b c': write"):
+        study.parse(text.replace("ppo mlp width=8 depth=1", "a b c"), "small.toml").members()
+
+
 def test_core_hours_follow_from_the_papers_run_times() -> None:
     """15 s per epoch and run for networks, the table of run times for circuits; 100 epochs, 100 runs."""
     table = {(n, 4): s for n, s in {6: 44, 8: 59, 10: 95, 12: 250, 14: 761}.items()}
@@ -205,7 +221,7 @@ def test_every_error_of_a_file_is_named_with_its_place() -> None:
         .replace('kind = "curves"', "kind = 3")
     )
     broken = broken.replace("grid = { qubits = [2, 3] }", "gird = { qubits = [] }")
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(FileError) as caught:
         study.parse(broken, "broken.toml")
     message = str(caught.value)
     for part in (
@@ -251,7 +267,7 @@ def test_every_error_of_a_file_is_named_with_its_place() -> None:
     ],
 )
 def test_studies_that_contradict_themselves(old: str, new: str, message: str) -> None:
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(FileError) as caught:
         study.parse(SMALL.replace(old, new), "broken.toml")
     assert message in str(caught.value)
 
@@ -259,7 +275,7 @@ def test_studies_that_contradict_themselves(old: str, new: str, message: str) ->
 def test_unknown_names() -> None:
     with pytest.raises(UnknownNameError, match="unknown study 'fig66'; did you mean 'fig6'"):
         study.load("fig66")
-    with pytest.raises(TaskError, match="cannot be read"):
+    with pytest.raises(FileError, match="cannot be read"):
         study.load("no/such.toml")
     with pytest.raises(UnknownNameError, match="unknown model 'mpl'"):
         study.parse(SMALL.replace('model = "mlp"', 'model = "mpl"'), "small.toml").members()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from qrlsuite import registry, specs
-from qrlsuite.errors import OptionError, QrlSuiteError, TaskError
+from qrlsuite.errors import FileError, OptionError, QrlSuiteError
 from qrlsuite.experiment import entry, task
 from qrlsuite.hookspecs import hookimpl
 from tests.conftest import TINY
@@ -102,13 +102,13 @@ def test_all_mistakes_are_named_at_once() -> None:
         .replace("interactions = 60", "")
         .replace("degree = 3", "degree = 1\nstep = 20")
     )
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(FileError) as caught:
         task.parse(text, "t.toml")
     for part in ("'epoch'", "protocol.seeds = 0", "protocol.interactions", "environment.options: degree = 1"):
         assert part in str(caught.value)
     assert "environment.options has no option 'step'; did you mean 'steps'" in str(caught.value)
     with pytest.raises(
-        TaskError, match=r"protocol\.seeds = 0.*environment\.name: unknown environment 'beam6h'"
+        FileError, match=r"protocol\.seeds = 0.*environment\.name: unknown environment 'beam6h'"
     ):
         task.parse(TINY.replace("seeds = 4", "seeds = 0").replace('name = "beam6g"', 'name = "beam6h"'), "t")
 
@@ -123,10 +123,10 @@ def test_a_preset_that_says_nothing_of_an_algorithm_is_not_its_preset() -> None:
     assert read.preset(None, "ppo", "classical") == (None, {})
     assert read.preset(None, "mine", "classical") == (None, {})
     with pytest.raises(
-        TaskError, match=r"'tuned' says nothing about algorithm 'mine', only about ppo, ddqn: leave"
+        FileError, match=r"'tuned' says nothing about algorithm 'mine', only about ppo, ddqn: leave"
     ):
         read.preset("tuned", "mine", "classical")
-    with pytest.raises(TaskError, match=r"says nothing about algorithm 'ppo' with classical models, only"):
+    with pytest.raises(FileError, match=r"says nothing about algorithm 'ppo' with classical models, only"):
         read.preset("tuned", "ppo", "classical")
 
 
@@ -136,7 +136,7 @@ def test_a_mistake_in_a_preset_is_named_with_its_file(tmp_path: Path) -> None:
         TINY
         + "\n[presets.mine.ddqn.all]\ngama = 0.9\n[presets.other.ddqn.quantum]\nlr = -1\n[presets.other.ppo.all]\n"
     )
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(FileError) as caught:
         entry.resolve(str(path), "mlp")  # although it takes neither
     assert str(caught.value).startswith(
         "t.toml: presets.mine.ddqn has no option 'gama'; did you mean 'gamma'?; "
@@ -155,7 +155,7 @@ def test_a_mistake_in_a_preset_is_named_with_its_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_mistake_in_what_tuning_took_is_named(table: str, message: str) -> None:
-    with pytest.raises(TaskError, match=message):
+    with pytest.raises(FileError, match=message):
         task.parse(f"{TINY}[presets.mine.ddqn.all]\nlr = 0.1\n[tuning.{table}]\n", "t.toml")
 
 
@@ -165,7 +165,7 @@ def test_a_bad_setting_is_not_blamed_on_the_file() -> None:
 
 
 def test_a_file_that_is_not_there() -> None:
-    with pytest.raises(TaskError, match="cannot be read"):
+    with pytest.raises(FileError, match="cannot be read"):
         task.load("nowhere/at-all.toml")
 
 
@@ -215,7 +215,7 @@ def test_a_task_extends_another() -> None:
     ],
 )
 def test_what_cannot_be_extended_is_named(extends: str, message: str) -> None:
-    with pytest.raises(TaskError, match=message):
+    with pytest.raises(FileError, match=message):
         task.parse(
             f"{TINY.replace('format_version = 1', f'format_version = 1{chr(10)}extends = {extends}')}",
             "t.toml",
@@ -240,5 +240,5 @@ def test_tasks_that_extend_each_other_are_refused(tmp_path: Path, monkeypatch: p
     fresh = registry.create(strict=True)
     fresh.add_plugin(Circle(tmp_path), "circle")
     monkeypatch.setattr(registry, "load", lambda: fresh)
-    with pytest.raises(TaskError, match=r"one\.toml: a task extends itself: two -> one -> two"):
+    with pytest.raises(FileError, match=r"one\.toml: a task extends itself: two -> one -> two"):
         task.load("one")

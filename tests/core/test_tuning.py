@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, TaskError, UnknownNameError
+from qrlsuite.errors import FileError, OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment import preset
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.task import RankingSection
@@ -386,5 +386,5 @@ def test_bad_grid_files(tmp_path: Path) -> None:
     path = tmp_path / "g.toml"
     for content in ("format_version = 1", "format_version = 1\n[search.all.al]\nlr = [1]", "x ="):
         path.write_text(content)
-        with pytest.raises(TaskError, match=r"g\.toml"):
+        with pytest.raises(FileError, match=r"g\.toml"):
             space.load(str(path))

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.engine import sheet
-from qrlsuite.errors import OptionError, TaskError
+from qrlsuite.errors import FileError, OptionError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import board, report
 from qrlsuite.leaderboard.compared import compare_entries
@@ -386,7 +386,7 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
 
 
 def test_an_unknown_rule_is_one_line_with_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(TaskError, match=r"ranking.rule: unknown rule 'tims'; did you mean 'times'"):
+    with pytest.raises(FileError, match=r"ranking.rule: unknown rule 'tims'; did you mean 'times'"):
         tasks.parse(RULED.replace('"times"', '"tims"'), "tiny.toml")
     entry = boards.entry("some one")
     ranking = entry.task_file.ranking.model_copy(update={"rule": "gone"})

@@ -99,13 +99,6 @@ def new(
     task: Annotated[
         str, typer.Option("--task", help="A task (see `qrlsuite list tasks`) or a task file's path.")
     ],
-    algorithm: Annotated[
-        str | None,
-        typer.Option("--algorithm", help="The algorithm of entries that name none; default: the task's."),
-    ] = None,
-    preset: Annotated[
-        str | None, typer.Option("--preset", help="Of entries that name none: one of the task's presets.")
-    ] = None,
     epochs: EpochsOption = None,
     looks: Annotated[
         str, typer.Option("--looks", metavar="N,M,...", help="Seeds of each entry at each look.")
@@ -143,8 +136,6 @@ def new(
         path,
         entries,
         task=task,
-        algorithm=algorithm,
-        preset=preset,
         epochs=epochs,
         looks=_numbers(looks),
         alpha=alpha,

@@ -1,0 +1,116 @@
+"""TOML files of users and plugins: tasks, presets, studies, grids, speeds. Every error names the file and the place."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin
+
+import pydantic
+
+from qrlsuite.errors import FileError, nearest
+
+Model = TypeVar("Model", bound=pydantic.BaseModel)
+
+
+def load(path: Path, model: type[Model], what: str) -> Model:
+    """Read and validate a file; `what` it is, for messages: `preset file`."""
+    return validate(parse(read(path, what), f"{what} {path}"), model, f"{what} {path}")
+
+
+def read(path: Path, what: str) -> str:
+    """Return a file's text."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"{what} {path} cannot be read: {reason}") from None
+
+
+def parse(text: str, source: str) -> dict[str, Any]:
+    """Return the tables of a text; `source` is where it came from, for messages."""
+    try:
+        return read_toml(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"{source}: not valid TOML: {error}") from None
+
+
+def validate(data: Any, model: type[Model], source: str) -> Model:
+    """Validate a file's content; the error lists every problem with its path in the file."""
+    try:
+        return model.model_validate(data)
+    except pydantic.ValidationError as error:
+        raise FileError(f"{source}: {'; '.join(problems(error, model))}") from None
+
+
+def read_toml(text: str) -> dict[str, Any]:
+    """Return the tables of a TOML text.
+
+    Raises
+    ------
+    tomllib.TOMLDecodeError
+        If it is not valid, or Python cannot hold it: hundreds of nested arrays, integers of thousands of digits.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except (RecursionError, ValueError) as error:
+        raise tomllib.TOMLDecodeError(f"too large a value: {error}") from None
+
+
+def validation_lines(error: pydantic.ValidationError) -> list[str]:
+    """Turn a pydantic error into lines `path = value: what is wrong`."""
+    lines = []
+    for item in error.errors(include_url=False):
+        path = ".".join(str(part) for part in item["loc"])
+        value = item.get("input")
+        value_text = "" if isinstance(value, Mapping) or item["type"] == "missing" else f" = {_short(value)}"
+        message = str(item["msg"]).removeprefix("Value error, ")
+        lines.append(f"{path}{value_text}: {message}" if path else message)
+    return lines
+
+
+def problems(error: pydantic.ValidationError, model: type[pydantic.BaseModel]) -> list[str]:
+    """Turn the error of a whole file into lines with paths, and the nearest known key for each unknown one.
+
+    Parameters
+    ----------
+    model:
+        What the file was validated as.
+    """
+    lines = []
+    for item, line in zip(error.errors(include_url=False), validation_lines(error)):
+        path = [str(part) for part in item["loc"]]
+        if item["type"] == "extra_forbidden":
+            *parents, key = path
+            table = f" in [{'.'.join(parents)}]" if parents else ""
+            lines.append(f"unknown key '{key}'{table}{nearest(key, _keys(model, parents))}")
+        elif item["type"] == "missing":
+            lines.append(f"missing key '{'.'.join(path)}'")
+        else:
+            lines.append(line)
+    return lines
+
+
+def _keys(model: Any, path: Sequence[str]) -> list[str]:
+    """Return the known keys of a (nested) section of a file; `path` may lead through lists, tables and options."""
+    for part in path:
+        if part.isdecimal():
+            continue
+        if get_origin(model) is dict:
+            model = get_args(model)[1]
+        else:
+            info = getattr(model, "model_fields", {}).get(part)
+            model = info.annotation if info is not None else None
+        while get_origin(model) is not dict and (
+            arguments := [each for each in get_args(model) if each is not type(None)]
+        ):
+            model = arguments[0]
+    return list(getattr(model, "model_fields", {}))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
