@@ -109,39 +109,6 @@ def test_a_hundred_seeds_do_not_change_one(name: str, case: dict[str, Any]) -> N
 
 
 @every_algorithm
-def test_different_seeds_differ(name: str, case: dict[str, Any]) -> None:
-    whole = trained(name, [0, 1], case)
-    for key, array in whole.items():
-        if key.startswith("algorithm.") and "steps" not in key and array.dtype == np.float32:
-            assert not np.array_equal(array[0], array[1]) or not array.any(), key
-
-
-@every_algorithm
-def test_groups_split_and_merge_at_the_end_of_an_epoch(name: str, case: dict[str, Any]) -> None:
-    straight = group(name, range(4), case).start()
-    halves = [group(name, [0, 1, 2], case).start(), group(name, [3], case).start()]
-    for _ in range(2):
-        for each in (straight, *halves):
-            each.algorithm.train_epoch(7)
-    for epoch, regrouped in enumerate(([[1, 3], [0, 2]], [[2], [3, 0, 1]], [[0, 1, 2, 3]])):
-        saved: dict[int, dict[str, NDArray[Any]]] = {}
-        for each in halves:
-            arrays = each.save()
-            saved.update({seed: {k: v[s] for k, v in arrays.items()} for s, seed in enumerate(each.seeds)})
-        halves = [
-            group(name, seeds, case).load({k: np.stack([saved[s][k] for s in seeds]) for k in saved[0]})
-            for seeds in regrouped
-        ]
-        expected = straight.algorithm.train_epoch(7)
-        drawn = actions(straight)
-        whole = {**straight.save(), **expected}
-        for each in halves:
-            metrics = each.algorithm.train_epoch(7)
-            np.testing.assert_array_equal(actions(each), drawn[each.seeds], err_msg=f"epoch {epoch}")
-            assert_same({**each.save(), **metrics}, each.seeds, whole)
-
-
-@every_algorithm
 def test_stored_results_do_not_depend_on_groups(
     name: str, case: dict[str, Any], tiny_task: str, tmp_path: Path
 ) -> None:
@@ -163,34 +130,6 @@ def test_stored_results_do_not_depend_on_groups(
         folders.append(store.path)
     for seed in range(3):
         assert results(folders[0], seed) == results(folders[1], seed)
-
-
-@every_algorithm
-def test_states_and_metrics_have_the_seed_axis_first(name: str, case: dict[str, Any]) -> None:
-    made = group(name, range(5), case).start()
-    metrics = made.algorithm.train_epoch(6)
-    for key, tensor in {**made.algorithm.state_dict(), **made.algorithm.policy_state()}.items():
-        assert tensor.shape[:1] == (5,), key
-    for metric, values in metrics.items():
-        assert values.shape == (5,), metric
-        assert values.dtype == np.float64, metric
-
-
-@every_algorithm
-def test_the_published_policy_is_what_acts(name: str, case: dict[str, Any]) -> None:
-    made, other = (group(name, range(2), {**case}).start() for _ in range(2))
-    for _ in range(2):
-        made.algorithm.train_epoch(12)
-    state = other.algorithm.state_dict()
-    policy = made.algorithm.policy_state()
-    mine = {k: v for k, v in state.items() if k.partition(".")[2] in policy and "adam" not in k}
-    acting = {k.partition(".")[0] for k in mine} & {"online", "actor", "policy"}
-    assert len(acting) == 1
-    for key, tensor in mine.items():
-        if key.partition(".")[0] in acting:
-            tensor.copy_(policy[key.partition(".")[2]])
-    if case.get("validation") != "sampled":
-        np.testing.assert_array_equal(actions(other), actions(made))
 
 
 LEARNING: dict[str, tuple[int, int, dict[str, Any]]] = {

@@ -46,18 +46,6 @@ def test_released_episode(episode):
     np.testing.assert_allclose(info["score"], episode["ratio"], rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"stack": 3, "degree": 6, "physics": "text"},
-        {"antennas": [((1, 1), (1, 0)), ((5, 5), (0, 2))], "steps": 3},
-    ],
-)
-def test_gymnasium_checker(options):
-    check_env(gymnasium.make(ID, **options).unwrapped, skip_render_check=True)
-
-
 @pytest.mark.parametrize("pygame", ["there", "missing"])
 def test_gymnasium_checker_renders_in_every_declared_mode(pygame):
     if pygame == "there":
@@ -109,14 +97,6 @@ def test_stack_holds_the_last_observations_oldest_first():
         singles.append(plain.step(action)[0])
         stack = stacked.step(action)[0]
     assert stack.tolist() == np.concatenate(singles[-3:]).tolist()
-
-
-def test_seeds():
-    def first(seed):
-        return BeamManagement6G().reset(seed=seed)[0].tolist()
-
-    assert first(1) == first(1)
-    assert first(1) != first(2)
 
 
 def test_an_unseeded_reset_continues_the_stream():

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from qrlsuite import registry, specs
-from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.plugins.environments.beam6g import ID, BeamManagement6G, BeamOptions, make_vector
 from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables
@@ -89,32 +87,6 @@ def test_tables_do_not_depend_on_the_batch(degree, size, offset):
     whole, some = tables(support), tables(support[offset : offset + size])
     for name in ("intensity", "beam", "optimal"):
         assert getattr(some, name).tobytes() == getattr(whole, name)[offset : offset + size].tobytes()
-
-
-@pytest.mark.parametrize(("size", "first"), [(1, 4), (2, 1), (17, 2)])
-def test_groups_of_lanes_do_not_depend_on_other_groups(size, first):
-    # 20 groups of 2 lanes, against `size` of them alone, over more than two episodes
-    actions = actions_of(40, 2 * STEPS + 5)
-    everyone = lanes(40, groups=20)
-    everyone.reset()
-    whole = walk(everyone, actions)
-    part = slice(2 * first, 2 * (first + size))
-    some = make_vector(BeamOptions(steps=STEPS), 2 * size)
-    some.seed_lanes(streams(20)[first : first + size])
-    some.reset()
-    assert walk(some, actions[:, part]) == [row[part] for row in whole]
-
-
-def test_other_lanes_actions_change_nothing():
-    def run(actions):
-        env = lanes(4)
-        env.reset()
-        return [row[1] for row in walk(env, actions)]
-
-    actions = actions_of(4, 2 * STEPS)
-    others = actions.copy()
-    others[:, [0, 2, 3]] = 2 - others[:, [0, 2, 3]]
-    assert run(actions) == run(others)
 
 
 @pytest.mark.parametrize("stop", [0, 5, STEPS, STEPS + 7])
@@ -208,22 +180,6 @@ def test_bad_state_changes_nothing(change, message):
     assert env.state_dict()["step"].tolist() == [0, 0]
 
 
-def test_autoreset_in_the_same_step():
-    env = lanes(3)
-    first, _ = env.reset()
-    for row in actions_of(3, STEPS):
-        observations, _, terminated, _, infos = env.step(row)
-    assert terminated.all()
-    assert infos["_final_obs"].all()
-    assert infos["final_info"]["_score"].all()
-    assert ((infos["final_info"]["score"] > 0) & (infos["final_info"]["score"] <= 1)).all()
-    assert (observations != infos["final_obs"]).any(axis=1).all()
-    assert (observations != first).any(axis=1).all()
-    _, _, terminated, _, infos = env.step(np.zeros(3, dtype=np.int64))
-    assert not terminated.any()
-    assert infos == {}
-
-
 def test_seeds():
     def first(**kwargs):
         return make_vector(BeamOptions(), 3).reset(**kwargs)[0].tolist()
@@ -231,20 +187,6 @@ def test_seeds():
     assert first(seed=1) == first(seed=1)
     assert first(seed=1) != first(seed=2)
     assert first(seed=1)[0] != first(seed=1)[1]
-
-
-def test_spaces_and_returned_arrays():
-    env = lanes(4, stack=2)
-    assert isinstance(env, LaneEnv)
-    observations, _ = env.reset()
-    assert env.observation_space.contains(observations)
-    assert env.single_observation_space.shape == (6,)
-    observations, rewards, terminated, truncated, _ = env.step(env.action_space.sample())
-    assert env.observation_space.contains(observations)
-    assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, np.bool_, np.bool_)
-    kept = observations.copy()
-    env.step(env.action_space.sample())
-    assert (observations == kept).all()  # not a view of what the environment goes on writing
 
 
 @pytest.mark.parametrize(
@@ -280,11 +222,3 @@ def test_bad_numbers_of_lanes_and_points():
 def test_gymnasium_make_vec():
     env = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="vector_entry_point", steps=4)
     assert env.reset(seed=0)[0].shape == (3, 3)
-
-
-def test_registered_spec_leads_here():
-    spec = registry.get(specs.EnvironmentSpec, "beam6g")
-    assert specs.resolve(spec.options) is BeamOptions
-    assert specs.resolve(spec.vector) is make_vector
-    assert specs.resolve(spec.entry_point) is BeamManagement6G
-    assert spec.gymnasium_id == ID

@@ -87,23 +87,6 @@ def test_building_leaves_global_random_numbers_alone():
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_names_in_a_population_are_those_of_one_agent_with_a_leading_axis():
-    modules = agents(3, small())
-    together = vqc.population(modules, small())
-    state = together.state_dict()
-    assert state.keys() == modules[0].state_dict().keys()
-    for name, value in state.items():
-        assert torch.equal(value, torch.stack([m.state_dict()[name] for m in modules]))
-    assert (
-        together.quantum_parameters()
-        == modules[0].quantum_parameters()
-        == {"circuit.scaling", "circuit.weights"}
-    )
-    assert [name for name, _ in together.named_parameters()] == [
-        name for name, _ in modules[0].named_parameters()
-    ]
-
-
 SHAPES = [(3, 3, 64, "float32"), (3, 3, 64, "float64"), (4, 1, 7, "float32"), (5, 3, 1, "float64")]
 WIDE = (16, 3, 1, "float32")  # wide enough for batched matrix products
 
@@ -151,14 +134,6 @@ def test_many_agents_at_odd_offsets_have_the_bits_of_one():
     everyone = gradients(list(range(17)))
     for some in ([3], [16, 5, 9], list(range(1, 17))):
         assert all(torch.equal(a, b[some]) for a, b in zip(gradients(some), everyone))
-
-
-def test_gradients_of_the_summed_loss_do_not_mix():
-    together = vqc.population(agents(3, small()), small())
-    together(observations(3, 4, 3))[1].sum().backward()
-    for parameter in together.parameters():
-        assert float(parameter.grad[[0, 2]].abs().sum()) == 0
-        assert float(parameter.grad[1].abs().sum()) > 0
 
 
 def test_deep_copies_are_independent_but_share_the_counter():
