@@ -146,6 +146,7 @@ def build(
     made, problems = list[Any](), [*refused, *unranked]
     for task in sorted({entry.task for entry in ranked}):
         members = [entry for entry in ranked if entry.task == task]
+        found: Sequence[Any]
         if by == "steps":
             found, lines = steps.sections(task, members, rule, horizon, alpha, shown)
         elif by in costs.UNITS:

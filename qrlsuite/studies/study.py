@@ -331,7 +331,7 @@ def _member(
             size = nearest_size(lambda size: entry(Setting("model", option, size)), target)
             all_settings.append(Setting("model", option, size))
     options_ = {s.full_name: s.value for s in all_settings}
-    alone = {
+    alone: dict[str, Any] = {
         "task": draft.task,
         "model": written.model,
         "algorithm": written.algorithm,
