@@ -72,6 +72,7 @@ def test_the_suite_s_own_working_copy_is_recorded() -> None:
     if not (package.parent / ".git").exists():
         pytest.skip("not a working copy")
     head = git(package.parent, "rev-parse", "HEAD")
+    provenance._commit.cache_clear()  # an earlier test of this process may have hidden git
     recorded = provenance.collect([])["commit"]
     assert recorded is not None
     assert head.startswith(recorded.removesuffix("-dirty").rpartition("-g")[2])
