@@ -1,0 +1,34 @@
+"""The suite from Python: the functions behind the commands; each returns its results as an object.
+
+    from qrlsuite import api
+
+    small = api.train("beam6g", "mlp", options={"width": 16}, seeds=8, epochs=10)
+    large = api.load("mlp width=64", task="beam6g", published=True)
+    api.compare(large, small)
+    api.board("beam6g", published=True)
+    api.board("beam6g", by="executions", published=True)
+    api.plot("curves", entries=[small, large])
+    api.evaluate("mlp width=16", best=4)
+    api.run_study("width.toml")
+
+Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
+those of `qrlsuite.errors`; where a message names an option of a command, such as `--task`, the function's argument has
+the same name.
+"""
+
+from __future__ import annotations
+
+from qrlsuite.api.entries import board, compare, load, plot
+from qrlsuite.api.studies import new_study, read_study, run_study
+from qrlsuite.api.training import evaluate, train, tune
+from qrlsuite.engine.terminal import show_figures_in_notebook
+
+__all__ = [
+    "board", "compare", "evaluate", "load", "new_study", "plot", "read_study", "run_study", "train", "tune",
+]  # fmt: skip
+
+show_figures_in_notebook()
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,318 @@
+"""Entries from Python: read, rank, compare and draw them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from qrlsuite.api.arguments import Seeds, several
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard import across, rules, studies
+from qrlsuite.leaderboard import board as boards
+from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.compared import EntryComparison, compare_entries
+from qrlsuite.leaderboard.costs import UNITS
+from qrlsuite.leaderboard.pair import on_board
+from qrlsuite.leaderboard.pictures.compose import compose
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.times import ALPHA
+
+Selected = tuple[list[EntryResults], list[str]]
+
+
+def load(
+    entry: str, *, task: str | None = None, runs: str | PathLike[str] = "runs", published: bool = False
+) -> EntryResults:
+    """Read an entry: the learning curves of its seeds, and how they were made.
+
+    Parameters
+    ----------
+    entry:
+        Its name or label, `TASK/` before it or not, or the beginning of one of them; or its folder.
+    task:
+        Look among the entries of this task only; None looks among all.
+    runs:
+        The results folder.
+    published:
+        Look among the published entries that come with the suite, too. Of an entry that is in both, the copy that
+        gets further, then that with more seeds, is read.
+
+    Returns
+    -------
+    EntryResults
+        With `curves` of shape (N, T): the mean validation score of N seeds after each of T epochs, in the task's
+        units ([0, 1] where scores are fractions of the optimum); `steps_per_epoch` environment steps each;
+        `records` by seed; `to_table()` for pandas and polars.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry or several have the name, or no epoch of it is finished; the message says what to type.
+    StoreError
+        If there is no results folder, or a file is damaged.
+
+    Examples
+    --------
+    >>> load("mlp width=64", task="beam6g", runs="none-yet", published=True).curves.shape
+    (100, 100)
+    """
+    folder = Path(runs)
+    collect.check_tasks(folder, several(task), published)
+    return collect.find(folder, entry, published, several(task))
+
+
+def board(
+    tasks: str | Sequence[str] | None = None,
+    *,
+    by: str = "steps",
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str | None = None,
+    alpha: float = ALPHA,
+    horizon: int | None = None,
+    entries: Sequence[str | EntryResults] = (),
+    study: str | None = None,
+    min_seeds: int = 1,
+) -> Leaderboard:
+    """Rank entries by significant outperformance: on a task, on each task, or over several tasks together.
+
+    Parameters
+    ----------
+    tasks:
+        A task; None means all, one after the other. Several are compared together: the entries that were trained on
+        all of them with the same options, by means over the tasks.
+    by:
+        `steps`; `executions` (of circuits), `shots` or `core-hours`: what learning cost, within the same budget for
+        all; `score`, the mean of the last tenth of the epochs, or `area`, that of all. Entries whose record does not
+        hold a cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
+    runs, published:
+        As for `load`. Published entries that answer the question of one study are not ranked beside others of their
+        task: name the study.
+    rule:
+        None ranks by significant outperformance with the error of the whole board held. `paper`, or another name of
+        `qrlsuite list rules`, shows tiers by the cells of the task's grid in the place of ranks. A task
+        may name a rule of its own.
+    alpha:
+        Probability of any false decision on the board.
+    horizon:
+        Environment steps to which all entries are cut; shorter ones are left out. None means the task's horizons.
+    entries:
+        Show these only: what `load` accepts. They keep the ranks that they have among all entries of their task. What
+        `load` returns is compared by itself, without others; and so is all by cost, for the cheapest entry sets the
+        budget.
+    study:
+        Rank the entries of this study only: its name, or a study file's path.
+    min_seeds:
+        Show no entries with fewer seeds.
+
+    Returns
+    -------
+    Leaderboard
+        `sections`, one per task and horizon, with a row per entry; `refused`, one line for each entry that was left
+        out and why; `as_dict()`. Without any entry it has no section.
+
+    Raises
+    ------
+    UnknownNameError
+        If a task, an entry or the rule is unknown, or no entry is left.
+    OptionError
+        If there is no such axis, the horizon is no whole number of epochs, or both `entries` and `study` are given.
+    StoreError
+        If there is no results folder, and `published` is false.
+    PluginError
+        If a plugin's rule fails.
+
+    Examples
+    --------
+    >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
+    >>> [(row.rank_text, row.entry.label) for row in found.sections[0].times.rows]
+    [('1-2', 'ddqn mlp width=64'), ('11', 'ddqn mlp width=16')]
+    >>> names = ["vqc-native qubits=6", "mlp width=16"]
+    >>> found = board("beam6g", by="executions", runs="none-yet", published=True, entries=names)
+    >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
+    [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
+    """
+    folder, task_names = Path(runs), several(tasks)
+    collect.check_tasks(folder, task_names, published)
+    together = task_names if len(task_names) > 1 else ()
+    if rule is not None and (together or by != "steps"):
+        other = "several tasks" if together else f"by = '{by}'"
+        raise OptionError(f"--rule {rule} judges cells of one task in environment steps: not {other}")
+
+    def select(names: Sequence[str], chosen: Sequence[str | EntryResults], least: int) -> Selected:
+        return _selected(folder, names, chosen, study, published, horizon, least)
+
+    if together:
+        found, left_out = across.collected(together, lambda task: select([task], entries, min_seeds))
+        return boards.build(found, left_out, None, horizon, alpha, by=by, together=together)
+    shown, left_out = select(task_names, entries, min_seeds)
+    keys = {(entry.task_hash, entry.name) for entry in shown}
+    family = shown
+    read = any(isinstance(entry, EntryResults) for entry in entries)
+    if (entries or min_seeds > 1) and not read and by not in UNITS:
+        family = _family(shown, select(task_names, (), 1)[0])
+    return boards.build(
+        family,
+        left_out,
+        rules.load(rule) if rule else None,
+        horizon,
+        alpha,
+        lambda entry: (entry.task_hash, entry.name) in keys,
+        by,
+    )
+
+
+def compare(
+    first: str | EntryResults,
+    second: str | EntryResults,
+    *,
+    task: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    rule: str | None = None,
+) -> EntryComparison:
+    """Say which of two entries needs fewer steps, by how much and how surely.
+
+    All seeds of both count, up to the shorter horizon. In the cells of the task's ranking grid both are compared at
+    equal numbers of seeds.
+
+    Parameters
+    ----------
+    first, second:
+        What `load` accepts, or what it returns.
+    task, runs, published:
+        As for `load`.
+    rule:
+        As for `board`: what counts as significant in a cell.
+
+    Returns
+    -------
+    EntryComparison
+        `verdict`, a sentence; `pair`, with the numbers of each threshold and the final scores; `among`, the verdict on
+        the board of all entries of the task, where one of the two is given by name. Of the cells: `verdicts`, E rows of
+        D; `points` of shape (2, E, D) and `intervals` of shape (2, E, D, 2), in environment steps; `outcome`, and the
+        same as a `sentence`. `as_dict()` has all.
+
+    Raises
+    ------
+    UnknownNameError
+        If an entry, the task or the rule is unknown.
+    QrlSuiteError
+        If the entries belong to different tasks, or their lengths have no common horizon.
+
+    Examples
+    --------
+    >>> found = compare("mlp width=64", "mlp width=16", task="beam6g", runs="none-yet", published=True)
+    >>> found.verdict
+    'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 57%, 100 seeds each, p < .0001)'
+    """
+    left, other = (
+        entry if isinstance(entry, EntryResults) else load(entry, task=task, runs=runs, published=published)
+        for entry in (first, second)
+    )
+    compared = compare_entries(left, other, rules.load(rule) if rule else None)
+    if isinstance(first, EntryResults) and isinstance(second, EntryResults):
+        return compared
+    others, _ = collect.collect(Path(runs), [left.task], published)
+    among = on_board(left, other, others, compared.grid, compared.pair.times.alpha)
+    return replace(compared, among=among)
+
+
+def plot(
+    kind: str,
+    *,
+    tasks: str | Sequence[str] | None = None,
+    entries: Sequence[str | EntryResults] = (),
+    horizon: int | None = None,
+    min_seeds: int = 1,
+    seeds: Seeds | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    environment: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Figure:
+    """Draw a picture of entries, of a task's environment, or of the estimator.
+
+    Entries that would cut the others to their own length are left out, unless `entries` names them. A warning names
+    each entry that was left out.
+
+    Parameters
+    ----------
+    kind:
+        What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
+    tasks, entries, horizon, min_seeds, runs, published:
+        As for `board`. Without `entries` all of the task are drawn, the smallest model first.
+    seeds:
+        Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; None means all.
+    environment:
+        For a picture of an environment: options that replace the task's.
+    settings:
+        The picture's own settings: `qrlsuite plot KIND --settings` lists them.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To show, change, or save with `figure.savefig`.
+
+    Raises
+    ------
+    UnknownNameError
+        If the kind, a task or an entry is unknown, or there are no entries.
+    OptionError
+        If a setting is unknown or has a bad value, or the picture cannot be made of these entries or tasks.
+    StoreError
+        If there is no results folder, and `published` is false.
+
+    Examples
+    --------
+    >>> plot("tiers", tasks="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
+    """
+    if "task" in settings:
+        raise OptionError(f"plot takes `tasks`, one or several: write tasks={settings['task']!r}")
+    drawn = compose(
+        kind,
+        several(tasks),
+        entries,
+        horizon=horizon,
+        min_seeds=min_seeds,
+        seeds=seeds,
+        runs=Path(runs),
+        published=published,
+        settings=settings,
+        environment=environment or {},
+    )
+    for line in drawn.left_out:
+        warnings.warn(f"left out: {line}", stacklevel=2)
+    return drawn.figure
+
+
+def _selected(
+    runs: Path,
+    tasks: Sequence[str],
+    entries: Sequence[str | EntryResults],
+    study: str | None,
+    published: bool,
+    horizon: int | None,
+    min_seeds: int,
+) -> tuple[list[EntryResults], list[str]]:
+    """Return the entries of a board, those named or those of a study, and a line for each that was left out."""
+    if study is None:
+        return collect.select(runs, tasks, entries, published, horizon, min_seeds)
+    if entries:
+        raise OptionError(f"--study {study} names the entries: leave --entry out")
+    return studies.select(study, runs, tasks, published, horizon, min_seeds)
+
+
+def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:
+    """Return what is compared: all ranked entries of the same definitions of tasks, and those shown beside them."""
+    hashes = {entry.task_hash for entry in shown}
+    family = [entry for entry in ranked if entry.task_hash in hashes]
+    keys = {(entry.task_hash, entry.name) for entry in family}
+    return family + [entry for entry in shown if (entry.task_hash, entry.name) not in keys]

@@ -1,0 +1,286 @@
+"""Training from Python: entries, searches of settings, and how trained agents play."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
+from qrlsuite.engine import missing
+from qrlsuite.engine.display import RunDisplay
+from qrlsuite.engine.where import Where
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.options import from_mapping
+from qrlsuite.results.seeds import read_seeds
+from qrlsuite.training import trackers
+from qrlsuite.tuning import runner as tuning_runner
+from qrlsuite.tuning.display import TuneDisplay
+from qrlsuite.tuning.search import Search, preset_path, read_requests, tuning_seeds
+
+if TYPE_CHECKING:
+    from qrlsuite.leaderboard.evaluation import Evaluation
+
+
+def train(
+    task: str,
+    model: str,
+    *,
+    algorithm: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    preset: str | None = None,
+    seeds: Seeds | None = None,
+    epochs: int | None = None,
+    engine: str | Where = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    budget: str | None = None,
+    track: str | Sequence[str] = (),
+    fresh: bool = False,
+    same: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> EntryResults | None:
+    """Train the missing seeds of an entry: a model and an algorithm on a task.
+
+    Interrupt it at any time: every finished epoch is saved, and the same call continues, to the same bytes as if it
+    had not been interrupted. More seeds or epochs extend earlier results; a repeated call trains nothing.
+
+    Parameters
+    ----------
+    task, model:
+        Registered names (`qrlsuite list tasks`, `qrlsuite list models`), or a task file's path.
+    algorithm:
+        A learning algorithm; None takes the task's.
+    options:
+        Options by name: `{"qubits": 6, "algorithm.gamma": 0.9, "environment.degree": 4}`.
+    preset:
+        One of the task's presets of settings, or a preset file's path.
+    seeds:
+        A number (100: seeds 0 to 99), the seeds themselves, or text ('0:20'); None takes the task's protocol.
+    epochs:
+        The epoch to which each is trained; None takes the task's protocol.
+    engine:
+        Where the work is done: a name (`qrlsuite list engines`), or what `qrlsuite.engine.where.Where.create` built
+        of a name and options.
+    workers:
+        Processes, or tasks in a queue; None takes one per core, or what the engine takes.
+    device:
+        `cpu`, `cuda` or `cuda:1`.
+    budget:
+        `"30min"`, `"8h"` or `"2core-hours"`: stop then, with every finished epoch saved.
+    track:
+        Trackers that watch, `NAME` or `NAME=TARGET`.
+    fresh:
+        Where the code of the entry has changed: train anew, and move the old seeds to a folder beside it.
+    same:
+        Where the code has changed: your word that nothing changed in effect, as a reason; the seeds are continued.
+    runs:
+        The results folder.
+    progress:
+        Whether to show a bar on a terminal or in a notebook, and lines elsewhere.
+
+    Returns
+    -------
+    EntryResults
+        The entry with its learning curves (N, T), of all its seeds that are there; None where no epoch has finished
+        yet, for it was handed to a queue, or the `budget` was too small.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, FileError
+        For an unknown name, or an option or argument that cannot be used.
+    StoreError
+        If a file of the entry is damaged, or another code has begun its seeds.
+    QrlSuiteError
+        If training failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> entry = train("beam6g", "mlp", options={"width": 16}, seeds=2, epochs=1)  # doctest: +SKIP
+    >>> entry.curves.shape  # doctest: +SKIP
+    (2, 1)
+    """
+    entry = resolve(task, model, algorithm, from_mapping(options), preset)
+    watching = [track] if isinstance(track, str) else list(track)
+    seed_numbers = None if seeds is None else read_seeds(seeds)
+    check_positive("epochs", epochs)
+    where = where_of(engine, workers, device, fresh, same)
+    missing.check_budget(budget, where)
+    missing.require_same_code(Path(runs), [entry], where)
+    work = missing.find(Path(runs), entry, where, seed_numbers, epochs)
+    with trackers.asking(watching):
+        missing.train(work, where, RunDisplay(work, where.workers, not progress, "call"), budget)
+    return collect.read(work.store)
+
+
+def tune(
+    task: str,
+    entries: str | Sequence[str],
+    *,
+    vary: str | Sequence[str] | Mapping[str, Any] | None = None,
+    sampler: str | None = None,
+    seeds: Seeds = 20,
+    epochs: int | None = None,
+    objective: Literal["time", "cell", "area"] = "time",
+    budget: str | None = None,
+    out: str | PathLike[str] | None = None,
+    engine: str | Where = "local",
+    workers: int | None = None,
+    device: str = "cpu",
+    fresh: bool = False,
+    same: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> list[Search]:
+    """Search settings with which models learn in few steps, on seeds that entries are never judged by.
+
+    Interrupt it at any time: the same call continues, and ends with the same presets as if it had never stopped.
+
+    Parameters
+    ----------
+    task, engine, workers, device, fresh, same, runs:
+        As for `train`. Trials lie below `runs`/tuning.
+    entries:
+        What is tuned: `"mlp width=16"`, or several, which get equal budgets. Options that are written are not varied.
+    vary:
+        What is varied: lists of values, or ranges, `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`; or
+        words as on the command line: a grid's name (`"paper"`), a grid file's path, `"lr=1e-3,5e-4"`. Without it
+        `halving` varies the options that models and algorithms mark as `Tuned`.
+    sampler:
+        `halving`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`.
+        None takes all combinations of what `vary` lists, and halving without it.
+    seeds:
+        Runs of each trial, with `halving` of each in the last rung: a number counts from seed 1,000,000.
+    epochs:
+        Of each trial; None takes the task's protocol.
+    objective:
+        What is minimized: steps below threshold (`time`), sample complexity at the task's reference `cell`, or its
+        mean over the ranking grid (`area`).
+    budget:
+        `"30min"`: begin no trial that would not end within this time; every call gets it anew. `"2core-hours"` with
+        `halving`: as many settings as this much of each model's time holds.
+    out:
+        The preset file, ending in .toml; None takes one below `runs`.
+    progress:
+        Whether to show what is searched, and a bar on a terminal or in a notebook.
+
+    Returns
+    -------
+    list of Search
+        One per entry, with `best` and all `trials`; `written`, the preset file for `train(preset=...)`, which is None
+        where the search is not over.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, FileError
+        For an unknown name, or an option or argument that cannot be used.
+    QrlSuiteError
+        If a trial failed; finished epochs are kept.
+    KeyboardInterrupt
+        When it was interrupted and every worker has saved and ended.
+
+    Examples
+    --------
+    >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
+    >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
+    """
+    check_positive("epochs", epochs)
+    where, folder = where_of(engine, workers, device, fresh, same), Path(runs)
+    requests = read_requests(
+        task, several(entries), vary or (), sampler, tuning_seeds(seeds), epochs, objective, budget
+    )
+    path = preset_path(out, requests)
+    searches = tuning_runner.build(requests, folder)
+    display = TuneDisplay(searches, where, not progress, "call")
+    display.begin()
+    tuning_runner.run(searches, folder, where, display, path)
+    return searches
+
+
+def evaluate(
+    entries: str | Sequence[str],
+    *,
+    task: str | None = None,
+    best: int = 10,
+    episodes: int = 1000,
+    seed: int = 0,
+    device: str = "cpu",
+    backend: str | None = None,
+    yes: bool = False,
+    runs: str | PathLike[str] = "runs",
+    progress: bool = True,
+) -> Evaluation:
+    """Play fresh episodes with the best trained agents of some entries, and with reference policies.
+
+    The agents are chosen by their last validation score; the episodes are others, the same for every policy, so the
+    choice does not raise the result.
+
+    Parameters
+    ----------
+    entries:
+        One or several entries of one task, each by name, label, the beginning of one of them, or folder.
+    task:
+        Look among the entries of this task only.
+    best:
+        How many agents of each entry.
+    episodes:
+        Complete episodes of each agent.
+    seed:
+        Another one gives other episodes.
+    device:
+        `cpu`, `cuda` or `cuda:1`.
+    backend:
+        Let the same agents act on this circuit backend, too: `native`, `pennylane`, `qiskit`, or a plugin's, with
+        options if need be: `"qiskit shots=1000"`. Finished episodes are kept in the entry's folder.
+    yes:
+        Execute circuits on a device that is no simulator.
+    runs:
+        The results folder.
+    progress:
+        Whether to show what is to be executed, and a bar, on a terminal or in a notebook.
+
+    Returns
+    -------
+    Evaluation
+        With `policies`: `returns` (sums of rewards) and relative `scores`, each of shape (agents, episodes); a
+        `figure()`; and `as_dict()`.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have a name.
+    OptionError
+        If the entries belong to different tasks, or a number cannot be used.
+    StoreError
+        If an entry has no trained agent.
+
+    Examples
+    --------
+    >>> evaluate(["mlp width=64", "vqc-native"], best=10).figure().savefig("histogram.pdf")  # doctest: +SKIP
+    """
+    from qrlsuite.leaderboard import evaluation  # torch, which all other functions do without
+
+    check_positive("best", best)
+    check_positive("episodes", episodes)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise OptionError(f"seed = {seed!r}: give a whole number, 0 or more")
+    names = [entries] if isinstance(entries, str) else list(entries)
+    return evaluation.evaluate(
+        Path(runs),
+        names,
+        task=task,
+        best=best,
+        episodes=episodes,
+        seed=seed,
+        device=device,
+        progress=progress,
+        backend=backend,
+        yes=yes,
+    )
