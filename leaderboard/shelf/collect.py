@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError, listed
@@ -15,7 +12,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf import published as published_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
-from qrlsuite.results import codes, genuine, lookup, probes, provenance
+from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, SeedRun, entries, parameters_of
 
@@ -93,16 +90,9 @@ def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
     if len(kinds) == 1:
         return kinds
     return [
-        [_marked(entry, "@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
+        [entry.marked("@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
         for same in kinds
     ]
-
-
-def _marked(entry: EntryResults, mark: str) -> EntryResults:
-    """Return an entry whose name and label say of which code it is."""
-    if "@" in entry.name:
-        return entry
-    return replace(entry, name=f"{entry.name}{mark}", label=f"{entry.label} {mark}")
 
 
 def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
@@ -357,7 +347,7 @@ def read_each(store: EntryStore) -> list[EntryResults]:
 
 def _of_code(store: EntryStore, group: codes.SameCode) -> EntryResults | None:
     entry = read_entry(store, group.seeds)
-    return None if entry is None else _marked(entry, f"@{group.mark}")
+    return None if entry is None else entry.marked(f"@{group.mark}")
 
 
 def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> EntryResults | None:
@@ -383,51 +373,12 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         if refused:
             raise StoreError("; ".join(refused))
         return None
-    found = _require_independent(store, runs)
-    length = _common_length(runs)
-    kept = [run for run in runs if len(run.scores) >= length]
-    made_with = [made for run in runs for made in run.record.get("provenance", [])]
-    foreign = any(probes.third_party(made) for made in made_with)
-    parameters = parameters_of(run.record for run in runs)
-    identity = record["identity"]
-    preset = record["preset"]
-    own = {run.seed: run.curve for run in runs}
-    values = np.stack([own[run.seed][:length] for run in kept])
-    return EntryResults(
-        name=record["name"] + store.mark,
-        label=" ".join([record["label"], store.mark]).rstrip(),
-        task=record["task_name"],
-        task_hash=record["task_hash"],
-        task_file=task_file,
-        algorithm=identity["algorithm"],
-        model=identity["model"],
-        parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
-        networks=parameters.get("networks"),
-        fixed=int(parameters.get("fixed", 0)),
-        curves=values,
-        seeds=tuple(run.seed for run in kept),
-        left_out=tuple(run.seed for run in runs if len(run.scores) < length),
-        hours=sum(run.seconds for run in runs) / 3600,
-        clocked=any(run.clocked for run in runs),
-        folder=store.path,
-        identity=identity,
-        options={
-            "algorithm": _mapping(identity.get("algorithm_options")),
-            "model": _mapping(identity.get("model_options")),
-            "environment": task_file.environment.options,
-        },
-        preset=preset if isinstance(preset, str) else None,
-        versions=provenance.versions(made_with),
-        commits=provenance.texts(made_with, "commit"),
-        processors=provenance.texts(made_with, "processor"),
-        devices=provenance.devices(made_with),
-        tuning=record["tuning"],
-        plan=record.get("plan"),
-        codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
-        unprobed=foreign and probes.EQUAL not in found,
-        first_thresholds=first.ranking.grid.thresholds,
-        executions=sum(run.executions for run in runs),
-        records={
+    entry = EntryResults.of_record(
+        record,
+        first,
+        store.path,
+        {run.seed: run.curve for run in runs},
+        {
             run.seed: {
                 "epochs": len(run.scores),
                 "finished": run.finished,
@@ -437,9 +388,14 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
             }
             for run in runs
         },
-        runs=own if any(len(curve) != length for curve in own.values()) else {},
+        parameters_of(run.record for run in runs),
+        [made for run in runs for made in run.record.get("provenance", [])],
+        _require_independent(store, runs),
+        clocked=any(run.clocked for run in runs),
+        codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
         refused=tuple(refused),
     )
+    return entry.marked(store.mark)
 
 
 def _readable(
@@ -486,13 +442,3 @@ def _require_independent(store: EntryStore, runs: Sequence[SeedRun]) -> set[str]
                 f"differs in {probe.get('difference')}; `qrlsuite check` looks for the cause"
             )
     return {probe["result"] for probe in made}
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _common_length(runs: Sequence[SeedRun]) -> int:
-    """Return the epochs that half of the finished runs or more have; before any finished, the fewest of any run."""
-    lengths = sorted((len(run.scores) for run in runs if run.finished), reverse=True)
-    return lengths[(len(lengths) - 1) // 2] if lengths else min(len(run.scores) for run in runs)

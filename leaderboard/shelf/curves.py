@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -21,6 +21,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
+from qrlsuite.results import probes, provenance
 from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.text import counted
 
@@ -120,6 +121,85 @@ class EntryResults(Shown):
     unprobed: bool = False
     chosen_seeds: str = ""
     first_thresholds: tuple[float, ...] | None = None
+
+    @classmethod
+    def of_record(
+        cls,
+        record: Mapping[str, Any],
+        task_file: TaskFile,
+        folder: Path,
+        curves: Mapping[int, NDArray[np.float64]],
+        records: Mapping[int, Mapping[str, Any]],
+        parameters: Mapping[str, int],
+        made_with: Sequence[Mapping[str, Any]],
+        probed: Collection[str],
+        **facts: Any,
+    ) -> EntryResults:
+        """Return the results of an entry, from runs or published.
+
+        Parameters
+        ----------
+        record:
+            The content of `entry.json`.
+        task_file:
+            The task as the record holds it.
+        curves:
+            Each seed's curve (T,), of any lengths.
+        parameters:
+            The result of `qrlsuite.results.store.parameters_of`.
+        made_with:
+            What made the seeds, see `qrlsuite.results.provenance.collect`.
+        probed:
+            The results of probes of its seeds.
+        records, facts:
+            Attributes that stay as they are.
+        """
+        identity, preset = record["identity"], record["preset"]
+        now = current(task_file, record["task_name"], record["task_hash"])
+        length = _common_length(records.values())
+        kept = [seed for seed, curve in curves.items() if len(curve) >= length]
+        return cls(
+            name=record["name"],
+            label=record["label"],
+            task=record["task_name"],
+            task_hash=record["task_hash"],
+            task_file=now,
+            algorithm=identity["algorithm"],
+            model=identity["model"],
+            parameters=(int(parameters.get("classical", 0)), int(parameters.get("quantum", 0))),
+            networks=parameters.get("networks"),
+            fixed=int(parameters.get("fixed", 0)),
+            curves=np.stack([curves[seed][:length] for seed in kept]),
+            seeds=tuple(kept),
+            left_out=tuple(seed for seed in curves if seed not in kept),
+            runs=curves if any(len(curve) != length for curve in curves.values()) else {},
+            hours=float(np.sum([spent["hours"] for spent in records.values()])),
+            executions=sum(spent["executions"] for spent in records.values()),
+            records=records,
+            folder=folder,
+            identity=identity,
+            options={
+                "algorithm": _mapping(identity.get("algorithm_options")),
+                "model": _mapping(identity.get("model_options")),
+                "environment": now.environment.options,
+            },
+            preset=preset if isinstance(preset, str) else None,
+            tuning=record["tuning"],
+            plan=record.get("plan"),
+            versions=provenance.versions(made_with),
+            commits=provenance.texts(made_with, "commit"),
+            processors=provenance.texts(made_with, "processor"),
+            devices=provenance.devices(made_with),
+            unprobed=any(map(probes.third_party, made_with)) and probes.EQUAL not in probed,
+            first_thresholds=task_file.ranking.grid.thresholds,
+            **facts,
+        )
+
+    def marked(self, mark: str) -> EntryResults:
+        """Return the entry with a mark behind its name and its label, which say of which code it is."""
+        if not mark or "@" in self.name:
+            return self
+        return replace(self, name=f"{self.name}{mark}", label=f"{self.label} {mark}")
 
     def reaching(self, epochs: int) -> EntryResults | None:
         """Return the entry with every run that has reached a number of epochs, itself where all have; None for none."""
@@ -314,6 +394,16 @@ def _registered(known: registry.Registry, name: str) -> Task | None:
         return load_task(name)
     except QrlSuiteError:
         return None  # its environment is not installed
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _common_length(records: Collection[Mapping[str, Any]]) -> int:
+    """Return the epochs that half of the finished runs or more have; before any finished, the fewest of any run."""
+    lengths = sorted((int(run["epochs"]) for run in records if run["finished"]), reverse=True)
+    return lengths[(len(lengths) - 1) // 2] if lengths else min(int(run["epochs"]) for run in records)
 
 
 def require_scores(scores: NDArray[np.float64], task_file: TaskFile, folder: Path) -> None:

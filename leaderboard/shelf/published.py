@@ -26,7 +26,7 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
-from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
+from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet, probes, provenance
@@ -106,45 +106,13 @@ class PublishedEntry:
 
     def entry_results(self) -> EntryResults:
         """Return what a leaderboard ranks."""
-        record, identity = self.record, self.record["identity"]
-        count = record["published"]["parameters"]
-        made_with = [record for last in self.provenance for record in provenance.records(last)]
-        return EntryResults(
-            name=record["name"],
-            label=record["label"],
-            task=record["task_name"],
-            task_hash=record["task_hash"],
-            task_file=current(self.task_file, record["task_name"], record["task_hash"]),
-            algorithm=identity["algorithm"],
-            model=identity["model"],
-            parameters=(count["classical"], count["quantum"]),
-            networks=count.get("networks"),
-            fixed=count.get("fixed", 0),
-            curves=self.curves,
-            seeds=self.seeds,
-            left_out=(),
-            hours=float(self.hours.sum()),
-            folder=self.folder,
-            identity=identity,
-            options={
-                "algorithm": identity["algorithm_options"],
-                "model": identity["model_options"],
-                "environment": self.task_file.environment.options,
-            },
-            preset=record["preset"] if isinstance(record["preset"], str) else None,
-            versions=provenance.versions(made_with),
-            commits=provenance.texts(made_with, "commit"),
-            processors=provenance.texts(made_with, "processor"),
-            devices=provenance.devices(made_with),
-            executions=int(self.executions.sum()),
-            tuning=record["tuning"],
-            plan=record.get("plan"),
-            codes=codes.distinct([codes.read(record, self.folder / "entry.json")]),
-            first_thresholds=self.task_file.ranking.grid.thresholds,
-            unprobed=any(map(probes.third_party, made_with)) and self.probe.get("result") != probes.EQUAL,
-            source="published",
-            chosen_seeds=self.chosen_seeds,
-            records={
+        published = self.record["published"]
+        return EntryResults.of_record(
+            self.record,
+            self.task_file,
+            self.folder,
+            dict(zip(self.seeds, self.curves)),
+            {
                 seed: {
                     "epochs": int(self.curves.shape[1]),
                     "finished": True,
@@ -154,6 +122,12 @@ class PublishedEntry:
                 }
                 for seed, hours, executions in zip(self.seeds, self.hours, self.executions)
             },
+            published["parameters"],
+            [made for last in self.provenance for made in provenance.records(last)],
+            {self.probe.get("result", "")},
+            codes=codes.distinct([codes.read(self.record, self.folder / "entry.json")]),
+            source="published",
+            chosen_seeds=self.chosen_seeds,
         )
 
 
