@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any, Protocol
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -81,14 +80,9 @@ class Leaderboard(Shown):
         return [section.sheet(explain) for section in self.sections]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield from self.sheets()
+        yield from self.sheets() if self.sections else [Text("no entries")]
         for line in self.refused:
             yield Text(f"left out: {line}")
-
-    def _repr_html_(self) -> str:
-        parts = [sheet.html() for sheet in self.sheets()]
-        parts += [f"<p>left out: {escape(line)}</p>" for line in self.refused]
-        return "\n".join(parts) or "<p>no entries</p>"
 
 
 def build(

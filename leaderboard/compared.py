@@ -11,7 +11,6 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard import tables
@@ -93,12 +92,6 @@ class EntryComparison(Shown, Comparison):
             yield Text(f"\n{self.headline}:")
             yield comparison_table(self)
             yield Text(self.legend)
-
-    def _repr_html_(self) -> str:
-        pair = self.pair
-        notes = [*pair.notes, *self.further]
-        shown = Sheet.of(self.verdict, pair.columns(), pair.rows(), notes, explained=True).html()
-        return shown + (comparison_html(self, self.headline) if self.show_cells else "")
 
 
 def compare_entries(
@@ -195,13 +188,3 @@ def legend(comparison: Comparison) -> str:
     """Explain the signs that occur in a comparison's table."""
     occurring = {str(verdict) for row in comparison.verdicts for verdict in row}
     return ", ".join(f"{sign} {meaning}" for name, (sign, _, meaning) in SYMBOLS.items() if name in occurring)
-
-
-def comparison_html(comparison: Comparison, headline: str) -> str:
-    """Return a comparison's cells as HTML for a notebook: the result in words, and a sign per cell of the grid."""
-    heading, rows, deltas = _levels(comparison)
-    signs = [[name, *(SYMBOLS[str(v)][0] for v in row)] for name, row in zip(rows, comparison.verdicts)]
-    remarks = [heading, legend(comparison)]
-    return Sheet.of(
-        f"{headline}: {comparison.sentence}", ["", *deltas], signs, remarks, explained=True
-    ).html()

@@ -6,7 +6,6 @@ import contextlib
 import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -302,10 +301,6 @@ class EntryResults(Shown):
         for name, text in self.facts.items():
             table.add_row(Text(name), Text(text))
         return table
-
-    def _repr_html_(self) -> str:
-        rows = (f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts.items())
-        return f"<table>{''.join(rows)}</table>"
 
     @property
     def fixed_text(self) -> str:

@@ -7,7 +7,7 @@ import io
 import re
 import textwrap
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, Literal
@@ -177,11 +177,17 @@ class Sheet:
 
     def html(self) -> str:
         """Return heading, table and notes as HTML for a notebook; every text is escaped."""
-        head = "".join(f"<th>{escape(column.head)}</th>" for column in self.columns)
-        body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self.rows)
+        places = [f" style='text-align:{'left' if column.words else 'right'}'" for column in self.columns]
+
+        def row(cells: Iterable[str], tag: str) -> str:
+            texts = (f"<{tag}{place}>{escape(cell)}</{tag}>" for place, cell in zip(places, cells))
+            return f"<tr>{''.join(texts)}</tr>"
+
+        head = row((column.head for column in self.columns), "th")
+        body = "".join(row(cells, "td") for cells in self.rows)
         return (
             (f"<p><b>{escape(self.title)}</b></p>" if self.title else "")
-            + f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+            + f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
             + "".join(f"<p><small>{escape(line)}</small></p>" for line in self.remarks())
         )
 

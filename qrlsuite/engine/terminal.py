@@ -7,13 +7,18 @@ import os
 import shlex
 import shutil
 import sys
+from collections.abc import Iterable, Iterator
+from html import escape
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 
 class Shown:
-    """A result that shows itself as its table: printed, at a Python prompt, and in a notebook.
+    """A result that shows itself as its table: printed, at a Python prompt, and as HTML in a notebook.
 
     Subclasses have `__rich_console__` or `__rich__`, and are dataclasses with `repr=False`.
     """
@@ -25,10 +30,46 @@ class Shown:
         return "\n".join(line.rstrip() for line in text.getvalue().rstrip().split("\n"))
 
     def _repr_html_(self) -> str:
-        console = Console(record=True, file=io.StringIO(), width=130, highlight=False, force_jupyter=False)
-        console.print(self)
-        style = "white-space:pre;overflow-x:auto;line-height:normal;font-family:monospace"
-        return console.export_html(inline_styles=True, code_format=f"<pre style='{style}'>{{code}}</pre>")
+        console = Console(width=130, file=io.StringIO(), force_jupyter=False)
+        return "\n".join(part for each in _parts(self, console) if (part := _html(each)))
+
+
+def _parts(shown: Any, console: Console) -> Iterator[Any]:
+    """Return what a result shows, in order: tables, texts, and sheets, which write themselves as HTML."""
+    if hasattr(shown, "__rich__"):
+        yield from _parts(shown.__rich__(), console)
+    elif isinstance(shown, str | Text | Table) or hasattr(shown, "html"):
+        yield shown
+    else:
+        for part in shown.__rich_console__(console, console.options):
+            yield from _parts(part, console)
+
+
+def _html(part: Any) -> str:
+    """Return a part of a result as HTML, with every text escaped; a part without words is left out."""
+    if isinstance(part, Table):
+        return _table_html(part)
+    if isinstance(part, str | Text):
+        bold = isinstance(part, Text) and "bold" in str(part.style)
+        lines = "<br>".join(map(escape, str(part).strip().splitlines()))
+        return f"<p><b>{lines}</b></p>" if bold else f"<p>{lines}</p>" * bool(lines)
+    return str(part.html())
+
+
+def _table_html(table: Table) -> str:
+    """Return a table as one of HTML: numbers at the right, as in a terminal; title above, caption below."""
+    columns = table.columns
+    places = [f" style='text-align:{column.justify}'" for column in columns]
+
+    def row(cells: Iterable[object], tag: str) -> str:
+        texts = (escape(" ".join(str(cell).replace("-\n", "-").split())) for cell in cells)
+        return f"<tr>{''.join(f'<{tag}{place}>{text}</{tag}>' for place, text in zip(places, texts))}</tr>"
+
+    head = row((column.header for column in columns), "th") if table.show_header else ""
+    body = "".join(row(cells, "td") for cells in zip(*(column.cells for column in columns)))
+    below = "".join(f"<p><small>{escape(line)}</small></p>" for line in str(table.caption or "").splitlines())
+    title = f"<p><b>{escape(str(table.title))}</b></p>" if table.title else ""
+    return f"{title}<table><thead>{head}</thead><tbody>{body}</tbody></table>{below}"
 
 
 def show_figures_in_notebook() -> None:

@@ -292,6 +292,18 @@ def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == [], "wrong input leaves nothing behind"
 
 
+def test_a_family_of_names_is_one_line_of_all_and_a_line_each_of_its_kind() -> None:
+    lines, tasks = (qrlsuite("list", *words).stdout.splitlines() for words in ([], ["tasks"]))
+    variants = [line for line in tasks if line.startswith("  beam6g-")]
+    [folded] = [line for line in lines if line.startswith("  beam6g-")]
+    assert folded.split(maxsplit=1) == [
+        "beam6g-*",
+        f"{len(variants)} variants of beam6g: qrlsuite list tasks",
+    ]
+    kinds = [line for line in lines if line and not line.startswith(" ")]
+    assert len(kinds) == len(set(kinds)), "a kind is one block"
+
+
 def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     rows = json.loads(qrlsuite("list", "--json").stdout)
     assert {"environments", "models", "algorithms", "tasks"} <= {row["kind"] for row in rows}

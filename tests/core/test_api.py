@@ -99,7 +99,7 @@ def test_evaluating(tiny_task: str, tmp_path: Path) -> None:
     with shown.capture() as captured:
         shown.print(found)
     assert "3 fresh episodes of each policy" in captured.get()
-    assert entry.label in found._repr_html_()
+    assert f"<td style='text-align:left'>{entry.label}</td>" in found._repr_html_()
     words = ["evaluate", entry.name, "--best", "2", "--episodes", "3", "--runs", str(tmp_path), "--json"]
     assert {**found.as_dict(), "picture": None} == json.loads(command(*words).stdout)
 

@@ -125,6 +125,7 @@ def test_results_show_themselves(small: EntryResults, large: EntryResults) -> No
         said = " ".join(unescape(shown).split())
         assert comparison.verdict in said
         assert comparison.sentence in said
+    assert all("<td" in shown._repr_html_() for shown in (board, comparison, small)), "tables, not drawn ones"
     assert "ddqn-mlp-" in small._repr_html_()
     assert "387" in printed(small)
     assert repr(small).startswith("task        beam6g\nentry       ddqn mlp width=16 (ddqn-mlp-")

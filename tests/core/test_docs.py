@@ -50,12 +50,18 @@ IN_SENTENCES = {
 
 
 def application() -> tuple[Any, Any]:
-    """Return the command line as a tree of commands, and the module they come from: click, or typer's copy of it."""
+    """Return the command line as a tree of commands, and the module they come from: click, or typer's copy of it.
+
+    Parsing calls the program's own options (`--version`, `--install-completion`, which edits the shell's files): here
+    they do nothing.
+    """
     from typer.main import get_command
 
     from qrlsuite.cli.app import build
 
     tree = get_command(build())
+    for option in tree.params:
+        option.callback = None
     return tree, importlib.import_module(type(tree).make_context.__module__)
 
 
@@ -87,6 +93,14 @@ def test_the_parser_finds_what_is_wrong() -> None:
     assert "No such option" in parse(["run", "--task", "beam6g", "--model", "mlp", "--quickly"])
     assert "is not one of" in parse(["leaderboard", "--format", "pdf"])
     assert "Missing option '--task'" in parse(["run", "mlp"])
+
+
+def test_the_parser_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An option that acts while it is parsed once edited the files of the shell that ran the tests."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for option in ("--install-completion", "--show-completion", "--version"):
+        assert not parse([option])
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("page", "line"), commands())

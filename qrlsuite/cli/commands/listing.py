@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import textwrap
 from typing import Annotated
 
 import typer
 
 from qrlsuite import registry, specs
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.engine.terminal import printable
+from qrlsuite.engine.terminal import printable, table_console
 from qrlsuite.registry import Registry
 
 SHOWN = 8
 """Names of a kind that `list plugins` shows."""
+MANY = 4
+"""Variants of one thing that `list` folds into a line."""
 
 
 def list_things(
@@ -45,10 +49,11 @@ def list_things(
         if only in (None, type(each.spec))
     ]
     rows += _published_studies() if only in (None, specs.StudySpec) else []
+    rows.sort(key=lambda row: list(specs.KINDS).index(row["kind"]))
     if json_output:
         typer.echo(json.dumps(rows))
         return
-    _print(rows)
+    _print(rows, folded=kind is None)
 
 
 def _published_studies() -> list[dict[str, str]]:
@@ -94,12 +99,34 @@ def _list_plugins(known: Registry, json_output: bool) -> None:
         typer.echo("\n" + "\n".join(f"problem: {printable(text)}" for text in others))
 
 
-def _print(rows: list[dict[str, str]]) -> None:
-    width = max((len(row["name"]) for row in rows), default=0)
-    last = None
-    for row in rows:
-        if row["kind"] != last:
-            typer.echo(("" if last is None else "\n") + row["kind"].replace("_", " "))
-            last = row["kind"]
-        origin = "" if row["distribution"] == "qrlsuite" else f"  [{row['distribution']}]"
-        typer.echo(printable(f"  {row['name']:<{width}}  {row['summary']}{origin}"))
+def _print(rows: list[dict[str, str]], folded: bool) -> None:
+    width = table_console(10_000).width  # a pipe keeps a thing on one line
+    for place, (kind, group) in enumerate(itertools.groupby(rows, key=lambda row: row["kind"])):
+        typer.echo("\n" * bool(place) + kind.replace("_", " "))
+        things = [(printable(row["name"]), printable(f"{row['summary']}{_origin(row)}")) for row in group]
+        lines = _folded(things, f"qrlsuite list {kind.replace('_', '-')}") if folded else things
+        indent = max(len(name) for name, _ in lines) + 4
+        for name, summary in lines:
+            first, *more = textwrap.wrap(summary, max(width - indent, 30)) or [""]
+            typer.echo(
+                "\n".join([f"  {name:<{indent - 4}}  {first}", *(" " * indent + line for line in more)])
+            )
+
+
+def _origin(row: dict[str, str]) -> str:
+    return "" if row["distribution"] == "qrlsuite" else f"  [{row['distribution']}]"
+
+
+def _folded(things: list[tuple[str, str]], command: str) -> list[tuple[str, str]]:
+    """Make a line of the many variants of a thing: of those whose name goes on after that thing's and a hyphen."""
+    names = [name for name, _ in things]
+    variants = {name: [each for each in names if each.startswith(f"{name}-")] for name in names}
+    many = {name: found for name, found in variants.items() if len(found) >= MANY}
+    hidden = {each for found in many.values() for each in found}
+    lines = []
+    for name, summary in things:
+        if name not in hidden:
+            lines.append((name, summary))
+        if name in many and name not in hidden:
+            lines.append((f"{name}-*", f"{len(many[name])} variants of {name}: {command}"))
+    return lines
