@@ -21,7 +21,7 @@ import numpy as np
 
 from qrlsuite import api
 from qrlsuite.leaderboard import rules
-from qrlsuite.leaderboard.ranked import learning_curves
+from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.statistics import (
     Grid,
     LearningCurves,

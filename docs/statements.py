@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite import api
-from qrlsuite.leaderboard.ranked import ranking_of
+from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.times import percent
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
-from qrlsuite.leaderboard.times import percent
 from qrlsuite.statistics import Comparison, Direction, LearningCurves, TimesBoard, Verdict, times_board
 from qrlsuite.statistics.estimator import sample_complexity
 from qrlsuite.statistics.times import times_below
@@ -31,8 +31,8 @@ from qrlsuite.statistics.times_board import holm
 from qrlsuite.studies.outcome import versus
 
 if TYPE_CHECKING:
+    from qrlsuite.leaderboard.boards.times import TimeRanking
     from qrlsuite.leaderboard.shelf.curves import EntryResults
-    from qrlsuite.leaderboard.times import TimeRanking
 
 DOCS = Path(__file__).parent
 FILE = DOCS / "statements.csv"

@@ -14,11 +14,11 @@ from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, nearest
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import pictures
+from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.times import rank_by_time
 from qrlsuite.leaderboard.pictures import cells, style
-from qrlsuite.leaderboard.ranked import ranking_of
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import rank_by_time
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.studies.looks import StudyWithLooks

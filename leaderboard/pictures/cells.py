@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.pictures import style
-from qrlsuite.leaderboard.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled

@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
-from qrlsuite.leaderboard.costs import price
+from qrlsuite.leaderboard.boards.costs import price
 from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
@@ -48,8 +48,8 @@ class CostsOptions:
 def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     """Draw S_hat of each entry at one cell, with its 5th to 95th percentile, in each unit on a logarithmic axis.
 
-    An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.costs.price`. One that
-    has no such cost (networks execute no circuits, exact values take no shots) has no point there.
+    An entry's steps are converted by what a step of it cost in all, see `qrlsuite.leaderboard.boards.costs.price`. An
+    entry without such a cost (networks execute no circuits, exact values take no shots) has no point there.
 
     Raises
     ------

@@ -19,8 +19,8 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.pictures import cells, style
-from qrlsuite.leaderboard.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Grid

@@ -13,8 +13,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options
+from qrlsuite.leaderboard.boards.ranked import learning_curves, ranking_of
 from qrlsuite.leaderboard.pictures import cells, style
-from qrlsuite.leaderboard.ranked import learning_curves, ranking_of
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import Board, outperformance

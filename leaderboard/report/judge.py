@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qrlsuite.leaderboard.ranked import learning_curves, ranking_of
-from qrlsuite.leaderboard.steps import Section
+from qrlsuite.leaderboard.boards.ranked import learning_curves, ranking_of
+from qrlsuite.leaderboard.boards.steps import Section
 from qrlsuite.statistics import Board, Evidence, Grid, LearningCurves, Outcome
 from qrlsuite.statistics.compare import in_words, overall
 

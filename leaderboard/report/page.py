@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import qrlsuite
-from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.boards.board import Leaderboard
 from qrlsuite.leaderboard.report import entries, sections
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
@@ -40,7 +40,7 @@ def render(
     Parameters
     ----------
     board:
-        As `qrlsuite.leaderboard.board.build` returns it.
+        As `qrlsuite.leaderboard.boards.board.build` returns it.
     title:
         The page's heading.
     studies:

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
-from qrlsuite.leaderboard import tables
-from qrlsuite.leaderboard.ranked import ranking_of
+from qrlsuite.leaderboard.boards import tables
+from qrlsuite.leaderboard.boards.ranked import ranking_of
+from qrlsuite.leaderboard.boards.steps import Row, Section
+from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow
 from qrlsuite.leaderboard.report import ladder, timed
 from qrlsuite.leaderboard.report.encode import clean
 from qrlsuite.leaderboard.report.entries import EntryView
@@ -18,8 +20,6 @@ from qrlsuite.leaderboard.report.judge import Judgement, judge
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
 from qrlsuite.leaderboard.report.words import listed
 from qrlsuite.leaderboard.shelf.absent import absent
-from qrlsuite.leaderboard.steps import Row, Section
-from qrlsuite.leaderboard.times import TimeRanking, TimeRow
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import Evidence, Grid, Outcome
 from qrlsuite.statistics.compare import TOO_FEW

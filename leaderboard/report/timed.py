@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from qrlsuite.leaderboard.times import TimeRanking, p_text
+from qrlsuite.leaderboard.boards.times import TimeRanking, p_text
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
 

@@ -13,16 +13,17 @@ from matplotlib.figure import Figure
 
 from qrlsuite.api.arguments import Seeds, several
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import across, rules, studies
-from qrlsuite.leaderboard import board as boards
-from qrlsuite.leaderboard.board import Leaderboard
-from qrlsuite.leaderboard.compared import EntryComparison, compare_entries
-from qrlsuite.leaderboard.costs import UNITS
-from qrlsuite.leaderboard.pair import on_board
+from qrlsuite.leaderboard import rules, studies
+from qrlsuite.leaderboard.boards import across
+from qrlsuite.leaderboard.boards import board as boards
+from qrlsuite.leaderboard.boards.board import Leaderboard
+from qrlsuite.leaderboard.boards.compared import EntryComparison, compare_entries
+from qrlsuite.leaderboard.boards.costs import UNITS
+from qrlsuite.leaderboard.boards.pair import on_board
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import ALPHA
 
 Selected = tuple[list[EntryResults], list[str]]
 

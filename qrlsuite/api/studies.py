@@ -17,8 +17,8 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.studies import Drawn
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.options import from_mapping
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import read_seeds

@@ -23,7 +23,7 @@ from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.search import Search, preset_path, read_requests, tuning_seeds
 
 if TYPE_CHECKING:
-    from qrlsuite.leaderboard.evaluation import Evaluation
+    from qrlsuite.api.evaluation import Evaluation
 
 
 def train(
@@ -265,7 +265,7 @@ def evaluate(
     --------
     >>> evaluate(["mlp width=64", "vqc-native"], best=10).figure().savefig("histogram.pdf")  # doctest: +SKIP
     """
-    from qrlsuite.leaderboard import evaluation  # torch, which all other functions do without
+    from qrlsuite.api import evaluation  # torch, which all other functions do without
 
     check_positive("best", best)
     check_positive("episodes", episodes)

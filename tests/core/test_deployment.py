@@ -14,10 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite import api
+from qrlsuite.api.evaluation import evaluate
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import studies
-from qrlsuite.leaderboard.evaluation import evaluate
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.training import deployment, evaluation

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore, json_line
 from qrlsuite.results.survey import groups

@@ -14,8 +14,9 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.errors import PluginError, UnknownNameError
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.leaderboard import board, rules
-from qrlsuite.leaderboard.compared import compare_entries
+from qrlsuite.leaderboard import rules
+from qrlsuite.leaderboard.boards import board
+from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.statistics import Evidence, Grid, IntervalRule, LearningCurves, compare, outperformance
 from tests.leaderboard.test_pictures import learner
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 HOSTILE = (

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.boards.board import Leaderboard
 from qrlsuite.leaderboard.report import render
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

@@ -18,7 +18,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import across
+from qrlsuite.leaderboard.boards import across
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.options import parse_setting
 from qrlsuite.results.store import EntryStore

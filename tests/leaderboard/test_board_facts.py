@@ -17,8 +17,9 @@ from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard import board, report, steps
-from qrlsuite.leaderboard.compared import compare_entries
+from qrlsuite.leaderboard import report
+from qrlsuite.leaderboard.boards import board, steps
+from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.pictures import tiers
 from qrlsuite.leaderboard.shelf import collect, published
 from qrlsuite.leaderboard.shelf.curves import EntryResults

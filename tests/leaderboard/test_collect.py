@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board, ranked
-from qrlsuite.leaderboard.compared import compare_entries
+from qrlsuite.leaderboard.boards import board, ranked
+from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
 from tests.conftest import TINY

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import board, costs, report
+from qrlsuite.leaderboard import report
+from qrlsuite.leaderboard.boards import board, costs
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard import boards
 

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from qrlsuite import api
-from qrlsuite.leaderboard import pair
-from qrlsuite.leaderboard.compared import compare_entries, pair_table
+from qrlsuite.leaderboard.boards import pair
+from qrlsuite.leaderboard.boards.compared import compare_entries, pair_table
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Direction
 from tests.leaderboard import boards

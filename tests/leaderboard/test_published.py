@@ -24,8 +24,9 @@ from qrlsuite import api, registry, specs
 from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import board, costs, studies
-from qrlsuite.leaderboard.compared import compare_entries
+from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.boards import board, costs
+from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect, plausible, published, verify
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance

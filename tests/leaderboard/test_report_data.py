@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli import app
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.ranked import learning_curves
+from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.report import encode, entries, ladder, render, words
 from qrlsuite.leaderboard.report.judge import judge
 from qrlsuite.statistics import Outcome, Verdict, compare

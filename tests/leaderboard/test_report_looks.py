@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically

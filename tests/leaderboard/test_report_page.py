@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.leaderboard import board
+from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import render
 from qrlsuite.leaderboard.shelf import collect
 from tests.leaderboard import boards

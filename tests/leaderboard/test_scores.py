@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.scores import rank_by_score
+from qrlsuite.leaderboard.boards.scores import rank_by_score
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from tests.leaderboard.test_pair import entry, spread
 

@@ -22,8 +22,9 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine import sheet
 from qrlsuite.errors import FileError, OptionError
 from qrlsuite.experiment import task as tasks
-from qrlsuite.leaderboard import board, report
-from qrlsuite.leaderboard.compared import compare_entries
+from qrlsuite.leaderboard import report
+from qrlsuite.leaderboard.boards import board
+from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
+from qrlsuite.api import evaluation
 from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
 from qrlsuite.engine.terminal import table_console
-from qrlsuite.leaderboard import evaluation, pictures
+from qrlsuite.leaderboard import pictures
 from qrlsuite.results.store import write_atomically
 
 

@@ -15,8 +15,8 @@ from qrlsuite import registry
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TasksOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard import across as several
 from qrlsuite.leaderboard import studies
+from qrlsuite.leaderboard.boards import across as several
 from qrlsuite.leaderboard.shelf import collect, published_studies
 from qrlsuite.leaderboard.shelf.export import export as write
 from qrlsuite.results import lookup

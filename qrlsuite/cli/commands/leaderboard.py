@@ -26,9 +26,9 @@ from qrlsuite.engine.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import report
-from qrlsuite.leaderboard.board import Leaderboard
+from qrlsuite.leaderboard.boards.board import Leaderboard
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import published_studies
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.store import write_atomically
 
 

@@ -17,7 +17,7 @@ from rich.text import Text
 from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.leaderboard import ranked
+from qrlsuite.leaderboard.boards import ranked
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results import speed

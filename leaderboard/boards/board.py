@@ -15,11 +15,11 @@ from rich.text import Text
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.leaderboard import across, costs, scores, steps, tables
-from qrlsuite.leaderboard.ranked import of_one_definition
+from qrlsuite.leaderboard.boards import across, costs, scores, steps, tables
+from qrlsuite.leaderboard.boards.ranked import of_one_definition
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.statistics import SignificanceRule
 from qrlsuite.statistics.times import check_probability
 
@@ -112,7 +112,7 @@ def build(
     horizon:
         Environment steps at which all entries that reach it are ranked; None means the task's own horizons.
     alpha:
-        Error probability of the whole board, see `qrlsuite.leaderboard.times.rank_by_time`.
+        Error probability of the whole board, see `qrlsuite.leaderboard.boards.times.rank_by_time`.
     shown:
         Which entries have a row. All are compared: what is shown changes no verdict. None means all. By cost all have
         one, for the cheapest sets the budget of the others.

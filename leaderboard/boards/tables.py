@@ -7,15 +7,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite.engine.sheet import Column, Sheet
+from qrlsuite.leaderboard.boards.times import p_text, percent
 from qrlsuite.leaderboard.shelf.absent import absent
-from qrlsuite.leaderboard.times import p_text, percent
 from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
 
 if TYPE_CHECKING:  # boards show themselves by this module
+    from qrlsuite.leaderboard.boards.steps import Row, Section
     from qrlsuite.leaderboard.shelf.curves import EntryResults
-    from qrlsuite.leaderboard.steps import Row, Section
 
 MARKS = {
     "†": "settings chosen after seeing runs on protocol seeds, which may flatter",

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.leaderboard.boards.times import percent
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import percent
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,

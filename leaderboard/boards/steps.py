@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite.errors import PluginError, QrlSuiteError
-from qrlsuite.leaderboard.ranked import (
+from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
     cell_text,
     complexity_at,
@@ -21,9 +21,9 @@ from qrlsuite.leaderboard.ranked import (
     ranking_of,
     rule_of,
 )
+from qrlsuite.leaderboard.boards.times import TimeRanking, rank_by_time
 from qrlsuite.leaderboard.rules import DEFAULT, TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import TimeRanking, rank_by_time
 from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, outperformance
 from qrlsuite.statistics.compare import TOO_FEW
 
@@ -176,7 +176,7 @@ def sections(
     alpha: float = 0.05,
     shown: Callable[[EntryResults], bool] | None = None,
 ) -> tuple[list[Section], list[str]]:
-    """Rank the entries of a task, horizon by horizon; arguments as for `qrlsuite.leaderboard.board.build`.
+    """Rank the entries of a task, horizon by horizon; arguments as for `qrlsuite.leaderboard.boards.board.build`.
 
     Returns
     -------

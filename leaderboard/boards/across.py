@@ -17,10 +17,10 @@ import numpy as np
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.errors import OptionError, UnknownNameError, listed
 from qrlsuite.experiment.task import digest
-from qrlsuite.leaderboard import costs
-from qrlsuite.leaderboard.ranked import learning_curves, ranking_of
+from qrlsuite.leaderboard.boards import costs
+from qrlsuite.leaderboard.boards.ranked import learning_curves, ranking_of
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import (
     MIN_RUNS,
@@ -242,7 +242,7 @@ def shares(
     least:
         Seeds that an entry needs on every task.
     by:
-        `steps`, or a key of `qrlsuite.leaderboard.costs.UNITS`.
+        `steps`, or a key of `qrlsuite.leaderboard.boards.costs.UNITS`.
 
     Raises
     ------

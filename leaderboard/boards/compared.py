@@ -13,12 +13,12 @@ from rich.text import Text
 
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
-from qrlsuite.leaderboard import tables
-from qrlsuite.leaderboard.pair import OnBoard, PairVerdict, judge_pair
-from qrlsuite.leaderboard.ranked import WITH_LOOKS, learning_curves, ranking_of, rule_of
+from qrlsuite.leaderboard.boards import tables
+from qrlsuite.leaderboard.boards.pair import OnBoard, PairVerdict, judge_pair
+from qrlsuite.leaderboard.boards.ranked import WITH_LOOKS, learning_curves, ranking_of, rule_of
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.rules import DEFAULT
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.statistics import Comparison, SignificanceRule, compare
 
 

@@ -19,10 +19,10 @@ import numpy as np
 
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import listed
-from qrlsuite.leaderboard.ranked import Complexity, cell_text, complexity_at, ranking_of
+from qrlsuite.leaderboard.boards.ranked import Complexity, cell_text, complexity_at, ranking_of
+from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.leaderboard.times import ALPHA
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.statistics import MIN_RUNS, Direction, LearningCurves, MeanTime, TimesBoard, times_board
 from qrlsuite.statistics.compare import TOO_FEW
@@ -368,7 +368,7 @@ def sections(
     by: str,
     alpha: float = ALPHA,
 ) -> tuple[list[CostSection], list[str]]:
-    """Rank the entries of a task by what learning costs; arguments as for `qrlsuite.leaderboard.board.build`.
+    """Rank the entries of a task by what learning costs; arguments as for `qrlsuite.leaderboard.boards.board.build`.
 
     Returns
     -------

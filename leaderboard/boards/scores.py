@@ -11,7 +11,7 @@ import numpy as np
 
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import steps, tables
+from qrlsuite.leaderboard.boards import steps, tables
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import steps_text
 from qrlsuite.statistics import (
@@ -223,7 +223,7 @@ def sections(
     alpha: float = 0.05,
     shown: Callable[[EntryResults], bool] | None = None,
 ) -> tuple[list[ScoreSection], list[str]]:
-    """Rank a task's entries by score at the horizon that most of them reach; see `qrlsuite.leaderboard.board.build`."""
+    """Rank a task's entries by score at the horizon that most of them reach, see `boards.board.build`."""
     by_steps, problems = steps.sections(task, entries, None, horizon, alpha)
     if not by_steps or not (shown is None or any(map(shown, entries))):
         return [], problems
