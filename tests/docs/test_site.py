@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,13 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
         loaded = re.findall(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?([^\"' >]+)", page.read_text())
         loaded += re.findall(r"<link\b(?![^>]*canonical)[^>]*\bhref=[\"']?([^\"' >]+)", page.read_text())
         assert not [address for address in loaded if re.match(r"(?:https?:)?//", address)], page
+
+
+def test_the_plugins_files_are_on_their_page(site: Path) -> None:
+    text = unescape(re.sub(r"<[^>]+>", "", (site / "plugins.html").read_text()))
+    code = (ROOT / "tests" / "third_party" / "acme-qrl" / "src" / "acme_qrl" / "ansatz.py").read_text()
+    assert code.strip() in text
+    assert "--8<--" not in text
 
 
 def test_tutorials_are_pages_with_their_output(site: Path) -> None:
