@@ -12,14 +12,14 @@ import subprocess
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard.shelf.published import CURVES, SEEDS
+from qrlsuite.leaderboard.shelf.published import AGENTS, CURVES, SEEDS
 from qrlsuite.studies.looks import FILE, LOG
 
 PLACES = ("leaderboard/entries", "leaderboard/unranked", "leaderboard/plans")
 """Where a repository keeps what is published."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9+._-]*")
-_OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS), (FILE, LOG)
+_OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS, AGENTS), (FILE, LOG)
 
 
 def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:

@@ -9,20 +9,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.fingerprint import fingerprint
 from qrlsuite.results import codes, probes
-from qrlsuite.results.store import EntryStore, SeedRun, parameters_of
+from qrlsuite.results.store import Arrays, EntryStore, SeedRun, parameters_of
 
 
-def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
+def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = True) -> Path:
     """Write an entry's published form; returns its folder `out/<task>/<entry>`.
 
-    Only complete runs are written. What the seeds looked like before training is computed anew, so that a file
-    that was changed since does not agree with it.
+    Only complete runs are written. Where the entry was published without agents and has these seeds' curves, bit for
+    bit, only the agents are added, with what they were made with. What the seeds looked like before training is
+    computed anew, so that a file that was changed since does not agree with it.
 
     Parameters
     ----------
@@ -30,6 +33,8 @@ def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
         Read from a results folder.
     force:
         Replace a published entry that has more seeds or more epochs.
+    agents:
+        Write the trained agents, too: of all seeds whose parameters are there and finite numbers.
 
     Raises
     ------
@@ -44,6 +49,9 @@ def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
     codes.require_installed(store, entry.seeds, identity.of(built))
     record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
     folder = out / entry.task / built.name
+    kept = _agents(store, entry.seeds) if agents else {}
+    if kept and not force and _add_agents(folder, entry, store, kept):
+        return folder
     _refuse_smaller(folder, entry, force)
     runs = [store.seed(seed).read() for seed in entry.seeds]
     unfinished = [run.seed for run in runs if not run.finished]
@@ -62,10 +70,41 @@ def export(entry: EntryResults, out: Path, force: bool = False) -> Path:
         {"classical": 0, "quantum": 0, **parameters_of(run.record for run in runs)},
         fingerprint(built, entry.seeds),
         _found(runs),
+        kept,
     )
     _replace(folder, content)
     published.read(folder)
     return folder
+
+
+def _agents(store: EntryStore, seeds: Sequence[int]) -> dict[int, Arrays]:
+    """Return the trained parameters by seed: of those that have some, and whose numbers are finite.
+
+    Raises
+    ------
+    StoreError
+        If a file is damaged.
+    """
+    held = {seed: store.seed(seed).parameters() for seed in seeds if store.seed(seed).agent.exists()}
+    return {s: own for s, own in held.items() if all(np.isfinite(values).all() for values in own.values())}
+
+
+def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Mapping[int, Arrays]) -> bool:
+    """Add agents to an entry that was published without; returns whether its curves are those of the agents' runs."""
+    if not folder.exists():
+        return False
+    there = published.read(folder)
+    rows = [there.seeds.index(seed) for seed in entry.seeds if seed in there.seeds]
+    if there.agents or len(rows) < len(entry.seeds) or not np.array_equal(there.curves[rows], entry.curves):
+        return False
+    stated, files = published.encode_agents(agents)
+    origins = [_made_with((store.seed(seed).record() or {}).get("provenance") or [{}]) for seed in agents]
+    stated["agents"]["provenance"] = [json.loads(origin) for origin in dict.fromkeys(map(_frozen, origins))]
+    record = {**there.record, "published": {**there.record["published"], **stated}}
+    kept = {name: (folder / name).read_bytes() for name in (published.CURVES, published.SEEDS)}
+    _replace(folder, {"entry.json": published.encode_record(record), **kept, **files})
+    published.read(folder).parameters()
+    return True
 
 
 _OF_PROBE = ("result", "seed", "epochs", "reason", "seconds", "cpu")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import save as encode
 
 from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError
@@ -29,6 +30,7 @@ from qrlsuite.results import checkpoint, codes, provenance
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
+    Arrays,
     EntryStore,
     SeedRun,
     SeedStore,
@@ -123,13 +125,14 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
     runs_by_seed = {} if exported is not None else {seed: source.seed(seed).read() for seed in seeds}
     for run in runs_by_seed.values():  # all of them, before anything is written
         require_scores(run.curve, entry.task.file, source.seed(run.seed).path)
+    agents = {} if exported is None else exported.parameters()
     store = EntryStore.create(runs, entry, _place_for(store, source, exported is not None, runs, entry))
     claim = acquire(store, seeds)
     try:
         return (
             _from_runs(source, runs_by_seed, entry, store)
             if exported is None
-            else _from_export(exported, entry, store)
+            else _from_export(exported, agents, entry, store)
         )
     finally:
         claim.release()
@@ -206,8 +209,10 @@ def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int
             checkpoint.save(store, group, epoch, arrays)
 
 
-def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> Imported:
-    """Write seeds from their curves; the agents and checkpoints were not exported."""
+def _from_export(
+    exported: PublishedEntry, agents: Mapping[int, Arrays], entry: Entry, store: EntryStore
+) -> Imported:
+    """Write seeds from their curves and agents; checkpoints are not exported, nor all agents."""
     present, new, known, differing = set(store.seeds()), list[int](), list[int](), list[int]()
     for row, seed in enumerate(exported.seeds):
         curve = exported.curves[row]
@@ -246,16 +251,19 @@ def _from_export(exported: PublishedEntry, entry: Entry, store: EntryStore) -> I
                 **({"code": exported.record["code"]} if "code" in exported.record else {}),
                 **({} if diverged is None else {"diverged": diverged}),
                 **({"probe": dict(probe)} if probe.get("seed") == seed else {}),
+                **({} if seed in agents else {"agent": False}),
                 "provenance": [dict(exported.provenance[row])],
             }
         )
+        if seed in agents:
+            write_atomically(made.agent, encode(agents[seed]))
         made.path.rename(store.seed(seed).path)
         new.append(seed)
     notes = _differences(differing) + _other_versions(exported.provenance, entry)
     if new:
-        notes.append(
-            "an export holds curves alone: these seeds cannot be evaluated, nor trained to more epochs"
-        )
+        notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
+    if without := sorted(set(new) - set(agents)):
+        notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
     return Imported(store, entry, tuple(new), tuple(known), tuple(notes))
 
 

@@ -1,8 +1,9 @@
-"""Published entries: an entry's validation curves and how they were made, in three small files.
+"""Published entries: an entry's validation curves and how they were made, in three small files, and its agents.
 
     <task>/<entry>/entry.json       what was run, with every option, versions and processors
                    curves.parquet   seed, epoch, score: the mean of each validation
                    seeds.parquet    per seed: hours, circuit executions, and what it looked like before training
+                   agents.safetensors  the trained parameters of all or some seeds, seed-first; need not be there
 
 Nothing in them is believed: hashes are computed again, the folder's place, the label and every number are
 checked, and every figure of a leaderboard is computed from the curves.
@@ -10,6 +11,7 @@ checked, and every figure of a leaderboard is computed from the curves.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +23,9 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 from numpy.typing import NDArray
+from safetensors.numpy import save as encode
 
+from qrlsuite.engine.terminal import command
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
@@ -30,7 +34,15 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet, probes, provenance
-from qrlsuite.results.store import EntryStore, round_means
+from qrlsuite.results.store import (
+    Arrays,
+    EntryStore,
+    SeedRun,
+    SeedStore,
+    read_arrays,
+    require_finite,
+    round_means,
+)
 from qrlsuite.specs import NAME, AlgorithmSpec, EnvironmentSpec, ModelSpec
 
 PUBLISHED = Path(__file__).parents[1] / "entries"
@@ -44,6 +56,7 @@ A study ranks its own. A task that has no others has a board of them.
 
 CURVES = "curves.parquet"
 SEEDS = "seeds.parquet"
+AGENTS = "agents.safetensors"
 MAX_BYTES = 20_000_000
 """A file larger than this, packed or unpacked, is no entry; nor one of more values than its seeds and epochs make."""
 
@@ -94,6 +107,35 @@ class PublishedEntry:
         return found
 
     @property
+    def agents(self) -> tuple[int, ...]:
+        """The seeds whose trained agents are published; none where the entry is of curves alone."""
+        return tuple(self.record["published"].get("agents", {}).get("seeds", ()))
+
+    def parameters(self) -> dict[int, Arrays]:
+        """Return the trained parameters by seed.
+
+        Raises
+        ------
+        StoreError
+            If the file's hash is not that of the record, it is damaged, or a parameter is not a finite number.
+        """
+        path, stated = self.folder / AGENTS, self.record["published"].get("agents", {})
+        if not self.agents:
+            return {}
+        stacked = read_arrays(path, MAX_BYTES)
+        if _sha256(path) != stated["sha256"]:
+            raise StoreError(
+                f"{path} is not the file whose hash is in entry.json: restore it, or export the entry again"
+            )
+        require_finite(stacked, path)
+        if not stacked or any(array.shape[:1] != (len(self.agents),) for array in stacked.values()):
+            raise StoreError(f"{path} does not hold the {len(self.agents)} agents that entry.json names")
+        return {
+            seed: {name: array[row] for name, array in stacked.items()}
+            for row, seed in enumerate(self.agents)
+        }
+
+    @property
     def chosen_seeds(self) -> str:
         """Why no board ranks an entry whose seeds may have been chosen; empty where they are 0 to N - 1.
 
@@ -129,6 +171,67 @@ class PublishedEntry:
             source="published",
             chosen_seeds=self.chosen_seeds,
         )
+
+
+class PublishedAgents(EntryStore):
+    """The seeds of a published entry that have agents, read as those of a results folder are.
+
+    Parameters
+    ----------
+    folder:
+        The published entry's.
+    runs:
+        A results folder: evaluations are kept there, for nothing is written beside published files.
+
+    Raises
+    ------
+    StoreError
+        If the entry or its agents are damaged, or it has none.
+    """
+
+    def __init__(self, folder: Path, runs: Path) -> None:
+        super().__init__(folder)
+        self.published = read(folder)
+        if not self.published.agents:
+            record = self.published.record
+            words = command("run", "--task", record["task_name"], record["label"], runs=runs)
+            raise StoreError(f"{folder} is published as curves without agents; {words} trains it here")
+        self.agents = self.published.parameters()
+        stated = self.published.record["published"]["agents"]["sha256"]
+        self.evaluations = runs / folder.parent.name / folder.name / f"evaluations-{stated[:16]}"
+
+    def seeds(self) -> list[int]:
+        """Return the seeds whose agents are there."""
+        return sorted(self.agents)
+
+    def seed(self, seed: int) -> SeedStore:
+        """Return one seed."""
+        return _PublishedSeed(self, seed)
+
+
+class _PublishedSeed(SeedStore):
+    """One of the agents: what of its run is published."""
+
+    def __init__(self, of: PublishedAgents, seed: int) -> None:
+        super().__init__(of.path, seed, of)
+        self._published, self.agent = of, of.path / AGENTS
+
+    def record(self) -> dict[str, Any]:
+        """Return what `run.json` has of a seed's end and code."""
+        entry = self._published.published
+        code = {name: entry.record[name] for name in ("code",) if name in entry.record}
+        return {**code, "status": "finished", "epochs": int(entry.curves.shape[1])}
+
+    def read(self) -> SeedRun:
+        """Return the seed's curve, hours and executions."""
+        entry = self._published.published
+        row = entry.seeds.index(self.seed)
+        seconds, executions = 3600 * float(entry.hours[row]), int(entry.executions[row])
+        return SeedRun(self.seed, self.record(), entry.curves[row][:, None], seconds, executions)
+
+    def parameters(self) -> Arrays:
+        """Return the trained agent's parameters by name."""
+        return self._published.agents[self.seed]
 
 
 def folders() -> tuple[Path, ...]:
@@ -196,6 +299,7 @@ def _read(folder: Path) -> PublishedEntry:
     _check_found(folder, published, seeds)
     facts = _table(folder / SEEDS, _SEED_COLUMNS, published["seeds"], 10_000)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
+    _check_agents(folder, published, seeds)
     hours = np.array(facts["hours"], np.float64)
     executions = np.array(facts["executions"], np.int64)
     origins = np.array(facts["origin"], np.int64)
@@ -238,6 +342,37 @@ def _check_found(folder: Path, published: Mapping[str, Any], seeds: Sequence[int
         folder,
         f"probe: {str(probe)[:100]} is not the result of one that found seeds independent",
     )
+
+
+def _check_agents(folder: Path, published: Mapping[str, Any], seeds: Sequence[int]) -> None:
+    """Check that the file of agents is there if, and only if, the record names seeds and a hash."""
+    stated = published.get("agents")
+    if stated is None:
+        _require(
+            not (folder / AGENTS).exists(), folder, f"{AGENTS} is there, and entry.json does not name it"
+        )
+        return
+    own = stated.get("seeds") if isinstance(stated, dict) else None
+    _require(
+        isinstance(own, list)
+        and own != []
+        and all(type(seed) is int for seed in own)
+        and own == sorted(set(own) & set(seeds))
+        and isinstance(stated.get("sha256"), str)
+        and isinstance(stated.get("provenance", []), list)
+        and all(isinstance(made, dict) for made in stated.get("provenance", [])),
+        folder,
+        f"agents: {str(stated)[:100]} does not name seeds of the entry, in their order, and a hash",
+    )
+    _require(
+        (folder / AGENTS).is_file(),
+        folder,
+        f"{AGENTS} is missing; write the entry again with `qrlsuite export`",
+    )
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _require(holds: bool, folder: Path, problem: str) -> None:
@@ -373,8 +508,9 @@ def files(
     parameters: Mapping[str, int],
     beginning: Fingerprint,
     found: Mapping[str, Any],
+    agents: Mapping[int, Arrays],
 ) -> dict[str, bytes]:
-    """Encode an entry's three files, by name; equal entries give equal bytes.
+    """Encode an entry's files, by name; equal entries give equal bytes.
 
     Parameters
     ----------
@@ -388,12 +524,15 @@ def files(
         Per seed, N of each.
     found:
         `diverged` and `probe`, as `PublishedEntry` has them; where there are none, their names are left out.
+    agents:
+        By seed the trained parameters, of no seed or more.
     """
     distinct: list[Mapping[str, Any]] = []
     for made in made_with:
         if made not in distinct:
             distinct.append(made)
     count, length = curves.shape
+    stated, file = encode_agents(agents)
     content = {
         **record,
         "published": {
@@ -404,10 +543,12 @@ def files(
             "circuit_executions": sum(executions),
             "provenance": distinct,
             **found,
+            **stated,
         },
     }
     return {
-        "entry.json": json.dumps(content, indent=1, allow_nan=False).encode() + b"\n",
+        **file,
+        "entry.json": encode_record(content),
         CURVES: _encode(
             {
                 "seed": np.repeat(np.array(seeds, np.int64), length),
@@ -427,6 +568,36 @@ def files(
             }
         ),
     }
+
+
+def encode_record(content: Mapping[str, Any]) -> bytes:
+    """Encode `entry.json`."""
+    return json.dumps(content, indent=1, allow_nan=False).encode() + b"\n"
+
+
+def encode_agents(agents: Mapping[int, Arrays]) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Return what the record says of agents, and their file by name; of no agents nothing.
+
+    Raises
+    ------
+    StoreError
+        If the file would be larger than is read, or agents have other parameters than others.
+    """
+    if not agents:
+        return {}, {}
+    seeds = sorted(agents)
+    try:
+        stacked = {name: np.stack([agents[seed][name] for seed in seeds]) for name in agents[seeds[0]]}
+    except (KeyError, ValueError):
+        raise StoreError(
+            "agents of one entry have different parameters: export it with --no-agents"
+        ) from None
+    content = encode(stacked)
+    if len(content) > MAX_BYTES:
+        size, most = len(content) / 1e6, MAX_BYTES // 1_000_000
+        raise StoreError(f"its agents take {size:.0f} MB, more than {most}: export it with --no-agents")
+    stated = {"sha256": hashlib.sha256(content).hexdigest(), "seeds": seeds}
+    return {"agents": stated}, {AGENTS: content}
 
 
 def _encode(columns: Mapping[str, Any]) -> bytes:

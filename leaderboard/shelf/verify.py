@@ -21,6 +21,7 @@ from qrlsuite.errors import QrlSuiteError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.leaderboard.shelf import plausible, published
+from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.leaderboard.shelf.curves import current
 from qrlsuite.leaderboard.shelf.fingerprint import CHUNK, fingerprint
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
@@ -92,6 +93,8 @@ class Retrained:
         (k, T).
     executions:
         (k,): circuit executions of each.
+    agents:
+        The trained parameters of each.
     parameters:
         What may stand in the entry's record: numbers of all networks; and, where no number of networks stands in it, of
         the first alone.
@@ -99,6 +102,7 @@ class Retrained:
 
     curves: NDArray[np.float64]
     executions: NDArray[np.int64]
+    agents: tuple[Mapping[str, NDArray[Any]], ...]
     parameters: tuple[Mapping[str, int], ...]
 
 
@@ -152,12 +156,14 @@ def verify(
     name = f"{folder.parent.name}/{folder.name}"
     try:
         entry, digest = published.read(folder), _digest(folder)
+        _check_agents(entry)
         made_by = from_record(entry.record, str(folder / "entry.json")) if rerun else None
     except QrlSuiteError as error:
         return VerificationResult(folder, name, False, "files", (), str(error))
     count, length = entry.curves.shape
     if made_by is None:
-        sound = f"files sound: {count} seeds of {length} epochs, hashes and label computed again"
+        agents = f", {len(entry.agents)} agents" if entry.agents else ""
+        sound = f"files sound: {count} seeds of {length} epochs{agents}, hashes and label computed again"
         message = "; ".join(filter(None, [sound, entry.chosen_seeds, "no seed was trained again"]))
         return VerificationResult(folder, name, True, "files", (), message, digest)
     if changed := _changed_code(entry, made_by):
@@ -173,8 +179,26 @@ def verify(
     return VerificationResult(folder, name, ok, check, seeds, message, digest, number)
 
 
+def _check_agents(entry: PublishedEntry) -> None:
+    """Check that an entry's agents are those of its record, finite, and parameters of its model where it is installed.
+
+    Raises
+    ------
+    StoreError
+        With the first thing that is wrong.
+    """
+    agents = entry.parameters()
+    if not agents or absent(entry.entry_results()):
+        return
+    from qrlsuite.training.evaluation import require_fitting  # torch, which checking files does without
+    from qrlsuite.training.trainer import Trainer
+
+    trainer = Trainer(from_record(entry.record, str(entry.folder / "entry.json")), [0])
+    require_fitting(trainer, agents[entry.agents[0]], entry.folder / published.AGENTS)
+
+
 def _digest(folder: Path) -> str:
-    """Return a hash of an entry's files."""
+    """Return a hash of an entry's files; that of its agents is in its record."""
     paths = (folder / name for name in ("entry.json", published.CURVES, published.SEEDS))
     hashes = b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)
     return hashlib.sha256(hashes).hexdigest()[:16]
@@ -214,6 +238,15 @@ def _train_again(
     for row, place in enumerate(places):
         if not equal[row] and elsewhere[entry.origins[place]] is None:
             return False, "verified", _differs(entry, place, again.curves[row])
+    agents = entry.parameters()
+    for row, place in enumerate(places):
+        seed = entry.seeds[place]
+        if (
+            seed in agents
+            and elsewhere[entry.origins[place]] is None
+            and not _equal(agents[seed], again.agents[row])
+        ):
+            return False, "verified", f"seed {seed} trained again is another agent than the published one"
     count, trained = len(entry.seeds), len(places)
     left = f"{count - trained} of {count} seeds, hours"
     begun = f"{trained} {'seed' if trained == 1 else 'seeds'} trained again"
@@ -270,6 +303,7 @@ def retrain(
     return Retrained(
         np.concatenate([part.curves for part in parts]),
         np.concatenate([part.executions for part in parts]),
+        tuple(agent for part in parts for agent in part.agents),
         parts[0].parameters,
     )
 
@@ -292,7 +326,11 @@ def _group(
         trainer.progress.epoch = trainer.epoch
     classical, quantum, fixed = trainer.models.parameters[0]
     first = {"classical": classical, "quantum": quantum, "fixed": fixed}
-    return Retrained(np.stack(curves, axis=1), executions, (trainer.models.trained(), first))
+    policy = trainer.policy()
+    agents = tuple(
+        {name: np.atleast_1d(values[s]) for name, values in policy.items()} for s in range(len(seeds))
+    )
+    return Retrained(np.stack(curves, axis=1), executions, agents, (trainer.models.trained(), first))
 
 
 def _counts(
@@ -381,6 +419,11 @@ def _differs(entry: PublishedEntry, place: int, again: NDArray[np.float64]) -> s
         f"seed {entry.seeds[place]} trained again differs from epoch {epoch + 1} on ({again[epoch]:.6f}, published "
         f"{stated[epoch]:.6f}), with the same versions on the same processor"
     )
+
+
+def _equal(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
+    """Return whether two agents have the same parameters, bit for bit."""
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def _plausible(entry: PublishedEntry, again: NDArray[np.float64], places: list[int]) -> tuple[bool, str]:

@@ -22,8 +22,8 @@ from safetensors.numpy import save as encode
 
 from qrlsuite.errors import StoreError
 from qrlsuite.results.store import FORMAT_VERSION, EntryStore, write_atomically
+from qrlsuite.results.store import Arrays as Arrays
 
-Arrays = dict[str, NDArray[Any]]
 FILE = "checkpoint.safetensors"  # in the group's folder
 
 

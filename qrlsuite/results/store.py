@@ -42,6 +42,10 @@ from qrlsuite.results import genuine, parquet
 FORMAT_VERSION = 1
 _MARK = re.compile(r"@[0-9a-f]{8}")
 _SEED_FOLDER = re.compile(r"seed-(\d{4}|[1-9]\d{4,})", re.ASCII)
+MOST_AGENT_BYTES = 200_000_000
+"""A file of parameters that is larger than this is not read."""
+
+Arrays = dict[str, NDArray[Any]]
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -139,6 +143,53 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
             raise StoreError(f"{path}, line {number}: not a JSON object")
         records.append(record)
     return records
+
+
+def read_arrays(path: Path, most: int = MOST_AGENT_BYTES) -> Arrays:
+    """Read a safetensors file: arrays by name.
+
+    Parameters
+    ----------
+    most:
+        Bytes of a file that is read; the format packs nothing, so arrays are no larger.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    StoreError
+        If it is larger, or damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        if (size := path.stat().st_size) > most:
+            raise StoreError(f"{path} has {size:,} bytes, more than {most:,}: it is not read")
+        arrays: Arrays = load(path.read_bytes())
+    except FileNotFoundError:
+        raise
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise StoreError(
+            f"{path} is damaged ({type(error).__name__}: {_first_line(error)}); restore the file or delete its folder"
+        ) from None
+    genuine.require_plain(path, [*arrays])
+    return arrays
+
+
+def require_finite(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Refuse parameters that are not numbers.
+
+    Raises
+    ------
+    StoreError
+        Naming the first.
+    """
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise StoreError(
+                f"{path}: '{name[:80]}' holds a value that is not a finite number; restore the file"
+            )
 
 
 def drop_torn_line(path: Path) -> None:
@@ -268,6 +319,25 @@ class SeedStore:
     def write_record(self, content: Mapping[str, Any]) -> None:
         """Replace `run.json`."""
         write_json(self.path / "run.json", content)
+
+    def parameters(self) -> Arrays:
+        """Return the trained agent's parameters by name.
+
+        Raises
+        ------
+        StoreError
+            If there are none, the file is damaged, or one is not a finite number though the run did not diverge.
+        """
+        try:
+            arrays = read_arrays(self.agent)
+        except FileNotFoundError:
+            raise StoreError(
+                f"{self.agent} is missing: seed {self.seed} has a learning curve but no trained parameters (entries "
+                "that were imported may have none); train the entry here with `qrlsuite run`"
+            ) from None
+        if (self.record() or {}).get("diverged") is None:
+            require_finite(arrays, self.agent)
+        return arrays
 
     def epochs(self, decimals: bool = True) -> list[dict[str, Any]]:
         """Return every epoch's record in order: the table, then newer lines.
@@ -525,6 +595,7 @@ class EntryStore:
         self.path = path
         self.groups = path / "groups"
         self.claims = path / "claims"
+        self.evaluations = path / "evaluations"
 
     @property
     def mark(self) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -24,7 +25,7 @@ from qrlsuite.errors import OptionError, PluginError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import codes
-from qrlsuite.results.store import EntryStore, SeedStore
+from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training.trainer import Policy, Trainer, build_envs, play_episodes
 
@@ -102,7 +103,8 @@ def distribution(values: FloatArray) -> dict[str, float]:
 def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], int]:
     """Choose the runs with the highest last validation score, earlier seeds first where equal.
 
-    Only finished runs count, and of these only those with the most epochs that any has.
+    Only finished runs count, of these only those with the most epochs that any has, and of these, if any have
+    agents, only these: an entry may have been imported with some.
 
     Returns
     -------
@@ -132,34 +134,10 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
         raise StoreError(
             f"{store.path}: no run has finished, so there is no trained agent; `qrlsuite run` finishes them"
         )
+    published = {seed: score for seed, score in last.items() if records[seed].get("agent") is not False}
+    last = published or last
     chosen = sorted(last, key=lambda seed: (-last[seed], seed))[:count]
     return chosen, [last[seed] for seed in chosen], len(last)
-
-
-def parameters(folder: SeedStore) -> dict[str, NDArray[Any]]:
-    """Read a trained agent's parameters by name.
-
-    Raises
-    ------
-    StoreError
-        If there are none, or the file is damaged.
-    """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
-    path = folder.agent
-    try:
-        arrays: dict[str, NDArray[Any]] = load(path.read_bytes())
-    except FileNotFoundError:
-        raise StoreError(
-            f"{path} is missing: seed {folder.seed} has a learning curve but no trained parameters (entries "
-            "that were imported or exported have none); train the entry here with `qrlsuite run`"
-        ) from None
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(
-            f"{path} is damaged ({type(error).__name__}: {error}); restore the file or delete the seed's folder"
-        ) from None
-    return arrays
 
 
 def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device: str = "cpu") -> Trainer:
@@ -173,15 +151,11 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
     codes.require_installed(
         store, seeds, identity.of(store.entry())
     )  # not of another backend that they act on
-    stored = [parameters(store.seed(seed)) for seed in seeds]
+    stored = [store.seed(seed).parameters() for seed in seeds]
     trainer = Trainer(entry, seeds, device)
-    state: dict[str, torch.Tensor] = dict(trainer.algorithm.policy_state())
-    if trainer.statistics is not None:
-        state |= trainer.statistics.published()
+    state = _state(trainer)
     for seed, arrays in zip(seeds, stored):
-        problem = _misfit({name: value[0] for name, value in state.items()}, arrays)
-        if problem:
-            raise StoreError(f"{store.seed(seed).agent} does not fit the entry's model: {problem}")
+        require_fitting(trainer, arrays, store.seed(seed).agent)
     with torch.no_grad():
         for name, value in state.items():
             together = torch.from_numpy(np.stack([arrays[name] for arrays in stored]))
@@ -196,6 +170,25 @@ def trained_agents(entry: Entry, store: EntryStore, seeds: Sequence[int], device
                 "the tensors that act() uses, into which trained parameters are loaded"
             )
     return trainer
+
+
+def require_fitting(trainer: Trainer, agent: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Refuse trained parameters that are not those of a trainer's agents.
+
+    Raises
+    ------
+    StoreError
+        Naming the file that they are of, and what differs.
+    """
+    problem = _misfit({name: value[0] for name, value in _state(trainer).items()}, agent)
+    if problem:
+        raise StoreError(f"{path} does not fit the entry's model: {problem}")
+
+
+def _state(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Return what a trained agent is loaded into, seed-first by name."""
+    state = dict(trainer.algorithm.policy_state())
+    return state if trainer.statistics is None else {**state, **trainer.statistics.published()}
 
 
 def _misfit(expected: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[Any]]) -> str | None:

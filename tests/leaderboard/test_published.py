@@ -451,6 +451,7 @@ def test_other_files_have_another_draw_of_the_same_number(folder: Path) -> None:
 def test_seeds_that_may_have_been_chosen_are_not_ranked(folder: Path, tmp_path: Path) -> None:
     for name in ("curves", "seeds"):
         rewrite(folder / f"{name}.parquet", lambda c: c.update(seed=[s + 5 * (s > 2) for s in c["seed"]]))
+    edit(folder, lambda r: r["published"]["agents"].update(seeds=[s + 5 * (s > 2) for s in range(8)]))
     found = api.board("tiny", runs=tmp_path / "entries")
     assert not found.sections
     assert "its 8 seeds are not 0 to 7 (3 is missing): not ranked" in found.refused[0]

@@ -56,10 +56,13 @@ def export(
     force: Annotated[
         bool, typer.Option("--force", help="Replace an entry with more seeds or epochs.")
     ] = False,
+    without_agents: Annotated[
+        bool, typer.Option("--no-agents", help="Write curves alone, without the trained agents.")
+    ] = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
-    """Write entries for a leaderboard: curves of every seed, and how they were made, in less than 200 kB each.
+    """Write entries for a leaderboard: curves and trained agents of every seed, and how they were made.
 
     Only finished seeds are written. `qrlsuite verify` checks what was written, and can train some seeds again. A study
     is written as its entries; one with looks with the curves of its seeds, so that others can compute its verdicts
@@ -99,7 +102,7 @@ def export(
     written = []
     for entry in selected:
         try:
-            folder = write(entry, out, force)
+            folder = write(entry, out, force, not without_agents)
         except QrlSuiteError as error:
             if not (everything or named):
                 raise

@@ -37,7 +37,7 @@ def import_entries(
 ) -> None:
     """Take over seeds that were trained elsewhere: they count as trained here, and `run` trains only what is missing.
 
-    From a results folder, agents and checkpoints are copied too. An export holds only learning curves. Seeds that
+    From a results folder, agents and checkpoints are copied too, from an export the agents that it has. Seeds that
     are here already stay. Stop with Ctrl-C at any time; the same command continues.
 
     Example: qrlsuite import /mnt/cluster/runs

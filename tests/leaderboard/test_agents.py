@@ -1,0 +1,228 @@
+"""Trained agents in published entries: written, read without trust, taken over, and played."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from qrlsuite.errors import StoreError
+from qrlsuite.leaderboard.shelf import collect, importing, published, verify
+from qrlsuite.leaderboard.shelf.export import export
+from qrlsuite.results.store import EntryStore
+from qrlsuite.training import evaluation
+from tests.conftest import TINY, trainer
+
+SEEDS = (0, 1, 2)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `runs`, three seeds of a tiny task, and `entries`, the same published."""
+    root = tmp_path_factory.mktemp("agents")
+    (root / "tiny.toml").write_text(TINY)
+    store = EntryStore(trainer(str(root / "tiny.toml"), root)("runs", SEEDS, 2))
+    entry = collect.read_entry(store)
+    assert entry is not None
+    export(entry, root / "entries")
+    return root
+
+
+@pytest.fixture
+def folder(trained: Path, tmp_path: Path) -> Path:
+    """The published entry, in a copy that a test may change."""
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
+    return next(tmp_path.glob("entries/*/*"))
+
+
+def runs_of(root: Path) -> EntryStore:
+    (store,) = importing.sources(root / "runs")
+    return store
+
+
+def state(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change what the record says of the agents."""
+    record = json.loads((folder / "entry.json").read_text())
+    change(record["published"])
+    (folder / "entry.json").write_text(json.dumps(record))
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], Any], rehash: bool = True) -> None:
+    """Change the agents' arrays, and, as a careful forger would, their hash."""
+    path = folder / published.AGENTS
+    arrays = {name: array.copy() for name, array in load(path.read_bytes()).items()}
+    path.write_bytes(save(change(arrays) or arrays))
+    if rehash:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        state(folder, lambda p: p["agents"].update(sha256=digest))
+
+
+def test_published_agents_are_the_trained_ones_and_play_the_same_episodes(
+    folder: Path, tmp_path: Path
+) -> None:
+    store = runs_of(tmp_path)
+    agents = published.read(folder).parameters()
+    for seed in SEEDS:
+        own = store.seed(seed).parameters()
+        assert {name: a.tobytes() for name, a in agents[seed].items()} == {
+            n: a.tobytes() for n, a in own.items()
+        }
+    here = evaluation.trained(store, 2, 5)
+    there = evaluation.trained(published.PublishedAgents(folder, tmp_path / "other"), 2, 5)
+    assert (here.seeds, here.runs) == (there.seeds, there.runs)
+    assert here.returns.tobytes() == there.returns.tobytes()
+    assert verify.verify(folder).message.startswith("files sound: 3 seeds of 2 epochs, 3 agents, hashes")
+
+
+def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path, tmp_path: Path) -> None:
+    entry = collect.read_entry(runs_of(tmp_path))
+    assert entry is not None
+    bare = export(entry, tmp_path / "bare", agents=False)
+    assert sorted(path.name for path in bare.iterdir()) == ["curves.parquet", "entry.json", "seeds.parquet"]
+    assert verify.verify(bare).ok
+    with pytest.raises(
+        StoreError, match=r"curves without agents; .*qrlsuite run --task tiny 'ddqn mlp width=16'"
+    ):
+        published.PublishedAgents(bare, tmp_path / "runs")
+    (source,) = importing.sources(bare)
+    taken = importing.import_seeds(source, tmp_path / "new")
+    assert taken.notes[-1] == "seeds 0:3 came without agents: they cannot be evaluated"
+    with pytest.raises(StoreError, match="no trained parameters"):
+        evaluation.trained(taken.store, 1, 5)
+
+
+def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_path: Path) -> None:
+    """Of fewer seeds, too; what was published of the curves stays as it is."""
+    store = runs_of(tmp_path)
+    whole = collect.read_entry(store)
+    part = collect.read_entry(store, [0, 2])
+    assert whole is not None
+    assert part is not None
+    bare = export(whole, tmp_path / "bare", agents=False)
+    before = {path.name: path.read_bytes() for path in bare.iterdir()}
+    record = json.loads(before["entry.json"])
+    export(part, tmp_path / "bare")
+    found = published.read(bare)
+    assert found.agents == (0, 2)
+    assert found.seeds == SEEDS
+    stated = found.record["published"]
+    assert len(stated["agents"]["provenance"]) == 1
+    assert {**stated, "agents": None} == {**record["published"], "agents": None}
+    assert all((bare / name).read_bytes() == before[name] for name in ("curves.parquet", "seeds.parquet"))
+    played = evaluation.trained(published.PublishedAgents(bare, tmp_path / "runs"), 3, 5)
+    assert sorted(played.seeds) == [0, 2]
+    (source,) = importing.sources(bare)
+    taken = importing.import_seeds(source, tmp_path / "new")
+    assert taken.notes[-1] == "seeds 1:2 came without agents: they cannot be evaluated"
+    assert sorted(evaluation.trained(taken.store, 3, 5).seeds) == [0, 2]
+
+
+def test_agents_of_other_curves_are_not_added(folder: Path, tmp_path: Path) -> None:
+    store = runs_of(tmp_path)
+    whole = collect.read_entry(store)
+    assert whole is not None
+    bare = export(whole, tmp_path / "bare", agents=False)
+    curves = whole.curves.copy()
+    curves[1, 1] -= 1e-6
+    export(replace(whole, curves=curves), tmp_path / "bare")
+    written = json.loads((bare / "entry.json").read_text())["published"]
+    assert "provenance" not in written["agents"], "a new entry, not agents beside the old curves"
+    assert published.read(bare).curves[1, 1] != whole.curves[1, 1]
+
+
+def nudge(arrays: dict[str, Any]) -> None:
+    arrays["b0"] += np.float32(1e-3)
+
+
+def nan(arrays: dict[str, Any]) -> None:
+    arrays["w0"][1, 0] = np.nan
+
+
+CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "another file": (
+        lambda f: rewrite(f, nudge, False),
+        "is not the file",
+    ),
+    "not a number": (lambda f: rewrite(f, nan), "'w0' holds a value that is not a finite number"),
+    "another model": (
+        lambda f: rewrite(f, lambda a: {**a, "b0": a["b0"][:, :-1]}),
+        "does not fit the entry's model",
+    ),
+    "fewer agents": (
+        lambda f: rewrite(f, lambda a: {n: v[:2] for n, v in a.items()}),
+        "does not hold the 3 agents",
+    ),
+    "an odd name": (lambda f: rewrite(f, lambda a: {**a, "\x1b[2J": a["b0"]}), "controls a terminal"),
+    "truncated": (
+        lambda f: (f / published.AGENTS).write_bytes((f / published.AGENTS).read_bytes()[:99]),
+        "agents.safetensors is damaged",
+    ),
+    "missing": (lambda f: (f / published.AGENTS).unlink(), "agents.safetensors is missing"),
+    "not named": (lambda f: state(f, lambda p: p.pop("agents")), "entry.json does not name it"),
+    "strange seeds": (
+        lambda f: state(f, lambda p: p["agents"].update(seeds=[0, 1, 9])),
+        "does not name seeds",
+    ),
+    "seeds of text": (lambda f: state(f, lambda p: p["agents"].update(seeds="012")), "does not name seeds"),
+    "no hash": (lambda f: state(f, lambda p: p["agents"].pop("sha256")), "does not name seeds"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_wrong_agents_are_refused_by_verify_and_import(case: str, folder: Path, tmp_path: Path) -> None:
+    change, message = CASES[case]
+    change(folder)
+    found = verify.verify(folder)
+    assert not found.ok
+    assert message in found.message
+    assert "\x1b" not in found.message
+    if case != "another model":  # is said where they are played: an import builds no model
+        (source,) = importing.sources(folder)
+        with pytest.raises(StoreError):
+            importing.import_seeds(source, tmp_path / "new")
+        assert not (tmp_path / "new").exists()
+
+
+def test_a_file_of_any_size_is_not_read(folder: Path, tmp_path: Path) -> None:
+    with (folder / published.AGENTS).open("ab") as file:
+        file.truncate(50_000_000_000)  # a hole, of no blocks
+    assert "50,000,000,000 bytes, more than 20,000,000: it is not read" in verify.verify(folder).message
+    path = runs_of(tmp_path).seed(0).agent
+    with path.open("ab") as file:
+        file.truncate(50_000_000_000)
+    with pytest.raises(StoreError, match="more than 200,000,000: it is not read"):
+        runs_of(tmp_path).seed(0).parameters()
+
+
+def test_parameters_that_are_no_numbers_are_not_played(folder: Path, tmp_path: Path) -> None:
+    seed = runs_of(tmp_path).seed(1)
+    arrays = {name: array.copy() for name, array in load(seed.agent.read_bytes()).items()}
+    arrays["w0"][0] = np.inf
+    seed.agent.write_bytes(save(arrays))
+    with pytest.raises(StoreError, match="'w0' holds a value that is not a finite number"):
+        evaluation.trained(runs_of(tmp_path), 3, 5)
+    record = seed.record() or {}
+    del record["format_version"]
+    seed.write_record({**record, "diverged": 2})  # of a run that diverged it is known
+    assert len(evaluation.trained(runs_of(tmp_path), 3, 5).seeds) == 3
+    entry = collect.read_entry(runs_of(tmp_path))
+    assert entry is not None
+    assert published.read(export(entry, tmp_path / "fresh")).agents == (0, 2)
+
+
+def test_a_forged_agent_is_found_by_training_again(folder: Path) -> None:
+    assert verify.verify(folder, rerun=3).check == "verified"
+    rewrite(folder, nudge)
+    found = verify.verify(folder, rerun=3)
+    assert (found.ok, "trained again is another agent than the published one" in found.message) == (
+        False,
+        True,
+    )
