@@ -6,20 +6,35 @@ group of seeds can be split and merged by slicing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-BuildModel = Callable[[int], nn.Module]
-"""`build_model(out_dim)` returns a population of S freshly initialized agents; every call draws anew.
 
-An entry's parameters are counted over all the networks that are built by it. One that is not trained, such as a
-target network, is a `copy.deepcopy` of another, or frozen by `requires_grad_(False)`.
-"""
+class BuildModel(Protocol):
+    """Builds populations of the entry's model; every call draws anew.
+
+    An entry's parameters are counted over all the networks that are built by it. One that is not trained, such as a
+    target network, is a `copy.deepcopy` of another, or frozen by `requires_grad_(False)`.
+    """
+
+    def __call__(self, outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:
+        """Return a population of S freshly initialized agents: (S, B, inputs) -> (S, B, outputs).
+
+        Parameters
+        ----------
+        outputs:
+            Numbers that a network returns.
+        inputs:
+            Numbers that it is given; None: those of an observation. Where it is given more, as the critic of a
+            continuous action, the observation comes first.
+        role:
+            What it is for, `"actor"` or `"critic"`: passed on to a model that asks.
+        """
 
 
 @dataclass(frozen=True)
@@ -64,11 +79,16 @@ class Algorithm(Protocol):
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,)."""
 
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (S, B) for observations (S, B, obs).
+    def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Return the greedy actions (S, B, ...) for observations (S, B, obs), in the shape and type of their space.
 
         An algorithm that draws them has an attribute `draws` that is true. It draws from streams of its own, so that
         training goes on as if no action had been drawn.
+
+        It may be `act(observations, begins, infos)` instead: `begins` (S, B) says where an episode begins with the
+        observation, and `infos` has what the lanes said of it, `action_mask` (S, B, choices) among it. What it
+        remembers of an episode is a state of its own, forgotten where one begins: apart from that of training, which
+        is in `state_dict`, and neither is in `policy_state`.
         """
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -21,11 +21,13 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     """A `gymnasium.vector.VectorEnv` with same-step autoreset and given random streams.
 
     A subclass sets `num_envs`, `single_observation_space`, `single_action_space`, `observation_space` and
-    `action_space`, and implements `reset`, `step`, `state_dict` and `load_state_dict`. `step` takes actions
-    (num_envs,) int64 and returns observations (num_envs, ...) float32, rewards (num_envs,) float64,
-    terminated and truncated (num_envs,) bool, and infos. Where an episode ends, the lane is reset in the same
-    step; then infos hold, as Gymnasium's same-step mode does, `final_obs` (num_envs, ...) with mask
-    `_final_obs`, and `final_info`, a dict that may hold `score` (num_envs,) with mask `_score`.
+    `action_space`, and implements `reset`, `step`, `state_dict` and `load_state_dict`. `step` takes actions in the
+    shape and type of their space, (num_envs,) int64 where it is discrete (`qrlsuite.actions`). It returns observations
+    (num_envs, ...) float32, rewards (num_envs,) float64, terminated and truncated (num_envs,) bool, and infos: a time
+    limit truncates, and learners estimate what would have followed (`arrived`). Where an episode ends, the lane is
+    reset in the same step; then infos hold, as Gymnasium's same-step mode does, `final_obs` (num_envs, ...) with mask
+    `_final_obs`, and `final_info`, a dict that may hold `score` (num_envs,) with mask `_score`. Infos may hold
+    `action_mask` (num_envs, choices), 1 for each action that can be chosen next.
 
     All randomness comes from `self.streams`: stream g serves the lanes `g*m .. (g+1)*m - 1`, m =
     num_envs / len(streams), in lane order, so that an episode never depends on lanes of another stream.
@@ -37,6 +39,8 @@ class LaneEnv(VectorEnv[Any, Any, Any]):
     """False in validation: an ended lane need not be reset; stepping it on is allowed and means nothing."""
     running_statistics: bool = False
     """True: agents standardize this environment's observations, see `qrlsuite.training.standardization`."""
+    unflattened_space: gymnasium.Space[Any] | None = None
+    """What observations were before lanes flattened them, an image or a Dict; None: `single_observation_space`."""
 
     def seed_lanes(self, streams: Sequence[np.random.Generator]) -> None:
         """Replace the random streams; their number divides `num_envs`. Takes effect at the next reset."""
@@ -73,3 +77,12 @@ def batched_spaces(
     env.single_action_space = action
     env.observation_space = gymnasium.vector.utils.batch_space(observation, lanes)
     env.action_space = gymnasium.vector.utils.batch_space(action, lanes)
+
+
+def arrived(observations: NDArray[Any], infos: Mapping[str, Any]) -> NDArray[Any]:
+    """Return where each lane's step arrived, before any reset, of what `LaneEnv.step` returned; (num_envs, ...)."""
+    if "final_obs" not in infos:
+        return observations
+    ended = np.asarray(infos["_final_obs"], dtype=np.bool_)
+    final = np.asarray(infos["final_obs"], dtype=observations.dtype)
+    return np.where(ended.reshape(-1, *[1] * (observations.ndim - 1)), final, observations)

@@ -1,4 +1,4 @@
-"""Runs any Gymnasium environment with discrete actions in lanes, for environments that have no vector form.
+"""Runs any Gymnasium environment in lanes, for environments that have no vector form.
 
 The state of an arbitrary environment cannot be copied. But an episode is fixed by the seed of its reset and by
 its actions, so these are what a checkpoint holds, and resuming plays them again.
@@ -16,9 +16,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.error import DependencyNotInstalled, InvalidAction, ResetNeeded
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
 
+from qrlsuite import actions as action_spaces
+from qrlsuite import registry, specs
+from qrlsuite.actions import check_actions
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import EnvironmentFailure, OptionError, StoreError
 from qrlsuite.normalization import Kind, Normalization
@@ -36,8 +39,10 @@ class GymLanes(LaneEnv):
 
     At every reset, a lane draws one integer from its stream and seeds its environment with it: whatever is
     random in the episode comes from there. Observations are flattened as `gymnasium.spaces.flatten` does it,
-    so discrete ones are one-hot; actions count from 0, also where the environment's do not. At an episode's
-    end `infos["final_info"]` holds `score` (L,) where the environment's `info` does.
+    so discrete ones are one-hot, and the parts of a Dict or Tuple follow each other in its order. Actions have the
+    shape and type of their space, see `qrlsuite.actions`. At an episode's end `infos["final_info"]` holds `score` (L,)
+    where the environment's `info` does. Where its `info` holds an `action_mask` (choices,), 1 for what can be chosen,
+    `infos["action_mask"]` is that of the returned observations (L, choices).
 
     Without autoreset, a lane whose episode has ended stays where it is: its steps return the last observation,
     reward 0, and neither termination nor truncation.
@@ -51,13 +56,13 @@ class GymLanes(LaneEnv):
     arguments:
         Keyword arguments of `gymnasium.make`.
     normalization, low, high:
-        See `qrlsuite.normalization.Normalization`; for boxes only.
+        See `qrlsuite.normalization.Normalization`; for boxes, and a Dict or Tuple, only.
 
     Raises
     ------
     qrlsuite.errors.OptionError
-        If there is no such environment, a package that it needs is missing, it refuses its arguments, its
-        actions are not discrete, or its observations are neither a box nor discrete.
+        If there is no such environment, a package that it needs is missing, it refuses its arguments, or its
+        actions or observations are not supported.
     """
 
     def __init__(
@@ -75,7 +80,9 @@ class GymLanes(LaneEnv):
         keywords = dict(arguments or {})
         first = make(env_id, keywords)
         self._action_space, self._raw_space, flat = _supported(env_id, first)
-        if normalization != "none" and not isinstance(self._raw_space, spaces.Box):
+        if normalization != "none" and not isinstance(
+            self._raw_space, spaces.Box | spaces.Dict | spaces.Tuple
+        ):
             raise OptionError(
                 f"environment '{env_id}': normalization = '{normalization}' is for boxes, "
                 f"and its observations are {self._raw_space}"
@@ -83,13 +90,14 @@ class GymLanes(LaneEnv):
         self._normalize = Normalization(normalization, flat, low, high, f"environment '{env_id}'")
         self.running_statistics = normalization == "running"
         self.envs = [first, *(make(env_id, keywords) for _ in range(num_envs - 1))]
-        batched_spaces(self, self._normalize.space, spaces.Discrete(int(self._action_space.n)), num_envs)
+        batched_spaces(self, self._normalize.space, action_spaces.from_zero(self._action_space), num_envs)
+        self.unflattened_space = self._raw_space
         limit = first.spec.max_episode_steps if first.spec is not None else None
         self.capacity = int(limit or UNLIMITED)
         self.streams = []
         self._seeds = np.zeros(num_envs, dtype=np.int64)
-        smallest = np.min_scalar_type(-int(self._action_space.n))  # a signed type: -1 is no action yet
-        self._actions = np.full((num_envs, self.capacity), -1, dtype=smallest)
+        self._actions = _no_actions(self.single_action_space, num_envs, self.capacity)
+        self._masks: dict[int, NDArray[Any]] = {}
         self._step = np.zeros(num_envs, dtype=np.int64)
         self._raw = np.zeros((num_envs, *flat.shape), dtype=np.float32)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
@@ -98,7 +106,7 @@ class GymLanes(LaneEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin a new episode in every lane; returns observations (L, n) and an empty dictionary.
+        """Begin a new episode in every lane; returns observations (L, n), and infos with the masks, if there are any.
 
         Raises
         ------
@@ -115,46 +123,47 @@ class GymLanes(LaneEnv):
         self._begun = True
         for lane in range(self.num_envs):
             self._begin(lane)
-        return self._observations(), {}
+        return self._observations(), self._mask_info()
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Take `actions` (L,) in all lanes.
+        """Take `actions` (L, ...) in all lanes.
 
         Raises
         ------
         gymnasium.error.ResetNeeded
             If there was no reset.
         gymnasium.error.InvalidAction
-            If an action is not in 0 .. n - 1.
+            If an action is not one of the space.
         qrlsuite.errors.EnvironmentFailure
-            If an episode without a time limit gets too long to be checkpointed.
+            If an episode without a time limit gets too long to be checkpointed, or a mask leaves no action.
         """
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
-        check_actions(actions, self.num_envs, int(self._action_space.n))
+        check_actions(actions, self.num_envs, self.single_action_space)
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         last: dict[int, dict[str, Any]] = {}
         running = np.flatnonzero(~self._ended)
         self._record(running, actions[running])
-        for lane, action in zip(running.tolist(), actions[running].tolist()):
+        for lane, action in zip(running.tolist(), actions[running]):
             rewards[lane], terminated[lane], truncated[lane], info = self._play(lane, action)
             if terminated[lane] or truncated[lane]:
                 last[lane] = info
         infos = self._finish(last, terminated | truncated) if last else {}
+        infos |= self._mask_info()
         return self._observations(), rewards, terminated, truncated, infos
 
     def state_dict(self) -> State:
         """Return the episodes so far, lane-first.
 
-        `seed` (L,) of the last reset, `actions` (L, capacity) since then, -1 where there is none yet, and
-        `observation` (L, n) as it came from the environment.
+        `seed` (L,) of the last reset, `actions` (L, capacity, ...) since then, -1 (of a box NaN) where there is none
+        yet, and `observation` (L, n) as it came from the environment.
 
         Raises
         ------
@@ -203,9 +212,12 @@ class GymLanes(LaneEnv):
         self._begun = True
 
     def _replay(self, lane: int, seed: int, actions: NDArray[Any]) -> None:
-        """Play one lane's episode again, from its reset seed and its actions (capacity,), -1 after the last."""
+        """Play one lane's episode again, from its reset seed and its actions (capacity, ...)."""
         self._begin(lane, seed)
-        for action in actions[: np.count_nonzero(actions >= 0)].tolist():
+        first = actions.reshape(self.capacity, -1)[:, 0]
+        for action in actions[
+            : np.count_nonzero(first >= 0 if first.dtype.kind == "i" else ~np.isnan(first))
+        ]:
             self._record(np.array([lane]), np.array([action]))
             _, terminated, truncated, _ = self._play(lane, action)
             self._ended[lane] = terminated or truncated
@@ -220,15 +232,16 @@ class GymLanes(LaneEnv):
         if seed is None:
             stream = self.streams[lane // (self.num_envs // len(self.streams))]
             seed = int(stream.integers(SEEDS))
-        observation, _ = self.envs[lane].reset(seed=seed)
+        observation, info = self.envs[lane].reset(seed=seed)
+        self._see_mask(lane, info)
         self._seeds[lane] = seed
-        self._actions[lane] = -1
+        self._actions[lane] = -1 if self._actions.dtype.kind == "i" else np.nan
         self._step[lane] = 0
         self._ended[lane] = False
         self._raw[lane] = self._flat(observation)
 
-    def _record(self, lanes: NDArray[np.intp], actions: NDArray[np.int64]) -> None:
-        """Note the actions (n,) that the lanes (n,) are about to take."""
+    def _record(self, lanes: NDArray[np.intp], actions: NDArray[Any]) -> None:
+        """Note the actions (n, ...) that the lanes (n,) are about to take."""
         steps = self._step[lanes]
         if steps.size and steps.max() == self.capacity:
             raise EnvironmentFailure(
@@ -238,12 +251,35 @@ class GymLanes(LaneEnv):
         self._actions[lanes, steps] = actions
         self._step[lanes] += 1
 
-    def _play(self, lane: int, action: int) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _play(self, lane: int, action: Any) -> tuple[float, bool, bool, dict[str, Any]]:
         """Take one step in one lane; returns reward, termination, truncation and info."""
-        env_action = np.int64(action + self._action_space.start)
+        space = self._action_space
+        if isinstance(space, spaces.Discrete):
+            env_action: Any = np.int64(int(action) + int(space.start))
+        elif isinstance(space, spaces.MultiDiscrete):
+            env_action = (action.astype(np.int64) + space.start).astype(space.dtype)
+        else:
+            env_action = np.array(action, dtype=space.dtype)  # a copy, which the environment may change
         observation, reward, terminated, truncated, info = self.envs[lane].step(env_action)
         self._raw[lane] = self._flat(observation)
+        self._see_mask(lane, info)
         return float(reward), bool(terminated), bool(truncated), info
+
+    def _see_mask(self, lane: int, info: Mapping[str, Any]) -> None:
+        """Keep the mask of a lane's observation, if it has one."""
+        if "action_mask" in info:
+            self._masks[lane] = np.array(info["action_mask"])
+
+    def _mask_info(self) -> dict[str, Any]:
+        """Return the masks of all lanes (L, choices) for infos; nothing where the environment has none."""
+        if not self._masks:
+            return {}
+        for lane, mask in self._masks.items():
+            if not mask.any() and not self._ended[lane]:
+                raise EnvironmentFailure(
+                    f"environment '{self.env_id}': info['action_mask'] leaves no action, and the episode goes on"
+                )
+        return {"action_mask": np.stack([self._masks[lane] for lane in range(self.num_envs)])}
 
     def _finish(self, last: Mapping[int, dict[str, Any]], done: NDArray[np.bool_]) -> dict[str, Any]:
         """Report the episodes that have ended (`last`: their infos by lane), and begin the next ones."""
@@ -277,18 +313,13 @@ class GymLanes(LaneEnv):
         return self._normalize(self._raw.copy())
 
 
-def check_actions(actions: NDArray[Any], lanes: int, choices: int) -> None:
-    """Check that actions are (lanes,) integers in 0 .. choices - 1.
-
-    Raises
-    ------
-    gymnasium.error.InvalidAction
-        If not.
-    """
-    if actions.shape != (lanes,) or actions.dtype.kind not in "iu":
-        raise InvalidAction(f"actions must be {lanes} integers, not {actions.dtype} of shape {actions.shape}")
-    if actions.min() < 0 or actions.max() >= choices:
-        raise InvalidAction(f"actions must lie in 0..{choices - 1}, not {actions.min()}..{actions.max()}")
+def _no_actions(space: spaces.Space[Any], lanes: int, capacity: int) -> NDArray[Any]:
+    """Return an array (lanes, capacity, ...) for actions, of the smallest type, in which there is none yet."""
+    _, high = action_spaces.limits(space)
+    shape = (lanes, capacity, *(space.shape or ()))
+    if high.dtype.kind == "f":
+        return np.full(shape, np.nan, dtype=high.dtype)
+    return np.full(shape, -1, dtype=np.min_scalar_type(-int(np.max(high)) - 1))  # a signed type: -1 is none
 
 
 def specification(env_id: str) -> gymnasium.envs.registration.EnvSpec:
@@ -347,7 +378,7 @@ def make(env_id: str, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
 
 def _supported(
     env_id: str, env: gymnasium.Env[Any, Any]
-) -> tuple[spaces.Discrete, spaces.Space[Any], spaces.Box]:
+) -> tuple[spaces.Space[Any], spaces.Space[Any], spaces.Box]:
     """Return an environment's action space, observation space, and the latter's flat box.
 
     Raises
@@ -356,15 +387,14 @@ def _supported(
         If the algorithms cannot act or observe in it.
     """
     action, observation = env.action_space, env.observation_space
-    if not isinstance(action, spaces.Discrete):
+    try:
+        action_spaces.kind(action)
+    except OptionError as error:
+        raise OptionError(f"environment '{env_id}': {error}") from None
+    if not observation.is_np_flattenable:
         raise OptionError(
-            f"environment '{env_id}' has the action space {action}: only discrete actions are supported, "
-            "wrap it to choose among a few"
-        )
-    if not isinstance(observation, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
-        raise OptionError(
-            f"environment '{env_id}' has the observation space {observation}: only boxes and discrete observations "
-            "are supported, wrap it with gymnasium.wrappers.FlattenObservation"
+            f"environment '{env_id}' has the observation space {observation}, which has no fixed number of values: "
+            "wrap it with gymnasium.wrappers.TransformObservation"
         )
     flat: Any = spaces.flatten_space(observation)
     limits = np.stack([flat.low, flat.high]).astype(np.float32)
@@ -391,7 +421,9 @@ def quick_task(env_id: str) -> dict[str, Any]:
     options: dict[str, Any] = {"id": env_id}
     if known.max_episode_steps is None:
         options["max_episode_steps"] = QUICK_STEPS
-    GymLanes(env_id, 1).close()
+    envs = GymLanes(env_id, 1)
+    envs.close()
+    kind = action_spaces.kind(envs.single_action_space)
     solved = known.reward_threshold
     derived = [0.0]
     if solved is not None:
@@ -414,6 +446,7 @@ def quick_task(env_id: str) -> dict[str, Any]:
         "format_version": 1,
         "name": quick_name(env_id),
         "summary": summary,
+        **({} if kind == "discrete" else {"default_algorithm": _algorithm(kind)}),
         "environment": {"name": "gym", "options": options},
         "protocol": {
             "seeds": 20,
@@ -432,6 +465,13 @@ def quick_task(env_id: str) -> dict[str, Any]:
     }
 
 
+def _algorithm(kind: str) -> str:
+    """Return the first registered algorithm that takes actions of a kind; any where none does, and training says so."""
+    known = registry.load()
+    names = known.names(specs.AlgorithmSpec)
+    return next((name for name in names if kind in registry.get(specs.AlgorithmSpec, name).actions), names[0])
+
+
 @functools.cache
 def _random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
     """Return the lowest and the highest return of 10 episodes of random actions, always the same ones.
@@ -447,7 +487,7 @@ def _random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
     try:
         envs.reset()
         for _ in range(QUICK_STEPS):
-            actions = stream.integers(int(envs._action_space.n), size=lanes)
+            actions = action_spaces.draw(envs.single_action_space, stream, lanes)
             _, rewards, terminated, truncated, _ = envs.step(actions)
             returns[running] += rewards[running]
             running &= ~(terminated | truncated)

@@ -125,7 +125,7 @@ class EnvironmentSpec(NumericSpec):
     policies:
         Reference policies for `qrlsuite evaluate`, by name: each a reference to `factory(envs) -> policy`,
         called when all lanes of the `LaneEnv` have been reset, and `policy(observations) -> actions` maps
-        observations (num_envs, ...) to actions (num_envs,). It may look into `envs`, and so know what no
+        observations (num_envs, ...) to actions (num_envs, ...). It may look into `envs`, and so know what no
         agent is shown. Uniformly random actions need no policy.
     pictures:
         What `qrlsuite plot` can draw of it.
@@ -155,7 +155,9 @@ class ModelSpec(NumericSpec):
     build:
         Reference to `build(obs_dim, out_dim, options, generator) -> torch.nn.Module`, an ordinary
         single-agent module (B, obs_dim) -> (B, out_dim), every random number drawn from `generator`
-        (a `torch.Generator`).
+        (a `torch.Generator`). A function with a parameter `space` is given the space of the observations before they
+        were flattened, such as that of an image, and one with a parameter `role` what the network is for, such as
+        `"critic"`: see `qrlsuite.algorithm.BuildModel`.
     population:
         Reference to `population(modules, options) -> torch.nn.Module`: S built modules as one that maps
         (S, B, in) to (S, B, out), its parameters named as in one module with a leading axis S. None uses
@@ -198,6 +200,8 @@ class AlgorithmSpec(NumericSpec):
     memory:
         Reference to `memory(options, rounds) -> qrlsuite.algorithm.Memory`: what it keeps in memory at least, where
         an epoch has `rounds` steps of every environment. None where it is unknown.
+    actions:
+        The kinds of actions that it takes: some of `qrlsuite.actions.KINDS`.
     """
 
     kind, kinds = "algorithm", "algorithms"
@@ -205,6 +209,15 @@ class AlgorithmSpec(NumericSpec):
     options: str
     factory: str
     memory: str | None = None
+    actions: tuple[str, ...] = field(default=("discrete",), kw_only=True)
+
+    def __post_init__(self) -> None:
+        Spec.__post_init__(self)
+        known = ("discrete", "multi-discrete", "multi-binary", "box")
+        if not self.actions or not set(self.actions) <= set(known):
+            raise PluginError(
+                f"algorithm '{self.name}': actions = {self.actions!r} must name some of {', '.join(known)}, in a tuple"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,7 +64,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
     register(
         EnvironmentSpec(
             name="gym",
-            summary="any environment of Gymnasium with discrete actions, by its id",
+            summary="any environment of Gymnasium, by its id",
             options=f"{_HERE}.gym:GymOptions",
             gymnasium_id="CartPole-v1",
             vector=f"{_HERE}.gym:make_vector",

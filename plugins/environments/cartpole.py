@@ -19,9 +19,9 @@ from pydantic import ConfigDict, Field, field_validator
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
+from qrlsuite.actions import check_actions
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.gymlanes import check_actions
 from qrlsuite.normalization import KIND, Kind, Normalization
 
 ID = "qrlsuite/CartPole-v1"

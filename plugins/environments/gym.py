@@ -1,4 +1,4 @@
-"""The environment `gym`: any environment that Gymnasium knows, by its id, as long as its actions are discrete."""
+"""The environment `gym`: any environment that Gymnasium knows, by its id."""
 
 from __future__ import annotations
 

@@ -12,12 +12,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite.actions import from_zero, kind
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.testing import reproducible
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import BrokenRuleError, Checklist, Finding, require
-from qrlsuite.testing.lanes import LONGEST, Lanes, S, actions, choices, register
+from qrlsuite.testing.lanes import LONGEST, Lanes, S, actions, register
 
 HARMLESS = ("infinity", "recommend", "values are equal")
 """Words of warnings of `check_env` that concern taste, or learners other than the suite's."""
@@ -37,10 +38,10 @@ def check(subject: Subject, deterministic: bool = False) -> list[Finding]:
     rules.run("gymnasium", "passes gymnasium.utils.env_checker.check_env", lambda: _gymnasium(lanes))
     cause = "in __init__, call qrlsuite.environment.batched_spaces(self, observation_space, action_space, num_envs)"
     if not rules.run(
-        "spaces", "discrete actions, and boxes or numbers to observe", lambda: _spaces(lanes), cause
+        "spaces", "actions of a kind that is taken, and boxes to observe", lambda: _spaces(lanes), cause
     ):
         return rules.findings
-    cause = "step takes (L,) integers and returns observations, rewards, terminated, truncated and infos"
+    cause = "step takes (L, ...) actions and returns observations, rewards, terminated, truncated and infos"
     if not rules.run(
         "shapes", "lanes first, of the right types, finite, in their space", lambda: _shapes(lanes), cause
     ):
@@ -128,13 +129,13 @@ def _spaces(lanes: Lanes) -> None:
     except QrlSuiteError as error:
         raise BrokenRuleError(str(error)) from error
     action, observation = envs.single_action_space, envs.single_observation_space
+    try:
+        kind(action)
+    except QrlSuiteError as error:
+        raise BrokenRuleError(str(error)) from error
     require(
-        isinstance(action, gymnasium.spaces.Discrete),
-        f"actions are {action}; the algorithms choose among discrete ones: use gymnasium.spaces.Discrete(n)",
-    )
-    require(
-        int(action.start) == 0,  # type: ignore[attr-defined]
-        f"actions are {action}; in lanes they count from 0: use gymnasium.spaces.Discrete(n), and add start in step",
+        action == from_zero(action),
+        f"actions are {action}; in lanes they count from 0: use {from_zero(action)}, and add start in step",
     )
     require(
         isinstance(observation, gymnasium.spaces.Box),
@@ -150,7 +151,7 @@ def _shapes(lanes: Lanes) -> None:
     _array("reset's observations", before, shape, np.float32)
     for observation in before:
         _within(envs, observation, "reset")
-    for step, row in enumerate(actions(range(S), choices(envs), 50), start=1):
+    for step, row in enumerate(actions(range(S), envs.single_action_space, 50), start=1):
         kept = np.array(before)
         after, rewards, terminated, truncated, infos = envs.step(row)
         require(
@@ -203,7 +204,7 @@ def _end(lanes: Lanes) -> int:
     """Return the length of the first episode that ends."""
     envs, unreset = lanes.make([0]), lanes.make([0], autoreset=False)
     alike = np.array_equal(envs.reset()[0], unreset.reset()[0])
-    rows = iter(actions([0], choices(envs), LONGEST + 5))
+    rows = iter(actions([0], envs.single_action_space, LONGEST + 5))
     for step in range(1, LONGEST + 1):
         row = next(rows)
         after, _, terminated, truncated, infos = envs.step(row)
@@ -262,7 +263,7 @@ def _score(lanes: Lanes, length: int) -> None:
     envs = lanes.make(range(S))
     envs.reset()
     scored: list[bool] = []
-    for row in actions(range(S), choices(envs), min(4 * length, LONGEST)):
+    for row in actions(range(S), envs.single_action_space, min(4 * length, LONGEST)):
         _, _, terminated, truncated, infos = envs.step(row)
         done = terminated | truncated
         if not done.any():

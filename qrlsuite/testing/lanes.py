@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import qrlsuite
 from qrlsuite import specs
+from qrlsuite.actions import draw
 from qrlsuite.environment import LaneEnv
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import require
@@ -77,21 +78,14 @@ def rows(seeds: Sequence[int]) -> list[int]:
     return [s * E + e for s in seeds for e in range(E)]
 
 
-def choices(envs: LaneEnv) -> int:
-    """Return the number of actions."""
-    return int(envs.single_action_space.n)  # type: ignore[attr-defined]
+def actions(seeds: Sequence[int], space: gymnasium.Space[Any], steps: int) -> NDArray[Any]:
+    """Return every lane's actions (steps, 2 len(seeds), ...); those of a seed do not depend on the others."""
+    columns = [draw(space, np.random.Generator(np.random.Philox(key=77 + s)), steps, E) for s in seeds]
+    return np.concatenate(columns, axis=1)
 
 
-def actions(seeds: Sequence[int], count: int, steps: int) -> NDArray[np.int64]:
-    """Return every lane's actions (steps, 2 len(seeds)); those of a seed do not depend on the others."""
-    columns = [
-        np.random.Generator(np.random.Philox(key=77 + s)).integers(count, size=(steps, E)) for s in seeds
-    ]
-    return np.concatenate(columns, axis=1).astype(np.int64)
-
-
-def play(envs: LaneEnv, actions: NDArray[np.int64], reset: bool = True) -> Seen:
-    """Return everything that lanes show under actions (T, L); observations have one more where they are reset."""
+def play(envs: LaneEnv, actions: NDArray[Any], reset: bool = True) -> Seen:
+    """Return everything that lanes show under actions (T, L, ...); observations have one more where they are reset."""
     names = ("observations", "rewards", "terminated", "truncated", "scores")
     seen: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     if reset:

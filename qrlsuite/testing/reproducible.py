@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.environment import LaneEnv
 from qrlsuite.seeding import pack, unpack
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, require
-from qrlsuite.testing.lanes import LONGEST, E, Lanes, S, actions, choices, differs, first_episodes, play, rows
+from qrlsuite.testing.lanes import LONGEST, E, Lanes, S, actions, differs, first_episodes, play, rows
 
 _STREAMS = (
     "draw from self.np_random in a gymnasium.Env, from self.streams in lanes, and from nothing global; set all state "
@@ -19,7 +21,7 @@ _STREAMS = (
 def same_seed(lanes: Lanes, steps: int) -> None:
     """The same streams and actions give the same bits, in new and in used lanes."""
     first, second = (lanes.make([0, 1]) for _ in range(2))
-    action_rows = actions([0, 1], choices(first), steps)
+    action_rows = actions([0, 1], first.single_action_space, steps)
     name = differs(play(first, action_rows), play(second, action_rows))
     require(name is None, f"the same streams and actions give other {name}: {_STREAMS}")
     first.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2 * E)])
@@ -32,7 +34,7 @@ def same_seed(lanes: Lanes, steps: int) -> None:
 def different_seed(lanes: Lanes, steps: int) -> None:
     """Other streams give other episodes."""
     envs, others = lanes.make([0]), lanes.make([5])
-    action_rows = actions([0], choices(envs), steps)
+    action_rows = actions([0], envs.single_action_space, steps)
     require(
         differs(play(envs, action_rows), play(others, action_rows)) is not None,
         f"other streams give the same {steps} steps: {_STREAMS}; if all episodes are meant to be alike, check with "
@@ -43,10 +45,10 @@ def different_seed(lanes: Lanes, steps: int) -> None:
 def seed_independence(lanes: Lanes, steps: int) -> None:
     """Seeds alone, in pairs and shuffled see what they see among all."""
     envs = lanes.make(range(S))
-    count = choices(envs)
-    whole = play(envs, actions(range(S), count, steps))
+    space = envs.single_action_space
+    whole = play(envs, actions(range(S), space, steps))
     for members in SIZES:
-        part = play(lanes.make(members), actions(members, count, steps))
+        part = play(lanes.make(members), actions(members, space, steps))
         name = differs(part, {key: value[rows(members)] for key, value in whole.items()})
         require(
             name is None,
@@ -58,7 +60,7 @@ def seed_independence(lanes: Lanes, steps: int) -> None:
 def state(lanes: Lanes, steps: int) -> None:
     """Saved in the middle of an episode, sliced, and restored in new lanes, episodes go on as they would have."""
     envs = lanes.make(range(S))
-    action_rows = actions(range(S), choices(envs), 2 * steps)
+    action_rows = actions(range(S), envs.single_action_space, 2 * steps)
     play(envs, action_rows[: max(1, steps // 2)])
     saved = {}
     for name, value in envs.state_dict().items():
@@ -90,8 +92,8 @@ def state(lanes: Lanes, steps: int) -> None:
 
 def validation(lanes: Lanes) -> None:
     """Lanes play the same first episodes whether or not they are reset, and whoever is beside them."""
-    count = choices(lanes.make([0]))
-    action_rows = actions(range(S), count, LONGEST)
+    space = lanes.make([0]).single_action_space
+    action_rows = actions(range(S), space, LONGEST)
     envs = lanes.make(range(S), autoreset=False, shared=True)
     length = _until_all_ended(envs, action_rows)
     whole = first_episodes(play(lanes.make(range(S), autoreset=False, shared=True), action_rows[:length]))
@@ -115,7 +117,7 @@ def validation(lanes: Lanes) -> None:
     )
 
 
-def _until_all_ended(envs: LaneEnv, action_rows: NDArray[np.int64]) -> int:
+def _until_all_ended(envs: LaneEnv, action_rows: NDArray[Any]) -> int:
     """Step lanes that are not reset until an episode ended in each, and on; return the number of steps."""
     envs.reset()
     over = np.zeros(envs.num_envs, dtype=bool)

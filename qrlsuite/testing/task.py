@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from qrlsuite import options, registry, specs
+from qrlsuite.actions import draw
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.task import Task, parse
 from qrlsuite.testing.common import Subject
@@ -91,9 +92,8 @@ def _scores(task: Task) -> None:
         envs = build_envs(Entry(task, algorithm, model, None, None, None), 2, lambda: None)
         envs.seed_lanes([np.random.Generator(np.random.Philox(key=k)) for k in range(2)])
         envs.reset()
-        choices = int(envs.single_action_space.n)  # type: ignore[attr-defined]
         for _ in range(LONGEST):
-            envs.step(choose.integers(choices, size=2))
+            envs.step(draw(envs.single_action_space, choose, 2))
             _, returns, scores = envs.take_finished()
             for value, score in zip(returns, scores):
                 _score(task, float(value), float(score))

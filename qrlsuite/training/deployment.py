@@ -185,9 +185,9 @@ class Deployment:
         return Played(self.name, returns, scores, tuple(self.seeds), tuple(self.validation), self.runs)
 
     def _guarded(self, progress: Sequence[int]) -> Policy:
-        def act(observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        def act(observations: NDArray[np.float32], *more: Any) -> NDArray[Any]:
             try:
-                return self.agents.act(observations)
+                return self.agents.act(observations, *more)
             except Exception as error:  # whatever a device's package raises
                 reason = " ".join(str(error).split()) or type(error).__name__
                 raise QrlSuiteError(

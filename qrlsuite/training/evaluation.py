@@ -8,7 +8,6 @@ counted more often than long ones.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from gymnasium import spaces
+from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
 from qrlsuite import specs
+from qrlsuite.actions import check_actions, draw
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, PluginError, StoreError
 from qrlsuite.experiment import identity
@@ -296,34 +296,20 @@ def references(
 
 
 def _random(envs: LaneEnv, stream: np.random.Generator) -> Policy:
-    """Return the policy that draws from the action space; where that is not discrete, as Gymnasium samples it."""
-    if isinstance(envs.single_action_space, spaces.Discrete):
-        choices = int(envs.single_action_space.n)
-        return lambda observations: stream.integers(choices, size=envs.num_envs)
-    space = copy.deepcopy(envs.action_space)
-    space.seed(int(stream.integers(2**31)))
-    return lambda observations: np.asarray(space.sample()).reshape(-1)  # as `Trainer.act` gives them
+    """Return the policy that draws from the action space."""
+    return lambda observations: draw(envs.single_action_space, stream, envs.num_envs)
 
 
 def _checked(name: str, policy: Policy, envs: LaneEnv) -> Policy:
-    """Return a reference policy whose actions are looked at before the environment takes them, where discrete."""
-    if not isinstance(envs.single_action_space, spaces.Discrete):
-        return policy
-    choices = int(envs.single_action_space.n)
+    """Return a reference policy whose actions are looked at before the environment takes them."""
 
-    def act(observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        actions = np.asarray(policy(observations))
-        if (
-            actions.shape != (envs.num_envs,)
-            or actions.dtype.kind not in "iu"
-            or actions.min() < 0
-            or actions.max() >= choices
-        ):
-            raise PluginError(
-                f"reference policy '{name}' gave {actions.dtype} of shape {actions.shape}: it has to give "
-                f"{envs.num_envs} integers in 0..{choices - 1}"
-            )
-        return actions.astype(np.int64)
+    def act(observations: NDArray[np.float32]) -> NDArray[Any]:
+        given = np.asarray(policy(observations))
+        try:
+            check_actions(given, envs.num_envs, envs.single_action_space)
+        except InvalidAction as error:
+            raise PluginError(f"reference policy '{name}': {error}") from None
+        return given.astype(envs.single_action_space.dtype)
 
     return act
 

@@ -41,6 +41,7 @@ class MeteredEnv(LaneEnv):
         self.score = score
         self.tick = tick
         batched_spaces(self, inner.single_observation_space, inner.single_action_space, inner.num_envs)
+        self.unflattened_space = inner.unflattened_space
         self.returns = np.zeros(inner.num_envs)
         self.observe: Callable[[NDArray[np.float32]], None] | None = None
         self.finished: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
@@ -58,7 +59,7 @@ class MeteredEnv(LaneEnv):
         except Exception as error:
             raise self._failure(error) from error
 
-    def step(self, actions: NDArray[np.int64]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step every lane."""
         try:
             with self.fence.around(f"environment '{self.environment_name}', step"):

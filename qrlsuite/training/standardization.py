@@ -79,8 +79,12 @@ class RunningStatistics:
         population.register_forward_pre_hook(self)
 
     def __call__(self, population: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Standardize the first of a population's inputs, (S, B, n)."""
+        """Standardize the first of a population's inputs, (S, B, n), or its first n numbers where it has more."""
         x, *others = inputs
+        n = self._mean.shape[2]
+        if x.shape[2] > n:
+            seen = ((x[..., :n] - self._mean) / self._deviation).clamp(-CLIP, CLIP)
+            return torch.cat([seen, x[..., n:]], 2), *others
         return ((x - self._mean) / self._deviation).clamp(-CLIP, CLIP), *others
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RunningStatistics:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import inspect
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 import qrlsuite
+from qrlsuite import actions as action_spaces
 from qrlsuite import population, registry, specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
@@ -41,8 +43,9 @@ MAX_EPISODE_STEPS = 100_000
 """An episode that has not ended after so many steps is an error, not an endless loop."""
 
 Floats = NDArray[np.float64]
-Policy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
-"""Maps observations (lanes, ...) to actions (lanes,)."""
+Policy = Callable[..., NDArray[Any]]
+"""Maps observations (lanes, ...) to actions (lanes, ...), see `informed`."""
+Infos = Mapping[str, Any]
 
 Report = Callable[[Progress], None]
 
@@ -83,27 +86,91 @@ def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence 
     return MeteredEnv(inner, spec.name, entry.task.file.score, tick, fence)
 
 
+def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
+    """Refuse an algorithm that does not take the actions of the entry's environment.
+
+    Raises
+    ------
+    OptionError
+        Naming those that do.
+    """
+    try:
+        kind = action_spaces.kind(space)
+    except OptionError as error:
+        raise OptionError(f"environment '{entry.task.environment.name}': {error}") from None
+    if kind in entry.algorithm.actions:
+        return
+    known = registry.load()
+    others = [each for each in known.names(specs.AlgorithmSpec)
+              if kind in registry.get(specs.AlgorithmSpec, each).actions]  # fmt: skip
+    advice = (
+        f"take {' or '.join(others)}: qrlsuite run '{others[0]} {entry.model.name}'"
+        if others
+        else "none does"
+    )
+    if known.of(specs.AlgorithmSpec)[entry.algorithm.name].distribution != "qrlsuite":
+        advice += (
+            f"; if it does take them, write actions={(*entry.algorithm.actions, kind)} in its AlgorithmSpec"
+        )
+    raise OptionError(
+        f"algorithm '{entry.algorithm.name}' takes {' and '.join(entry.algorithm.actions)} actions, and those of "
+        f"environment '{entry.task.environment.name}' are {space}: {advice}"
+    )
+
+
+class _FirstNetwork(Exception):
+    """The sizes of the first network that an algorithm asks for."""
+
+
 def first_network(entry: Entry) -> nn.Module:
     """Return one agent's freshly built first network; nothing is computed with it.
 
     Raises
     ------
     OptionError
-        If actions are not discrete: the algorithm alone knows its outputs then.
+        If the algorithm does not take the environment's actions.
+    PluginError
+        If it asks for no network.
     """
     envs = build_envs(entry, 1, lambda: None)
-    inputs = int(np.prod(envs.single_observation_space.shape or (1,)))
-    if not isinstance(envs.single_action_space, spaces.Discrete):
-        raise OptionError(
-            f"'{entry.label}': the actions of environment '{entry.task.environment.name}' are "
-            f"{envs.single_action_space}, not discrete, so that the size of the model is not known before it is trained"
-        )
-    outputs = int(envs.single_action_space.n)
+    require_actions(entry, envs.single_action_space)
+    own = int(np.prod(envs.single_observation_space.shape or (1,)))
+
+    def ask(outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:
+        raise _FirstNetwork(outputs, own if inputs is None else inputs, role)
+
+    if isinstance(envs.single_action_space, spaces.Discrete):
+        outputs, inputs, role = int(envs.single_action_space.n), own, "network"
+    else:
+        try:
+            specs.resolve(entry.algorithm.factory)(
+                envs, ask, entry.algorithm_options, [Streams(entry.task.hash, 0)], torch.device("cpu")
+            )
+        except _FirstNetwork as found:
+            outputs, inputs, role = found.args
+        else:
+            raise PluginError(f"algorithm '{entry.algorithm.name}' builds no network when it is made")
     with _building(entry.model), seeded(0):
-        agent: nn.Module = specs.resolve(entry.model.build)(
-            inputs, outputs, entry.model_options, torch.Generator()
-        )
-    return agent
+        return build_agent(entry.model, envs, inputs, outputs, role, entry.model_options, torch.Generator())
+
+
+def build_agent(
+    spec: specs.ModelSpec,
+    envs: LaneEnv,
+    inputs: int,
+    outputs: int,
+    role: str,
+    options: Any,
+    generator: torch.Generator,
+) -> nn.Module:
+    """Build one agent's network, for which `build` of the model is also given what it asks for: `space`, `role`."""
+    build = specs.resolve(spec.build)
+    more = {"space": envs.unflattened_space or envs.single_observation_space, "role": role}
+    asked = inspect.signature(build).parameters
+    model: nn.Module = build(
+        inputs, outputs, options, generator, **{name: value for name, value in more.items() if name in asked}
+    )
+    return model
 
 
 def count_parameters(entry: Entry) -> tuple[int, int]:
@@ -131,6 +198,30 @@ class Episodes:
     rounds: int
 
 
+def informed(policy: Policy) -> Callable[[NDArray[np.float32], NDArray[np.bool_], Infos], NDArray[Any]]:
+    """Return a policy as one of three arguments: it is given observations alone where it does not ask for more.
+
+    `policy(observations, begins, infos)` is also told in which lanes (lanes,) an episode begins with the observation,
+    and what the lanes said of it.
+    """
+    if asks_for_more(policy):
+        return policy
+    return lambda observations, begins, infos: policy(observations)
+
+
+def asks_for_more(function: Callable[..., Any]) -> bool:
+    """Tell whether a policy takes observations, begins and infos, and not observations alone."""
+    try:
+        given = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # of another language
+        return False
+    kinds = [each.kind for each in given]
+    places = sum(
+        kind in (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD) for kind in kinds
+    )
+    return places >= 3 or inspect.Parameter.VAR_POSITIONAL in kinds
+
+
 def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
     """Play one episode in every lane.
 
@@ -139,7 +230,7 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
     envs:
         Lanes whose streams are set, with `autoreset` off.
     begin:
-        Called after the reset; returns the policy.
+        Called after the reset; returns the policy, which may ask for more than observations (`informed`).
 
     Raises
     ------
@@ -147,14 +238,16 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         If the environment fails, or an episode does not end within `MAX_EPISODE_STEPS`.
     """
     envs.take_finished()
-    observations, _ = envs.reset()
-    policy = begin()
+    observations, infos = envs.reset()
+    policy = informed(begin())
+    begins = np.ones(envs.num_envs, dtype=np.bool_)
     returns, scores = (np.full(envs.num_envs, np.nan) for _ in range(2))
     lengths = np.zeros(envs.num_envs, np.int64)
     unfinished = np.ones(envs.num_envs, dtype=np.bool_)
     for played in range(1, MAX_EPISODE_STEPS + 1):
-        observations, _, terminated, truncated, _ = envs.step(policy(observations))
-        if not (terminated | truncated).any():
+        observations, _, terminated, truncated, infos = envs.step(policy(observations, begins, infos))
+        begins = terminated | truncated
+        if not begins.any():
             continue
         lanes, sums, final_scores = envs.take_finished()
         first = lanes[unfinished[lanes]]
@@ -182,7 +275,7 @@ class ModelBuilder:
     def __init__(
         self,
         entry: Entry | Sequence[Entry],
-        observation_size: int,
+        envs: LaneEnv,
         streams: Sequence[Streams],
         statistics: RunningStatistics | None = None,
         fence: Fence | None = None,
@@ -190,24 +283,26 @@ class ModelBuilder:
         self.fence = fence or Fence(closed=False)
         self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
         self.entry = self.entries[0]
-        self.observation_size = observation_size
+        self.envs = envs
+        self.observation_size = int(np.prod(envs.single_observation_space.shape or (1,)))
         self.streams = streams
         self.statistics = statistics
         self.built: list[nn.Module] = []
         # classical, quantum and fixed numbers of each network built
         self.parameters: list[tuple[int, int, int]] = []
 
-    def __call__(self, out_dim: int) -> nn.Module:
-        """Return a population of freshly initialized agents."""
+    def __call__(self, outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:
+        """Return a population of freshly initialized agents, see `qrlsuite.algorithm.BuildModel`."""
         spec, options = self.entry.model, [entry.model_options for entry in self.entries]
         call = len(self.built)
+        given = self.observation_size if inputs is None else inputs
         with _building(spec):
-            build = specs.resolve(spec.build)
 
             def agent(streams: Streams, own: Any) -> nn.Module:
                 with seeded(stream_key(streams.task_hash, streams.seed, "build", call)):
-                    model: nn.Module = build(self.observation_size, out_dim, own, streams.torch("init", call))
-                return model
+                    return build_agent(
+                        spec, self.envs, given, outputs, role, own, streams.torch("init", call)
+                    )
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)
@@ -215,9 +310,7 @@ class ModelBuilder:
             stacked = spec.population is None
             if stacked:  # a stack keeps one agent's plain attributes for all
                 both = options[0], next((own for own in options if own != options[0]), options[0])
-            unregistered.require_none(
-                lambda which: agent(two[which], both[which]), self.observation_size, spec.name, stacked
-            )
+            unregistered.require_none(lambda which: agent(two[which], both[which]), given, spec.name, stacked)
             agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))
@@ -358,16 +451,18 @@ class Trainer:
         self.streams = [Streams(entry.task.hash, seed) for seed in self.seeds]
         self.fence = Fence(closed=bool(entry.third_party()))
         self.envs = build_envs(entry, self.S * self.E, self._tick, self.fence)
+        require_actions(entry, self.envs.single_action_space)
         size = int(np.prod(self.envs.single_observation_space.shape or (1,)))
         self.statistics: RunningStatistics | None = None
         if self.envs.inner.running_statistics:
             self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
-        self.models = ModelBuilder(entries, size, self.streams, self.statistics, self.fence)
+        self.models = ModelBuilder(entries, self.envs, self.streams, self.statistics, self.fence)
         with _building(entry.algorithm):
             factory = specs.resolve(entry.algorithm.factory)
             own_options = population.joined([each.algorithm_options for each in entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
+        self._informed = asks_for_more(self.algorithm.act)
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:
@@ -514,14 +609,38 @@ class Trainer:
         self._require_scores(episodes.scores)
         return episodes
 
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (S * L,) for observations (S * L, ...) of seed-major lanes."""
+    def act(
+        self,
+        observations: NDArray[np.float32],
+        begins: NDArray[np.bool_] | None = None,
+        infos: Infos | None = None,
+    ) -> NDArray[Any]:
+        """Return the greedy actions (S * L, ...) for observations (S * L, ...) of seed-major lanes.
+
+        Parameters
+        ----------
+        begins:
+            Where an episode begins with the observation (S * L,).
+        infos:
+            What the lanes said of it.
+
+        Raises
+        ------
+        ValueError
+            If the algorithm asks where episodes begin, and `begins` is absent.
+        """
         stacked = np.ascontiguousarray(observations, np.float32)
+        seen = stacked.reshape(self.S, len(stacked) // self.S, -1)
+        more: tuple[Any, ...] = ()
+        if self._informed:
+            if begins is None:
+                raise ValueError(
+                    f"algorithm '{self.entry.algorithm.name}' remembers episodes: give act() where they begin"
+                )
+            more = begins.reshape(seen.shape[:2]), _by_seed(infos or {}, *seen.shape[:2])
         with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
-            actions: NDArray[np.int64] = self.algorithm.act(
-                stacked.reshape(self.S, len(stacked) // self.S, -1)
-            )
-        return actions.reshape(-1)
+            actions: NDArray[Any] = self.algorithm.act(seen, *more)
+        return actions.reshape(len(stacked), *(self.envs.single_action_space.shape or ()))
 
     def _called(self) -> str:
         """Name what is called in an epoch: a generator that a single call moves is said of that call, see `Fence`."""
@@ -539,6 +658,16 @@ class Trainer:
                 f"environment '{self.entry.task.environment.name}': a validation episode has the score {outside[0]:g}, "
                 "outside [0, 1]: is score.max_return in the task file the best possible return, and none negative?"
             )
+
+
+def _by_seed(infos: Infos, seeds: int, lanes: int) -> dict[str, NDArray[Any]]:
+    """Return what lanes say of their observations (S * L, ...) by seed (S, L, ...)."""
+    return {
+        name: value.reshape(seeds, lanes, *value.shape[1:])
+        for name, value in infos.items()
+        if isinstance(value, np.ndarray) and not name.startswith(("_", "final_"))
+        if value.shape[:1] == (seeds * lanes,)
+    }
 
 
 def _part(arrays: Arrays, prefix: str) -> Arrays:

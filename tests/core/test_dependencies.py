@@ -18,8 +18,8 @@ FOLDERS = {
     "qrlsuite.leaderboard": ROOT / "leaderboard",
 }
 TOP = {
-    "algorithm", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization", "notation", "options",
-    "population", "registry", "seeding", "specs",
+    "actions", "algorithm", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization", "notation",
+    "options", "population", "registry", "seeding", "specs",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""
 

@@ -201,13 +201,13 @@ class Push(LaneEnv):
         return np.zeros((self.num_envs, 1), np.float32), {}
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, object]]:
-        assert actions.shape == (self.num_envs,)
+        assert actions.shape == (self.num_envs, 1)
         ended = np.ones(self.num_envs, bool)
-        return np.zeros((self.num_envs, 1), np.float32), actions.astype(float), ended, ~ended, {}
+        return np.zeros((self.num_envs, 1), np.float32), actions[:, 0].astype(float), ended, ~ended, {}
 
 
 def hardest(envs: LaneEnv) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda observations: np.full(envs.num_envs, 3.0)
+    return lambda observations: np.full((envs.num_envs, 1), 3.0)
 
 
 def test_actions_need_not_be_discrete(walk: Entry) -> None:
@@ -224,7 +224,8 @@ def test_actions_need_not_be_discrete(walk: Entry) -> None:
     again = evaluation.references(entry, episodes=200)[1]
     assert (again.returns == random.returns).all()
     with pytest.raises(
-        OptionError, match=r"the actions of environment 'gym' are Box\(2.0, 3.0.*not discrete"
+        OptionError,
+        match=r"'reinforce' takes discrete actions, and those of environment 'gym' are Box\(2.0, 3.0",
     ):
         count_parameters(entry)
 
@@ -237,7 +238,7 @@ def test_a_third_partys_policy_is_looked_at(tiny_task: str) -> None:
     entry = resolve(tiny_task, "mlp")
     task = load(tiny_task)
     task.environment = replace(entry.task.environment, policies={"odd": f"{__name__}:too_many"})
-    with pytest.raises(PluginError, match=r"reference policy 'odd' gave .* integers in 0\.\.2"):
+    with pytest.raises(PluginError, match=r"reference policy 'odd': actions must lie in 0\.\.2, not 7\.\.7"):
         evaluation.references(replace(entry, task=task), episodes=3)
 
 

@@ -143,8 +143,7 @@ def test_names_of_tasks_without_a_file_are_names() -> None:
     ("env_id", "message"),
     [
         ("Acrobat-v1", "knows no environment 'Acrobat-v1'; did you mean 'Acrobot-v1'"),
-        ("Pendulum-v1", "only discrete actions are supported"),
-        ("Blackjack-v1", "only boxes and discrete observations are supported"),
+        (f"{HERE}:Unbounded-v0", "has no bounds: state finite ones"),
         ("", "knows no environment ''"),
     ],
 )
@@ -173,10 +172,10 @@ def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
     summary = json.loads(done.stdout)
     assert (summary["task"], summary["seeds"], summary["epochs"]) == ("gym-frozenlake-v1", 2, 2)
     assert 0 <= summary["median_score"] <= 1
-    wrong = cli("run", "--task", "gym:Pendulum-v1", "--model", "mlp", "--runs", "tmp", cwd=tmp_path)
+    wrong = cli("run", "ddqn mlp", "--task", "gym:Pendulum-v1", "--seeds", "1", "--runs", "tmp", cwd=tmp_path)
     assert wrong.returncode == 2
     assert len(wrong.stderr.strip().splitlines()) == 1
-    assert "only discrete actions are supported" in wrong.stderr
+    assert "'ddqn' takes discrete actions, and those of environment 'gym' are Box(-2.0, 2.0" in wrong.stderr
 
 
 TASK = """

@@ -14,20 +14,37 @@ HERE = "tests.environments.strangers"
 
 
 class Walk(gymnasium.Env[Any, Any]):
-    """A random walk of random length; what it shows depends on `kind`, and `start` shifts its actions."""
+    """A random walk of random length.
 
-    def __init__(self, kind: str = "box", start: int = 0, scored: bool = True) -> None:
+    What it shows depends on `kind`, what it takes on `acts`; `start` shifts its actions. With `masked`, action 0 cannot
+    be chosen at even steps, and with `masked = "all"` none ever.
+    """
+
+    def __init__(
+        self, kind: str = "box", start: int = 0, scored: bool = True, acts: str = "discrete", masked: str = ""
+    ) -> None:
         self.kind = kind
         self.scored = scored
-        self.action_space: Any = spaces.Discrete(3, start=start)
+        self.masked = masked
+        self.action_space: Any = {
+            "discrete": spaces.Discrete(3, start=start),
+            "multi-discrete": spaces.MultiDiscrete([3, 2], start=[start, 0]),
+            "multi-binary": spaces.MultiBinary(3),
+            "box": spaces.Box(np.array([[-1, 0]], np.float32), np.array([[1, 4]], np.float32)),
+            "doubles": spaces.Box(-1, 1, (), np.float64),
+            "unbounded": spaces.Box(-np.inf, 1, (2,)),
+            "whole": spaces.Box(0, 9, (2,), np.int64),
+            "several": spaces.Tuple([spaces.Discrete(2), spaces.Discrete(3)]),
+        }[acts]
         self.observation_space: Any = {
             "box": spaces.Box(-10, 10, (2, 2), np.float64),
             "image": spaces.Box(0, 255, (2, 2), np.uint8),
             "discrete": spaces.Discrete(5, start=1),
             "binary": spaces.MultiBinary(3),
             "multi": spaces.MultiDiscrete([2, 3]),
-            "dict": spaces.Dict(a=spaces.Discrete(2)),
-            "tuple": spaces.Tuple([spaces.Discrete(2)]),
+            "dict": spaces.Dict(b=spaces.Discrete(2), a=spaces.Box(-1, 1, (2, 2))),
+            "tuple": spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1,))]),
+            "sequence": spaces.Sequence(spaces.Discrete(2)),
         }[kind]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
@@ -35,15 +52,19 @@ class Walk(gymnasium.Env[Any, Any]):
         self.length = int(self.np_random.integers(3, 12))
         self.steps = 0
         self.position = float(self.np_random.normal())
-        return self._observe(), {}
+        return self._observe(), self._info()
+
+    def _info(self) -> dict[str, Any]:
+        mask = np.array([self.steps % 2, 1, 1], np.int8) * (self.masked != "all")
+        return {"action_mask": mask} if self.masked else {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         assert action in self.action_space, action
         self.steps += 1
-        self.position += float(self.np_random.normal()) + float(action)
+        self.position += float(self.np_random.normal()) + float(np.sum(action))
         ended = self.steps == self.length
         info = {"score": self.steps / 12} if ended and self.scored else {}
-        return self._observe(), self.position, ended, False, info
+        return self._observe(), self.position, ended, False, {**info, **self._info()}
 
     def _observe(self) -> Any:
         return {
@@ -52,8 +73,9 @@ class Walk(gymnasium.Env[Any, Any]):
             "discrete": 1 + self.steps % 5,
             "binary": np.array([self.steps & 1, self.steps >> 1 & 1, self.steps >> 2 & 1], np.int8),
             "multi": np.array([self.steps % 2, self.steps % 3]),
-            "dict": {"a": 0},
-            "tuple": (0,),
+            "dict": {"b": 1, "a": np.full((2, 2), self.steps / 20, np.float32)},
+            "tuple": (self.steps % 2, np.ones(1, np.float32)),
+            "sequence": (),
         }[self.kind]
 
 
@@ -133,3 +155,4 @@ for name, limit in [
 ]:
     gymnasium.register(f"{name}-v0", f"{HERE}:{name}", max_episode_steps=limit, disable_env_checker=True)
 gymnasium.register("Cut-v0", f"{HERE}:Endless", max_episode_steps=4, disable_env_checker=True)
+gymnasium.register("Unbounded-v0", f"{HERE}:Walk", kwargs={"acts": "unbounded"}, disable_env_checker=True)

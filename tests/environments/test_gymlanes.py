@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
+from qrlsuite import actions as action_spaces
 from qrlsuite.errors import EnvironmentFailure, OptionError, StoreError
 from qrlsuite.gymlanes import SEEDS, UNLIMITED, GymLanes
 from qrlsuite.options import build
@@ -147,6 +148,8 @@ def test_scores_come_from_info_where_there_are_any() -> None:
         ("multi", 5, [1, 0, 1, 0, 0]),
         ("image", 4, [0, 0, 0, 0]),
         ("box", 4, None),
+        ("dict", 6, [0, 1, 0, 0, 0, 0]),
+        ("tuple", 3, [1, 0, 1]),
     ],
 )
 def test_observations_are_flattened(kind: str, size: int, first: list[int] | None) -> None:
@@ -155,6 +158,7 @@ def test_observations_are_flattened(kind: str, size: int, first: list[int] | Non
     assert observations.dtype == np.float32
     assert observations.shape == (2, size)
     assert env.single_observation_space.shape == (size,)
+    assert env.unflattened_space == gymnasium.make(WALK, kind=kind).observation_space
     assert observations in env.observation_space
     if first is not None:
         np.testing.assert_array_equal(observations[0], first)
@@ -172,11 +176,87 @@ def test_actions_count_from_zero_also_where_the_environments_do_not() -> None:
     assert difference[0] == pytest.approx(5)
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Acrobot-v1", "FrozenLake-v1", WALK])
-def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str) -> None:
-    straight, stopped = lanes(env_id, 4), lanes(env_id, 4)
-    choices = int(straight.single_action_space.n)  # type: ignore[attr-defined]
-    actions = np.random.default_rng(2).integers(0, choices, (75, 4))
+ACTS = ("multi-discrete", "multi-binary", "box", "doubles")
+
+
+@pytest.mark.parametrize("acts", ACTS)
+def test_an_action_has_the_shape_and_type_of_its_space(acts: str) -> None:
+    """The environment gets each lane's action, counted from where its own space begins."""
+    env, one = lanes(WALK, 2, acts=acts, start=4), gymnasium.make(WALK, acts=acts, start=4)
+    stream = np.random.default_rng(1)
+    stream.integers(SEEDS, size=0)
+    env.reset()
+    one.reset(seed=int(stream.integers(SEEDS)))
+    offset = np.array([4, 0]) if acts == "multi-discrete" else 0
+    space = env.single_action_space
+    for given in action_spaces.draw(space, np.random.default_rng(3), 2, 2):
+        assert given.shape == (2, *(space.shape or ()))
+        assert given.dtype == space.dtype
+        rewards = env.step(given)[1]
+        assert rewards[1] == one.step(np.asarray(given[1] + offset, space.dtype))[1]
+
+
+@pytest.mark.parametrize(
+    ("acts", "given", "message"),
+    [
+        (
+            "multi-discrete",
+            np.zeros(2, np.int64),
+            r"must be 2 integers of shape \(2,\) each, not int64 of .*\(2,\)",
+        ),
+        ("multi-discrete", np.array([[0, 2], [0, 0]]), r"must lie in 0..1, not 0..2"),
+        ("multi-binary", np.array([[0, 2, 0]] * 2), r"must lie in 0..1, not 0..2"),
+        ("box", np.zeros((2, 1, 2), np.int64), r"must be 2 numbers of shape \(1, 2\) each, not int64"),
+        ("box", np.full((2, 1, 2), 1.5), r"must lie in -1..1, not 1.5: qrlsuite.actions.from_units maps"),
+        ("box", np.full((2, 1, 2), np.nan), r"must lie in -1..1, not nan"),
+    ],
+)
+def test_actions_that_are_none_of_the_space(acts: str, given: Any, message: str) -> None:
+    env = lanes(WALK, 2, acts=acts)
+    env.reset()
+    before = env.state_dict()
+    with pytest.raises(InvalidAction, match=message):
+        env.step(given)
+    np.testing.assert_array_equal(env.state_dict()["actions"], before["actions"])
+
+
+def test_numbers_between_minus_one_and_one_become_actions_of_a_box() -> None:
+    space = gymnasium.spaces.Box(np.array([[-1, 0]], np.float32), np.array([[1, 4]], np.float32))
+    units = np.array([[-1, -1], [1, 1], [0, 0.5], [9, -9], [np.nan, np.nan]], np.float32)
+    actions = action_spaces.from_units(units, space)
+    assert actions.tolist() == [[[-1, 0]], [[1, 4]], [[0, 3]], [[1, 0]], [[0, 2]]]
+    assert actions.dtype == np.float32
+
+
+def test_masks_are_those_of_the_observations_that_are_returned() -> None:
+    env = lanes(WALK, 3, masked="some")
+    _, infos = env.reset()
+    steps = np.zeros(3, np.int64)
+    for _ in range(30):
+        np.testing.assert_array_equal(infos["action_mask"][:, 0], steps % 2)
+        assert infos["action_mask"].shape == (3, 3)
+        _, _, terminated, _, infos = env.step(np.ones(3, np.int64))
+        steps = np.where(terminated, 0, steps + 1)
+    with pytest.raises(
+        EnvironmentFailure, match=r"info\['action_mask'\] leaves no action, and the episode goes on"
+    ):
+        lanes(WALK, 1, masked="all").reset()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "acts"),
+    [
+        ("CartPole-v1", ""),
+        ("Acrobot-v1", ""),
+        ("FrozenLake-v1", ""),
+        (WALK, ""),
+        *((WALK, acts) for acts in ACTS),
+    ],
+)
+def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str, acts: str) -> None:
+    more = {"acts": acts} if acts else {}
+    straight, stopped = lanes(env_id, 4, **more), lanes(env_id, 4, **more)
+    actions = action_spaces.draw(straight.single_action_space, np.random.default_rng(2), 75, 4)
     straight.reset()
     stopped.reset()
     for row in actions[:40]:
@@ -186,7 +266,7 @@ def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str) -> None
     assert all(len(values) == 4 for values in state.values())
     halves = []
     for part in (slice(0, 2), slice(2, 4)):
-        half = GymLanes(env_id, 2)
+        half = GymLanes(env_id, 2, more)
         half.seed_lanes(stopped.streams[part])
         half.load_state_dict({name: values[part].copy() for name, values in state.items()})
         halves.append((half, part))
@@ -265,9 +345,22 @@ def test_states_that_do_not_fit(change: dict[str, Any], message: str) -> None:
         ("Acrobat-v1", {}, "Gymnasium knows no environment 'Acrobat-v1'; did you mean 'Acrobot-v1'"),
         ("Zzz", {}, r"no environment 'Zzz'; gymnasium.pprint_registry\(\) lists"),
         ("nowhere.at.all:X-v0", {}, "module 'nowhere.at.all' cannot be imported: ModuleNotFoundError"),
-        ("Pendulum-v1", {}, r"action space Box\(-2.0, 2.0, \(1,\), float32\): only discrete actions"),
-        (WALK, {"kind": "dict"}, r"observation space Dict\('a': Discrete\(2\)\): only boxes and discrete"),
-        (WALK, {"kind": "tuple"}, r"observation space Tuple\(Discrete\(2\)\): only boxes and discrete"),
+        (
+            WALK,
+            {"acts": "unbounded"},
+            r"the action space Box\(-inf, 1.0, .* has no bounds: state finite ones",
+        ),
+        (
+            WALK,
+            {"acts": "whole"},
+            r"action space Box\(0, 9, .* is not supported: use Discrete, MultiDiscrete, ",
+        ),
+        (WALK, {"acts": "several"}, r"action space Tuple\(Discrete\(2\), .* is not supported"),
+        (
+            WALK,
+            {"kind": "sequence"},
+            r"observation space Sequence\(.*, which has no fixed number of values: wrap it",
+        ),
         (f"{HERE}:Unmade-v0", {}, "needs a package that is not installed: pip install no_such_package"),
         (WALK, {"colour": "red"}, r"cannot be made with {'colour': 'red'}: TypeError: .*'colour'"),
     ],
