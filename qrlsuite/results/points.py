@@ -1,0 +1,332 @@
+"""Points of learning curves that other programs wrote: csv files, tables, arrays, and the files of `run_files`.
+
+Points are the environment steps and scores of the runs of entries. A csv file or a table names entry and seed in every
+row. Other files hold a run each, and its path names it: the run's number is the seed, and what differs between the
+paths of several runs is the entry. `logs/small/seed-3/evaluations.npz` is seed 3 of `small`.
+"""
+
+from __future__ import annotations
+
+import array
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow
+from numpy.typing import ArrayLike, NDArray
+
+from qrlsuite.errors import FileError, OptionError, listed
+from qrlsuite.experiment.preset import TUNING_SEEDS
+from qrlsuite.results import run_files
+from qrlsuite.results.genuine import require_plain
+from qrlsuite.results.run_files import MOST_POINTS, cells_of, lines_of, whole
+
+COLUMNS = ("entry", "seed", "step", "score")
+"""Columns of a csv file or a table."""
+
+Run = tuple[str, int]
+"""An entry's name and a seed."""
+
+_LONGEST_NAME = 80
+
+
+@dataclass(frozen=True)
+class Points:
+    """What was observed of one run.
+
+    Attributes
+    ----------
+    steps:
+        (K,) int64: environment steps since training began, increasing, 1 or more.
+    scores:
+        (K,) float64, finite.
+    source:
+        Where they were read, for messages.
+    """
+
+    steps: NDArray[np.int64]
+    scores: NDArray[np.float64]
+    source: str
+
+
+class _Rows:
+    """Collects points of runs, and refuses what is not a curve."""
+
+    def __init__(self) -> None:
+        self._runs: dict[Run, tuple[array.array[int], array.array[float], str]] = {}
+        self._count = 0
+
+    def add(self, entry: str, seed: int, step: int, score: float, source: str) -> None:
+        """Add a point.
+
+        Raises
+        ------
+        FileError
+            If it is none: a score that is not finite, a name or seed that none can have. Or there are too many.
+        """
+        if not math.isfinite(score):
+            raise FileError(
+                f"{source}: the score of '{ascii(entry)[1:-1]}', seed {seed}, at step {step} is {score}: every score "
+                "is a finite number; where training failed, write the score that its agent had"
+            )
+        self._count += 1
+        if self._count > MOST_POINTS:
+            raise FileError(f"{source}: more than {MOST_POINTS:,} points: import fewer files at once")
+        if (entry, seed) not in self._runs:
+            _require_run(entry, seed, source)
+            self._runs[entry, seed] = array.array("q"), array.array("d"), source
+        steps, scores, _ = self._runs[entry, seed]
+        steps.append(step)
+        scores.append(score)
+
+    def points(self) -> dict[Run, Points]:
+        """Return the points of every run; one at step 0, before training, is left out.
+
+        Raises
+        ------
+        FileError
+            If steps do not increase, or there is no point.
+        """
+        found = {}
+        for (entry, seed), (steps, scores, source) in self._runs.items():
+            at, values = np.array(steps, np.int64), np.array(scores, np.float64)
+            _require_increasing(at, f"{source}: '{entry}', seed {seed}")
+            if at[-1] > 0:
+                found[entry, seed] = Points(at[at > 0], values[at > 0], source)
+        if not found:
+            raise FileError("there is no score after step 0: nothing was imported")
+        return found
+
+
+def _require_increasing(steps: NDArray[np.int64], run: str) -> None:
+    if steps[0] < 0:
+        raise FileError(f"{run}: step {steps[0]} is negative")
+    wrong = np.flatnonzero(np.diff(steps) <= 0)
+    if not len(wrong):
+        return
+    before, after = steps[wrong[0]], steps[wrong[0] + 1]
+    if after in steps[: wrong[0] + 1]:
+        raise FileError(f"{run}: step {after} is there twice: give every run a seed of its own")
+    raise FileError(
+        f"{run}: step {after} follows step {before}: steps count from the beginning of training, so sort the rows"
+    )
+
+
+def _require_run(entry: str, seed: int, source: str) -> None:
+    """Refuse names that cannot be an entry's, and numbers that cannot be a seed's."""
+    if not entry or len(entry) > _LONGEST_NAME or not entry.isprintable() or {"/", "\\"} & set(entry):
+        raise FileError(
+            f"{source}: entry {ascii(entry)[:100]}: a name is one line of 1 to {_LONGEST_NAME} characters, without "
+            "slashes"
+        )
+    require_plain(source, entry)
+    if not 0 <= seed < TUNING_SEEDS:
+        raise FileError(
+            f"{source}: seed {seed} of '{entry}': number the runs of an entry 0, 1, 2, ..., below {TUNING_SEEDS:,}"
+        )
+
+
+def read_files(paths: Sequence[Path], metric: str | None = None) -> dict[Run, Points]:
+    """Read files of one kind or of several.
+
+    Parameters
+    ----------
+    metric:
+        What the score is called: a column of csv files (default: `score`), a scalar of TensorBoard or W&B (default:
+        the first of `run_files.METRICS` that is there).
+
+    Returns
+    -------
+    dict
+        The points of each run.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read, is of no known kind, or holds what is no learning curve.
+    """
+    rows, of_runs = _Rows(), list[Path]()
+    for path in dict.fromkeys(paths):
+        if run_files.holds_one_run(path):
+            of_runs.append(path)
+        else:
+            _read_csv(path, rows, metric)
+    for (entry, seed), files in _named(of_runs).items():
+        for step, score in run_files.read(files, metric):
+            rows.add(entry, seed, step, score, str(files[0]))
+    return rows.points()
+
+
+def _read_csv(path: Path, rows: _Rows, metric: str | None) -> None:
+    content = cells_of(path, lines_of(path))
+    _, head = next(content, (0, list[str]()))
+    names = [name.strip() for name in head]
+    places = [names.index(name) for name in _columns(names, metric, str(path))]
+    for line, cells in content:
+        if len(cells) != len(names):
+            raise FileError(f"{path}, line {line}: {len(cells)} cells, and {len(names)} in the first line")
+        _add_row(rows, [cells[place].strip() for place in places], str(path), f"line {line}")
+
+
+def read_table(table: Any, metric: str | None = None) -> dict[Run, Points]:
+    """Read an Arrow table or a data frame with the columns entry, seed, step and score.
+
+    Parameters
+    ----------
+    table:
+        What `pyarrow.table` takes: a table, a data frame of pandas or polars.
+    metric:
+        The column that is the score.
+
+    Raises
+    ------
+    OptionError
+        If it is no table.
+    FileError
+        As for `read_files`.
+    """
+    try:
+        arrow = table if isinstance(table, pyarrow.Table) else pyarrow.table(table)
+    except (TypeError, ValueError, pyarrow.ArrowException):
+        raise OptionError(
+            f"curves of type {type(table).__name__}: give files, {{entry: (seeds, points)}}, an Arrow table or a data "
+            "frame"
+        ) from None
+    wanted, rows, number = list(_columns(arrow.column_names, metric, "the table")), _Rows(), 0
+    for batch in arrow.select(wanted).to_batches(max_chunksize=100_000):
+        for values in zip(*(column.to_pylist() for column in batch.columns)):
+            number += 1
+            _add_row(rows, values, "the table", f"row {number}")
+    return rows.points()
+
+
+def read_arrays(curves: Mapping[str, tuple[Iterable[int], ArrayLike]], steps: ArrayLike) -> dict[Run, Points]:
+    """Read arrays: by entry (N,) seeds and (N, K) scores.
+
+    Parameters
+    ----------
+    steps:
+        (K,) environment steps of the scores.
+
+    Raises
+    ------
+    OptionError
+        If shapes do not fit.
+    FileError
+        As for `read_files`.
+    """
+    at, rows = np.asarray(steps), _Rows()
+    if at.ndim != 1 or at.dtype.kind not in "iu":
+        raise OptionError(f"steps: give whole numbers of shape (points,), not {at.dtype} of shape {at.shape}")
+    for entry, content in curves.items():
+        try:
+            numbers, points = content
+            seeds, scores = (
+                [whole(seed) for seed in np.asarray(numbers).tolist()],
+                np.asarray(points, np.float64),
+            )
+        except (TypeError, ValueError) as error:
+            raise OptionError(f"curves[{entry!r}]: give (seeds, points): {error}") from None
+        if scores.shape != (len(seeds), len(at)):
+            raise OptionError(
+                f"curves[{entry!r}]: points of shape {scores.shape}, and {len(seeds)} seeds at {len(at)} steps have "
+                f"({len(seeds)}, {len(at)})"
+            )
+        for seed, curve in zip(seeds, scores.tolist()):
+            for step, score in zip(at.tolist(), curve):
+                rows.add(str(entry), seed, step, score, f"curves[{entry!r}]")
+    return rows.points()
+
+
+def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str, ...]:
+    """Return the names of the four columns.
+
+    Raises
+    ------
+    FileError
+        If one is missing, or there twice.
+    """
+    wanted = (*COLUMNS[:3], metric or COLUMNS[3])
+    wrong = [name for name in wanted if list(names).count(name) != 1]
+    if wrong:
+        here = listed([ascii(name)[1:-1][:40] for name in names]) or "none"
+        other = "; --metric NAME reads another column as the score" if wrong == [COLUMNS[3]] else ""
+        raise FileError(f"{source}: expected the columns {', '.join(wanted)}, each once; found {here}{other}")
+    return wanted
+
+
+def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str) -> None:
+    """Add a row of four values.
+
+    Raises
+    ------
+    FileError
+        If one is missing or no number.
+    """
+    for name, value in zip(COLUMNS, values):
+        if value is None or value == "":
+            raise FileError(
+                f"{source}, {place}: no {name}: every row has an entry, a seed, a step and a score"
+            )
+    entry, seed, step, score = values
+    try:
+        numbers = whole(seed), whole(step), float(score)
+    except (ValueError, TypeError, OverflowError):
+        texts = ", ".join(ascii(value)[:30] for value in values)
+        raise FileError(
+            f"{source}, {place}: {texts}: seed and step are whole numbers, and the score is a number"
+        ) from None
+    rows.add(str(entry).strip(), *numbers, source)
+
+
+_SEED = re.compile(r".*(?<![a-z])seed[-_ =]*(\d+)(?!\d).*|.*?(\d+)", re.IGNORECASE | re.DOTALL)
+_BEFORE = re.compile(r"[-_ =.]*(seed|run)?[-_ =.]*$", re.IGNORECASE)
+
+
+def _named(paths: Sequence[Path]) -> dict[Run, list[Path]]:
+    """Return files by the run that they are of.
+
+    Raises
+    ------
+    FileError
+        If a run's name has no number, or two runs have one name.
+    """
+    of_folders: dict[tuple[str, ...], list[Path]] = defaultdict(list)
+    for path in paths:
+        of_folders[run_files.words(path)].append(path)
+    words_of: dict[tuple[str, ...], tuple[list[str], int]] = {}
+    for key, files in of_folders.items():
+        *above, run = key
+        found = _SEED.fullmatch(run)
+        if found is None:
+            raise FileError(
+                f"{files[0]}: which seed is '{ascii(run)[1:-1]}'? Call the folders of runs ENTRY/seed-0, ENTRY/seed-1, "
+                f"..., or write a csv file with the columns {','.join(COLUMNS)}"
+            )
+        group = 1 if found[1] else 2
+        words_of[key] = [*above, _BEFORE.sub("", run[: found.start(group)])], int(found[group])
+    return _by_difference(of_folders, words_of)
+
+
+def _by_difference(
+    files: Mapping[tuple[str, ...], list[Path]], words_of: Mapping[tuple[str, ...], tuple[list[str], int]]
+) -> dict[Run, list[Path]]:
+    """Name entries by the words that differ between runs, or by the last word of all."""
+    longest = max((len(words) for words, _ in words_of.values()), default=0)
+    padded = {key: [""] * (longest - len(words)) + words for key, (words, _) in words_of.items()}
+    differing = [place for place, words in enumerate(zip(*padded.values())) if len(set(words)) > 1]
+    found: dict[Run, list[Path]] = {}
+    for key, words in padded.items():
+        own = [words[place] for place in differing if words[place]] or [word for word in words if word][-1:]
+        run = " ".join(own), words_of[key][1]
+        if run in found:
+            raise FileError(
+                f"{found[run][0]} and {files[key][0]} are both seed {run[1]} of '{run[0]}' by their paths"
+            )
+        found[run] = files[key]
+    return found

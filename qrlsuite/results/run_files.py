@@ -1,0 +1,367 @@
+"""Files that hold the learning curve of one run: of Stable-Baselines3, TensorBoard and W&B.
+
+No file is unpickled, and how much one may hold is bounded before it is read.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import io
+import json
+import math
+import os
+import subprocess
+import sys
+import zipfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrlsuite.errors import FileError, listed
+
+METRICS = ("eval/mean_reward", "rollout/ep_rew_mean", "charts/episodic_return", "score")
+"""Scalars that are read as the score, the first of them that a file has, where none is named: those of
+Stable-Baselines3's evaluations and training, and of CleanRL."""
+
+MOST_BYTES = 1_000_000_000
+"""Bytes of a file that is read at once, packed or unpacked, at most."""
+
+MOST_POINTS = 20_000_000
+"""Points of one import, at most."""
+
+WINDOW = 100
+"""Episodes over which training returns are averaged, as Stable-Baselines3 does (`stats_window_size`)."""
+
+_LONGEST_LINE = 1_000_000
+_NOT_FINITE = ("NaN", "Infinity", "-Infinity")
+
+Curve = Iterable[tuple[int, float]]
+"""Environment steps and scores, in order."""
+
+
+def holds_one_run(path: Path) -> bool:
+    """Return whether a file holds one run; a csv file may hold many.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read, is too large, or is of no known kind.
+    """
+    try:
+        if path.is_dir():
+            raise FileError(
+                f"{path} holds no entry of this suite; to import curves that other programs wrote, name their files, "
+                f"such as {path}/*/*/evaluations.npz"
+            )
+        size = path.stat().st_size
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
+    if size > MOST_BYTES and not _streamed(path):
+        raise FileError(f"{path}: larger than {MOST_BYTES // 10**6} MB")
+    if _kind(path) is not None:
+        return True
+    if not path.name.endswith(".csv"):
+        raise FileError(
+            f"{path}: give a csv file with the columns entry,seed,step,score; monitor.csv or evaluations.npz of "
+            "Stable-Baselines3; events.out.tfevents.* of TensorBoard; or run-*.wandb of W&B"
+        )
+    return False
+
+
+def words(path: Path) -> tuple[str, ...]:
+    """Return what names the run of a file: words that may name its entry, and at last the run's own name.
+
+    These are the folders of its path, and the last of them is the run, unless the file has a name of its own. W&B's
+    files say project, group and name, and may have the seed in their configuration.
+    """
+    if _kind(path) is _wandb:
+        return _words_of_wandb(path)
+    place = path.absolute()
+    named_by_itself = _kind(path) is _evaluations and path.name != "evaluations.npz"
+    run = place.with_suffix("") if named_by_itself else place.parent
+    return (*run.parent.parts[1:], run.name)
+
+
+def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
+    """Read the files of one run.
+
+    Parameters
+    ----------
+    metric:
+        The scalar of TensorBoard or W&B that is the score.
+
+    Raises
+    ------
+    FileError
+        If one is damaged, of another kind than the others, or does not hold a learning curve.
+    """
+    kinds = {_kind(path) for path in paths}
+    reader = _kind(paths[0])
+    if len(kinds) > 1 or reader is None or (reader is _evaluations and len(paths) > 1):
+        names = listed([path.name for path in paths])
+        raise FileError(f"{paths[0].parent}: {names} are of one run: name one of them")
+    if metric is not None and not _streamed(paths[0]):
+        raise FileError(f"{paths[0]}: --metric {metric}: files of Stable-Baselines3 have one score")
+    return reader(paths, metric)
+
+
+def _kind(path: Path) -> Callable[[Sequence[Path], str | None], Curve] | None:
+    """Return what reads a file of one run, None for any other."""
+    name = path.name
+    if ".tfevents." in name:
+        return _tensorboard
+    if name.endswith(".wandb"):
+        return _wandb
+    if name.endswith(".npz"):
+        return _evaluations
+    return _monitor if name == "monitor.csv" or name.endswith(".monitor.csv") else None
+
+
+def _streamed(path: Path) -> bool:
+    """Return whether a file is read bit by bit, and may have any length."""
+    return _kind(path) in (_tensorboard, _wandb)
+
+
+def whole(value: Any) -> int:
+    """Return a whole number, also of text such as 1000 or 1000.0.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or larger than a number of steps can be.
+    """
+    number = value if isinstance(value, int) and not isinstance(value, bool) else float(value)
+    if not math.isfinite(number) or number != int(number) or abs(number) >= 2**53:
+        raise ValueError(f"{value!r} is not a whole number")
+    return int(number)
+
+
+def lines_of(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read, is no text, or has a line that no csv file has.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            while line := file.readline(_LONGEST_LINE):
+                if len(line) == _LONGEST_LINE:
+                    raise FileError(f"{path}: a line of it has {_LONGEST_LINE:,} characters or more")
+                yield line
+    except UnicodeDecodeError:
+        raise FileError(f"{path} is not text (UTF-8)") from None
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
+
+
+def cells_of(path: Path, lines: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of every line of a csv file that is not empty."""
+    reader = csv.reader(lines)
+    try:
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                yield reader.line_num, cells
+    except csv.Error as error:
+        raise FileError(f"{path}, line {reader.line_num}: {error}") from None
+
+
+def _monitor(paths: Sequence[Path], metric: str | None) -> Curve:
+    """Yield the mean return of the last episodes at the end of each; episodes of several environments by their time."""
+    episodes = [episode for path in paths for episode in _episodes(path)]
+    episodes.sort(key=lambda episode: episode[0])  # stable: those of one environment keep their order
+    recent: deque[float] = deque(maxlen=WINDOW)
+    steps = 0
+    for _, length, reward in episodes:
+        steps += length
+        recent.append(reward)
+        yield steps, math.fsum(recent) / len(recent)
+
+
+def _episodes(path: Path) -> Iterator[tuple[float, int, float]]:
+    """Yield the end, the length and the return of every episode of a monitor file."""
+    lines = lines_of(path)
+    try:
+        started = float(json.loads(next(lines, "").removeprefix("#"))["t_start"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise FileError(f'{path}: a monitor file begins with #{{"t_start": ...}}') from None
+    content = cells_of(path, lines)
+    _, names = next(content, (0, list[str]()))
+    if not {"r", "l", "t"} <= set(names):
+        raise FileError(
+            f"{path}: expected the columns r, l, t; found {listed([ascii(n)[1:-1] for n in names]) or 'none'}"
+        )
+    for line, cells in content:
+        try:
+            reward, length, time = (cells[names.index(name)] for name in "rlt")
+            episode = started + float(time), whole(length), float(reward)
+        except (ValueError, IndexError, OverflowError):
+            raise FileError(
+                f"{path}, line {line + 1}: not an episode: {ascii(','.join(cells))[:80]}"
+            ) from None
+        if episode[1] < 1:
+            raise FileError(f"{path}, line {line + 1}: an episode of {episode[1]} steps")
+        yield episode
+
+
+def _evaluations(paths: Sequence[Path], metric: str | None) -> Curve:
+    """Return the mean return of the episodes of each evaluation."""
+    path = paths[0]
+    steps, results = (_npz_array(path, name) for name in ("timesteps", "results"))
+    if steps.ndim != 1 or results.ndim != 2 or len(results) != len(steps) or not results.shape[1]:
+        raise FileError(
+            f"{path}: timesteps of shape {steps.shape} and results of shape {results.shape}; expected (evaluations,) "
+            "and (evaluations, episodes)"
+        )
+    if steps.dtype.kind not in "iu" or results.dtype.kind not in "iuf":
+        raise FileError(f"{path}: timesteps are {steps.dtype} and results {results.dtype}; expected numbers")
+    return zip(steps.tolist(), results.astype(np.float64).mean(axis=1).tolist())
+
+
+def _npz_array(path: Path, name: str) -> NDArray[Any]:
+    """Return an array of an npz file; its size is known before it is unpacked.
+
+    Raises
+    ------
+    FileError
+        If it is not there, is damaged or too large, or holds Python objects.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            here = archive.namelist()
+            if f"{name}.npy" not in here:
+                names = listed([ascii(each)[1:-1][:40] for each in here]) or "none"
+                raise FileError(
+                    f"{path}: expected the arrays timesteps and results, as EvalCallback writes them; found {names}"
+                )
+            size = archive.getinfo(f"{name}.npy").file_size
+            if size > 8 * MOST_POINTS:
+                raise FileError(f"{path}: {name} unpacks to {size:,} bytes: refused")
+            with archive.open(f"{name}.npy") as file:
+                content = file.read(size + 1)
+        _require_size(io.BytesIO(content), len(content), f"{path}: {name}")
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise FileError(f"{path} is not a readable npz file: {' '.join(str(error).split())[:200]}") from None
+
+
+def _require_size(stream: io.BytesIO, length: int, source: str) -> None:
+    """Refuse an array of objects, and one whose head asks for other memory than its bytes."""
+    version = np.lib.format.read_magic(stream)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, kind = readers[version](stream)
+    if kind.hasobject:
+        raise FileError(f"{source} holds Python objects, which are never unpickled: refused")
+    if math.prod(shape) * kind.itemsize != length - stream.tell():
+        raise FileError(f"{source} does not have the bytes of an array of shape {shape}")
+
+
+def _tensorboard(paths: Sequence[Path], metric: str | None) -> Curve:
+    """Return a scalar of event files; of one step, what was written last."""
+    _require_installed("tensorboard", paths[0])
+    found: dict[str, dict[int, float]] = {}
+    for path in sorted(paths, key=lambda path: path.name):
+        try:
+            for tag, step, value in _scalars(path):
+                _collect(found, tag, step, value, metric, path)
+        except FileError:
+            raise
+        except Exception as error:  # whatever the library says of a damaged file
+            raise FileError(
+                f"{path} is not a readable event file: {' '.join(str(error).split())[:200]}"
+            ) from None
+    return _chosen(found, metric, paths[0])
+
+
+def _scalars(path: Path) -> Iterator[tuple[str, int, float]]:
+    """Yield name, step and value of every scalar of an event file."""
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+    from tensorboard.util.tensor_util import make_ndarray
+
+    for event in EventFileLoader(str(path)).Load():
+        for value in event.summary.value:
+            if value.metadata.plugin_data.plugin_name == "scalars" and value.HasField("tensor"):
+                yield value.tag, int(event.step), float(make_ndarray(value.tensor).item())
+
+
+def _wandb(paths: Sequence[Path], metric: str | None) -> Curve:
+    """Return a scalar of offline files of W&B, by `global_step` where a run logs it, else by W&B's own step."""
+    found: dict[str, dict[int, float]] = {}
+    for path in paths:
+        for record in _wandb_records(path):
+            history = _mapping(record.get("history"))
+            item = _mapping(history.get("item"))
+            step = item.get("global_step", _mapping(history.get("step")).get("num"))
+            for name, value in item.items():
+                number = float(value) if value in _NOT_FINITE else value  # as W&B writes them
+                if type(number) in (int, float) and type(step) in (int, float) and not name.startswith("_"):
+                    _collect(found, name, whole(step), float(number), metric, path)
+    return _chosen(found, metric, paths[0])
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _words_of_wandb(path: Path) -> tuple[str, ...]:
+    for record in _wandb_records(path):
+        if run := _mapping(record.get("run")):
+            above = [str(run[name]) for name in ("project", "run_group") if run.get(name)]
+            name = str(run.get("display_name") or path.absolute().parent.name)
+            seed = _mapping(_mapping(run.get("config")).get("update")).get("seed")
+            return (*above, name if seed is None else f"seed-{seed}")
+    raise FileError(f"{path}: not a run of W&B, or W&B cannot read it")
+
+
+def _wandb_records(path: Path) -> Iterator[Mapping[str, Any]]:
+    """Yield the records of a file, as W&B's own program prints them.
+
+    Raises
+    ------
+    FileError
+        If W&B is not installed, or a record is no JSON or too long.
+    """
+    _require_installed("wandb", path)
+    command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", str(path.absolute())]
+    env = {**os.environ, "WANDB_ERROR_REPORTING": "false", "WANDB_MODE": "offline"}
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, env=env, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
+        assert process.stdout is not None  # it is a pipe
+        try:
+            while line := process.stdout.readline(_LONGEST_LINE):
+                yield _mapping(json.loads(line))
+        except (ValueError, RecursionError):
+            raise FileError(f"{path}: W&B does not print it as JSON records") from None
+        finally:
+            process.kill()
+
+
+def _collect(
+    found: dict[str, dict[int, float]], name: str, step: int, value: float, metric: str | None, path: Path
+) -> None:
+    """Keep a scalar's value if it may be the score; of others, the name."""
+    values = found.setdefault(name, {})
+    if name == metric or (metric is None and name in METRICS):
+        values[step] = value
+    if len(values) > MOST_POINTS or len(found) > 10_000:
+        raise FileError(f"{path}: more than {MOST_POINTS:,} points or 10,000 scalars")
+
+
+def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: Path) -> Curve:
+    """Return the score's values by step."""
+    name = metric or next((name for name in METRICS if found.get(name)), "")
+    if not found.get(name):
+        here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
+        raise FileError(f"{path}: name the scalar that is the score with --metric; found {here}")
+    return sorted(found[name].items())
+
+
+def _require_installed(package: str, path: Path) -> None:
+    if importlib.util.find_spec(package) is None:
+        raise FileError(f"{path}: to read it, pip install 'qrlsuite[{package}]'")
