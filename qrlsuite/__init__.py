@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
     from qrlsuite.api import evaluate as evaluate
+    from qrlsuite.api import import_curves as import_curves
     from qrlsuite.api import load as load
     from qrlsuite.api import new_study as new_study
     from qrlsuite.api import plot as plot
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "evaluate", "hookimpl", "layer", "load", "new_study", "plot",
-    "read_study", "register_environments", "run_study", "train", "tune",
+    "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load", "new_study",
+    "plot", "read_study", "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}

@@ -128,11 +128,15 @@ def compare_entries(
     rule = rule or rule_of([first, second])
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
-    remarks = tables.changed_thresholds([first, second]) + [
-        f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
-        for entry in (first, second)
-        if entry.on_protocol_seeds
-    ]
+    remarks = (
+        tables.external_entries([first, second])
+        + tables.changed_thresholds([first, second])
+        + [
+            f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"
+            for entry in (first, second)
+            if entry.on_protocol_seeds
+        ]
+    )
     return EntryComparison(**values, labels=pair.labels, pair=pair, remarks=tuple(remarks), show_cells=asked)
 
 

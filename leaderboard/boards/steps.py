@@ -305,6 +305,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "rests_on": None if row.rests_on is None else asdict(row.rests_on),
         "entry": entry.name,
         "label": entry.label,
+        "external": entry.external,
         "parameters": {
             "classical": entry.parameters[0],
             "quantum": entry.parameters[1],

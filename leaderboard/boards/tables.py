@@ -78,7 +78,8 @@ def sheet(section: Section, explain: bool = False) -> Sheet:
     columns = _tier_columns(section) if section.by_tiers else _rank_columns(section)
     notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
     promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
-    warnings = [*_diverged(section), *changed_thresholds([row.entry for row in section.rows])]
+    entries = [row.entry for row in section.rows]
+    warnings = [*external_entries(entries), *_diverged(section), *changed_thresholds(entries)]
     remarks = (notes[0], *warnings, *notes[1:], *_marks(section), *promise, *facts(section))
     return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
 
@@ -196,19 +197,20 @@ def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
                 f"{len(row.entry.seeds)}{'*' * row.provisional}{'!' * (id(row.entry) in few)}" for row in rows
             ),
         ),
-        Column("core-hours", tuple(hours_text(entry.hours) for entry in entries), meaning="of training"),
+        Column(
+            "core-hours",
+            tuple(
+                "-" if entry.external and not entry.hours else hours_text(entry.hours) for entry in entries
+            ),
+            meaning="of training",
+        ),
         Column(
             "parameters",
-            tuple(map(_parameters, entries)),
+            tuple(entry.parameters_text(" q") for entry in entries),
             meaning="trained numbers of an agent; q: of a quantum circuit; fixed: those that stay as they were drawn",
         ),
         Column("settings", tuple(entry.settings for entry in entries), words=True),
     ]
-
-
-def _parameters(entry: EntryResults) -> str:
-    classical, quantum = entry.parameters
-    return (f"{classical} + {quantum} q" if quantum else str(classical)) + entry.fixed_text
 
 
 def _row_of(section: Section, entry: EntryResults) -> Row:
@@ -323,6 +325,13 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
     """Say of which entries the thresholds changed after their first seed: they may have been chosen to flatter."""
     labels = [entry.label for entry in entries if entry.changed_thresholds]
     return [f"thresholds changed after the first seed: {', '.join(labels)}"] if labels else []
+
+
+def external_entries(entries: Sequence[EntryResults]) -> list[str]:
+    """Say which entries have curves that another program made."""
+    labels = [entry.label for entry in entries if entry.external]
+    line = f"curves that other programs made, and nobody here can train or check again: {', '.join(labels)}"
+    return [line] * bool(labels)
 
 
 def unequal_tuning(section: Section) -> list[str]:

@@ -68,7 +68,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     for k, (name, entry, complexities) in enumerate(zip(style.labels(entries), entries, measured)):
         look = style.of(entry, k)
         places = centers + (k - (len(entries) - 1) / 2) * width
-        text = f"{name}: {style.parameters_text(entry)} parameters, {style.seeds_text(entry)}"
+        text = f"{name}: {style.facts(entry)}"
         handles.append(Patch(facecolor=look.color, edgecolor="white", hatch=look.hatch, lw=0, label=text))
         for i, j in np.ndindex(*grid.shape):
             alpha = 0.3 if complexities.at_cap[i, j] else 1.0

@@ -169,7 +169,7 @@ def _draw_panel(
                 alpha=alpha,
             )
             if annotate:
-                note = style.parameters_text(entry)
+                note = entry.parameters_text()
                 if len(counts) > 1:
                     note += f"\n({style.seeds_text(entry)})"
                 axes.annotate(

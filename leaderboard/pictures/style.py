@@ -109,10 +109,10 @@ def labels(entries: Sequence[EntryResults], longest: int = 60) -> list[str]:
     ]
 
 
-def parameters_text(entry: EntryResults) -> str:
-    """Write parameter counts: `387`, or `73 + 240` with the quantum ones second."""
-    classical, quantum = entry.parameters
-    return (f"{classical} + {quantum}" if quantum else f"{classical}") + entry.fixed_text
+def facts(entry: EntryResults) -> str:
+    """Write parameters, where they are known, and seeds: `73 + 240 parameters, 100 seeds`."""
+    known = entry.parameters_text()
+    return seeds_text(entry) if known == "-" else f"{known} parameters, {seeds_text(entry)}"
 
 
 def heading(entries: Sequence[EntryResults]) -> str:

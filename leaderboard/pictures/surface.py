@@ -93,7 +93,7 @@ def _maps(
                     Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, hatch="////", ec="#ffffff48", lw=0)
                 )
         axes.set_title(
-            f"{name}\n{style.parameters_text(entry)} parameters, {style.seeds_text(entry)}",
+            f"{name}\n{style.facts(entry)}",
             fontsize=8,
             loc="left",
         )
@@ -154,7 +154,7 @@ def _box(
             ms=3,
             mew=0,
         )
-        text = f"{name}: {style.parameters_text(entry)} parameters, {style.seeds_text(entry)}"
+        text = f"{name}: {style.facts(entry)}"
         handles.append(Line2D([], [], color=look.color, marker=look.marker, lw=4, alpha=0.7, label=text))
     axes.set_xlabel(cells.level_name(grid))
     axes.set_ylabel("δ")

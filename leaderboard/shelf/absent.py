@@ -8,6 +8,8 @@ from qrlsuite.leaderboard.shelf.curves import EntryResults
 
 def absent(entry: EntryResults) -> list[str]:
     """Return what would be needed to train an entry further and nothing registers, in words: `model 'fourier'`."""
+    if entry.external:
+        return []
     known = registry.load()
     used: list[tuple[type[specs.Spec], str]] = [
         (specs.EnvironmentSpec, entry.task_file.environment.name),

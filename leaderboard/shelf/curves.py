@@ -70,6 +70,8 @@ class EntryResults(Shown):
         Hash of the study with looks that trained it; None for a number of seeds that was fixed in advance.
     source:
         Whether the curves were read from a results folder or from a published entry.
+    external:
+        Whether another program made the curves: nobody here trained them, or can check them.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     unprobed:
@@ -109,6 +111,7 @@ class EntryResults(Shown):
     tuning: Mapping[str, Any] | None = None
     plan: str | None = None
     source: Literal["runs", "published"] = "runs"
+    external: bool = False
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     color: int | None = None
     records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
@@ -191,6 +194,7 @@ class EntryResults(Shown):
             devices=provenance.devices(made_with),
             unprobed=any(map(probes.third_party, made_with)) and probes.EQUAL not in probed,
             first_thresholds=task_file.ranking.grid.thresholds,
+            external=bool(record.get("imported")),
             **facts,
         )
 
@@ -279,20 +283,19 @@ class EntryResults(Shown):
     @property
     def facts(self) -> dict[str, str]:
         """What a person asks of an entry first, in words."""
-        classical, quantum = self.parameters
         n_runs, epochs = self.curves.shape
         return {
             "task": self.task,
             "entry": f"{self.label} ({self.name})",
-            "parameters": (f"{classical} + {quantum} quantum" if quantum else f"{classical}")
-            + self.fixed_text,
+            **({"made": "by another program"} if self.external else {}),
+            "parameters": self.parameters_text(" quantum"),
             "seeds": f"{n_runs}"
             + (f", {len(self.left_out)} unfinished left out" if self.left_out else "")
             + (f", {len(self.diverged)} diverged" if self.diverged else ""),
             **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
             "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
-            "core-hours": f"{self.hours:.2f}",
+            "core-hours": f"{self.hours:.2f}" if self.hours or not self.external else "-",
             "read from": str(self.folder),
         }
 
@@ -301,6 +304,19 @@ class EntryResults(Shown):
         for name, text in self.facts.items():
             table.add_row(Text(name), Text(text))
         return table
+
+    def parameters_text(self, unit: str = "") -> str:
+        """Write the numbers of parameters, `73 + 240` with those of circuits second; `-` where they are not known.
+
+        Parameters
+        ----------
+        unit:
+            What follows those of circuits.
+        """
+        classical, quantum = self.parameters
+        if self.external and not classical + quantum:
+            return "-"
+        return (f"{classical} + {quantum}{unit}" if quantum else f"{classical}") + self.fixed_text
 
     @property
     def fixed_text(self) -> str:
@@ -335,7 +351,7 @@ class EntryResults(Shown):
         one = {"ddqn": True, "reinforce": algorithm_options.get("baseline") != "value"}.get(
             self.algorithm, False
         )
-        return self.networks is None and not one
+        return self.networks is None and not one and not self.external
 
     @property
     def has_circuit(self) -> bool:
@@ -347,6 +363,8 @@ class EntryResults(Shown):
         """Where its settings come from: the preset and what `--set` changed of it, or `tuned` and how much."""
         if self.tuning is not None:
             return _tuned_text(self.tuning)
+        if self.external:
+            return "-"
         presets = self.task_file.presets
         name = self.preset or "default"
         if self.algorithm not in presets.get(name, {self.algorithm: {}}):

@@ -49,6 +49,8 @@ class Imported:
     ----------
     store:
         The entry's folder here.
+    name, label, task:
+        What the entry and its task are called.
     new, known:
         Seeds that were copied, and seeds that were here already.
     notes:
@@ -56,7 +58,9 @@ class Imported:
     """
 
     store: EntryStore
-    entry: Entry
+    name: str
+    label: str
+    task: str
     new: tuple[int, ...]
     known: tuple[int, ...]
     notes: tuple[str, ...]
@@ -65,9 +69,9 @@ class Imported:
         """Return it as plain values."""
         return {
             "folder": str(self.store.path),
-            "entry": self.entry.name,
-            "label": self.entry.label,
-            "task": self.entry.task.name,
+            "entry": self.name,
+            "label": self.label,
+            "task": self.task,
             "seeds": list(self.new),
             "known": list(self.known),
             "notes": list(self.notes),
@@ -178,7 +182,7 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
     for seed, run in runs.items():
         if seed in present:
             known.append(seed)
-            if _differs(store, seed, run.curve):
+            if differs(store, seed, run.curve):
                 differing.append(seed)
         elif seed in training or not (run.finished or seed in newest):
             waiting.append(seed)
@@ -187,12 +191,14 @@ def _from_runs(source: EntryStore, runs: Mapping[int, SeedRun], entry: Entry, st
             new.append(seed)
             versions += run.record.get("provenance", [])
     _take_checkpoints(source, store, sorted({*new, *known} - {*differing}))
-    notes = _differences(differing) + _other_versions(versions, entry)
+    notes = differences(differing) + _other_versions(versions, entry)
     if waiting:
         notes.append(
             f"seeds {format_seeds(waiting)} are left there: they are being trained, or have no checkpoint yet"
         )
-    return Imported(store, entry, tuple(new), tuple(known), tuple(notes))
+    return Imported(
+        store, entry.name, _label_of(entry, store), entry.task.name, tuple(new), tuple(known), tuple(notes)
+    )
 
 
 def _take_checkpoints(source: EntryStore, store: EntryStore, seeds: Sequence[int]) -> None:
@@ -218,7 +224,7 @@ def _from_export(
         curve = exported.curves[row]
         if seed in present:
             known.append(seed)
-            if _differs(store, seed, curve):
+            if differs(store, seed, curve):
                 differing.append(seed)
             continue
         rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
@@ -227,7 +233,7 @@ def _from_export(
         diverged, probe = exported.diverged.get(seed), exported.probe
         if diverged is not None:
             rows[diverged - 1]["diverged"] = True
-        made = _unplaced(store, seed)
+        made = unplaced(store, seed)
         made.path.mkdir(parents=True)
         write_atomically(made.table, table_bytes(rows))
         write_atomically(
@@ -259,15 +265,17 @@ def _from_export(
             write_atomically(made.agent, encode(agents[seed]))
         made.path.rename(store.seed(seed).path)
         new.append(seed)
-    notes = _differences(differing) + _other_versions(exported.provenance, entry)
+    notes = differences(differing) + _other_versions(exported.provenance, entry)
     if new:
         notes.append("an export holds no checkpoints: these seeds cannot be trained to more epochs")
     if without := sorted(set(new) - set(agents)):
         notes.append(f"seeds {format_seeds(without)} came without agents: they cannot be evaluated")
-    return Imported(store, entry, tuple(new), tuple(known), tuple(notes))
+    return Imported(
+        store, entry.name, _label_of(entry, store), entry.task.name, tuple(new), tuple(known), tuple(notes)
+    )
 
 
-def _unplaced(store: EntryStore, seed: int) -> SeedStore:
+def unplaced(store: EntryStore, seed: int) -> SeedStore:
     """Return an empty place beside that of a seed, without what an import that was killed left there."""
     path = store.path / f".seed-{seed:04d}.import"
     shutil.rmtree(path, ignore_errors=True)
@@ -276,7 +284,7 @@ def _unplaced(store: EntryStore, seed: int) -> SeedStore:
 
 def _place(store: EntryStore, seed: int, folder: Path) -> None:
     """Copy a seed's folder, whole or not at all."""
-    copy = _unplaced(store, seed).path
+    copy = unplaced(store, seed).path
     try:
         shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(".*"))
         for path in copy.iterdir():
@@ -288,14 +296,20 @@ def _place(store: EntryStore, seed: int, folder: Path) -> None:
         raise StoreError(f"cannot copy {folder} to {store.path}: {error.strerror or error}") from None
 
 
-def _differs(store: EntryStore, seed: int, curve: NDArray[np.float64]) -> bool:
+def _label_of(entry: Entry, store: EntryStore) -> str:
+    """Return an entry's label, with the mark of seeds of other code."""
+    return f"{entry.label} {store.mark}".rstrip()
+
+
+def differs(store: EntryStore, seed: int, curve: NDArray[np.float64]) -> bool:
     """Return whether a seed's curve here and a curve (T,) from elsewhere differ in the epochs that both have."""
     own = store.seed(seed).read().curve
     shared = min(len(own), len(curve))
     return not np.array_equal(own[:shared], curve[:shared])
 
 
-def _differences(seeds: Sequence[int]) -> list[str]:
+def differences(seeds: Sequence[int]) -> list[str]:
+    """Say of which seeds other curves are here."""
     if not seeds:
         return []
     return [f"seeds {format_seeds(seeds)} have other curves there than here: those here stay"]

@@ -22,6 +22,9 @@ from qrlsuite.experiment.task import Task, TaskFile, digest, load
 from qrlsuite.notation import Written
 from qrlsuite.options import Setting
 
+EXTERNAL = "external"
+"""What the algorithm of entries is called whose curves another program made; so is their task's environment."""
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -183,6 +186,10 @@ def resolve(
     """
     written = entry if isinstance(entry, Written) else notation.parse_entry(entry)
     written = written.given(algorithm, tuple(settings), preset)
+    if written.algorithm == EXTERNAL:
+        raise OptionError(
+            f"'{EXTERNAL} {written.model}' has curves that another program made: they can be compared, not trained"
+        )
     task, model = load(task_name), registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)
     spec = registry.get(

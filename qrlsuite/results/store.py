@@ -702,7 +702,8 @@ class EntryStore:
         """
         if self.record().get("imported"):
             raise StoreError(
-                f"{self.path} was imported from other files: it can be compared, not trained further"
+                f"{self.path} holds curves that another program made: they can be compared, not trained, evaluated or "
+                "published"
             )
         return from_record(self.record(), str(self.path / "entry.json"))
 

@@ -107,6 +107,7 @@ def outline(store: EntryStore) -> dict[str, Any]:
     keys = ("label", "name", "hash", "preset", "tuning", "task_name", "task_hash", "identity")
     return {
         **{key: record[key] for key in keys},
+        **({"imported": record["imported"]} if record.get("imported") else {}),
         "seeds": len(seeds),
         "provenance": made_with,
         "parameters": parameters_of(records),

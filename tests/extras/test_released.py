@@ -358,7 +358,7 @@ def test_import_shows_on_the_leaderboard_with_a_mark_and_can_be_repeated(
     record = store.seed(1).record() or {}
     assert record["imported"]["file"] == "1.pkl"
     assert record["imported"]["arguments"]["lr"] == 5e-4
-    with pytest.raises(StoreError, match="was imported from other files"):
+    with pytest.raises(StoreError, match="holds curves that another program made"):
         store.entry()
     listed = CliRunner().invoke(build(), ["runs", "--runs", str(tmp_path / "runs")])
     assert "ddqn hybrid (imported)  3 finished  6" in listed.output

@@ -204,7 +204,7 @@ def change(store: EntryStore, path: str, **values: Any) -> None:
     [
         ("entry.json", {"hash": "0" * 16}, "the options do not have the entry's hash"),
         ("entry.json", {"plan": "0" * 16}, "belongs to a study with looks"),
-        ("entry.json", {"imported": True}, "was imported from other files"),
+        ("entry.json", {"imported": True}, "holds curves that another program made"),
         ("seed-0001/run.json", {"task_hash": "0" * 16}, "does not say that it is seed 1 of"),
         ("seed-0001/run.json", {"seed": 7}, "does not say that it is seed 1 of"),
         ("seed-0001/run.json", {"epochs": 9}, "finished 9 epochs and holds 2"),

@@ -1,0 +1,89 @@
+"""Learning curves of other programs from Python: import them, to compare and draw them as any."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.shelf import external
+from qrlsuite.leaderboard.shelf.importing import Imported
+from qrlsuite.results import points
+
+
+def import_curves(
+    curves: str
+    | PathLike[str]
+    | Sequence[str | PathLike[str]]
+    | Mapping[str, tuple[Iterable[int], ArrayLike]]
+    | Any,
+    *,
+    steps: ArrayLike | None = None,
+    task: str | None = None,
+    maximum: float | None = None,
+    thresholds: Sequence[float] = (),
+    every: int | None = None,
+    metric: str | None = None,
+    runs: str | PathLike[str] = "runs",
+) -> list[Imported]:
+    """Import learning curves that other programs made, as *external* entries to compare.
+
+    At every grid point stands the last score at or before it: nothing is interpolated or carried backward, and a curve
+    ends at its last observation. External entries cannot be trained, evaluated or exported for publication.
+
+    Parameters
+    ----------
+    curves:
+        By entry (seeds, points), (N,) and (N, K); or a table with the columns entry, seed, step and score (Arrow, or a
+        data frame of pandas or polars); or files: csv with these columns, `monitor.csv` and `evaluations.npz` of
+        Stable-Baselines3, event files of TensorBoard, offline files of W&B.
+    steps:
+        (K,) environment steps of `points`, increasing.
+    task:
+        A task of the suite, of which the curves are; or the name of a new one, `external` where it is None. Later
+        imports into it need no other option.
+    maximum:
+        The best possible score: scores become fractions of it, in [0, 1].
+    thresholds:
+        Scores that count as reached, for a new task; by default .6, .7, .8 and .9 of the maximum.
+    every:
+        Environment steps between two grid points of a new task. By default those of the curves where they are equal,
+        else a round number that gives 100 points or fewer.
+    metric:
+        The column of a csv file or a table, or the scalar of TensorBoard or W&B, that is the score.
+    runs:
+        The results folder.
+
+    Returns
+    -------
+    list of Imported
+        For each entry its `label`, `task`, and the seeds that are `new`; `notes` say what to know.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read, or something is no learning curve. Nothing is written then.
+    OptionError
+        If an array has the wrong shape, or nothing says what a good score is.
+
+    Examples
+    --------
+    >>> import_curves("runs.csv", maximum=500)  # doctest: +SKIP
+    """
+    if isinstance(curves, Mapping):
+        if steps is None:
+            raise OptionError("steps: give the environment steps of the points, shape (points,)")
+        found = points.read_arrays(curves, steps)
+    elif steps is not None:
+        raise OptionError("steps: files and tables have steps of their own; leave it out")
+    elif isinstance(curves, str | PathLike):
+        found = points.read_files([Path(fspath(curves))], metric)
+    elif isinstance(curves, Sequence) and all(isinstance(each, str | PathLike) for each in curves):
+        found = points.read_files([Path(fspath(each)) for each in curves], metric)
+    else:
+        found = points.read_table(curves, metric)
+    return external.import_points(found, Path(runs), task, maximum, thresholds, every)

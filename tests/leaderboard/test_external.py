@@ -1,0 +1,424 @@
+"""`qrlsuite import` of curves that other programs made: external entries, compared and drawn as any."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite import api
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError, QrlSuiteError
+from qrlsuite.results import points, run_files
+from qrlsuite.results.store import EntryStore
+
+STEPS = np.arange(1, 11) * 1000
+
+
+def learned(seed: int, reached: int) -> list[float]:
+    """Return ten scores of a run that is good from one of them on."""
+    noise = np.random.default_rng(seed).uniform(0, 5, 10)
+    return [float(value) for value in np.where(np.arange(10) < reached + seed % 3, 20, 90) + noise]
+
+
+def write_csv(
+    path: Path, entries: dict[str, Sequence[list[float]]], steps: Sequence[int] = tuple(STEPS)
+) -> Path:
+    rows = [
+        f"{entry},{seed},{step},{score}"
+        for entry, runs in entries.items()
+        for seed, curve in enumerate(runs)
+        for step, score in zip(steps, curve)
+    ]
+    path.write_text("\n".join(["entry,seed,step,score", *rows]) + "\n")
+    return path
+
+
+@pytest.fixture
+def csv(tmp_path: Path) -> Path:
+    """2 x 20 runs, one entry faster than the other."""
+    fast, slow = ([learned(100 * k + seed, k) for seed in range(20)] for k in (2, 6))
+    return write_csv(tmp_path / "curves.csv", {"fast lr=0.1": fast, "slow lr=0.01": slow})
+
+
+@pytest.fixture
+def qrlsuite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: object) -> Any:
+        return CliRunner().invoke(build(), [str(word) for word in words])
+
+    return run
+
+
+def test_from_csv_to_a_verdict_and_a_picture_in_three_commands(
+    csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
+) -> None:
+    imported = qrlsuite("import", csv, "--maximum", 100)
+    assert "external fast lr=0.1 on external: imported seeds 0:20" in imported.output
+    assert "grid: every 1000 steps, the last score at or before" in imported.output
+    assert "scores over 100; thresholds 0.6, 0.7, 0.8, 0.9; horizon 10000 steps" in imported.output
+    compared = qrlsuite("compare", "fast", "slow")
+    assert compared.output.startswith("fast lr=0.1 needs"), compared.exception
+    assert "curves that other programs made" in " ".join(compared.output.split())
+    assert qrlsuite("plot", "curves").output == "wrote runs/external-curves.png\n"
+    assert (tmp_path / "runs" / "external-curves.png").stat().st_size > 10_000
+
+
+def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
+    csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
+) -> None:
+    qrlsuite("import", csv, "--maximum", 100)
+    board = qrlsuite("leaderboard").output
+    assert "curves that other programs made, and nobody here can train or check again: external fast" in board
+    [fast] = [line for line in board.splitlines() if "fast lr=0.1" in line and "█" in line]
+    assert fast.split()[-4:] == ["20", "-", "-", "-"]  # seeds, core-hours, parameters, settings
+    rows = json.loads(qrlsuite("leaderboard", "--format", "json").output)["sections"][0]["rows"]
+    assert [row["external"] for row in rows] == [True, True]
+    assert "external fast" in qrlsuite("runs").output
+    shown = json.loads(qrlsuite("show", "fast", "--json").output)
+    assert shown["imported"]["grid"].startswith("every 1000 steps")
+    entry = api.load("fast")
+    assert entry.external
+    assert entry.facts["made"] == "by another program"
+    assert entry.options["model"] == {"name": "fast lr=0.1", "lr": 0.1}
+
+
+def test_external_entries_are_not_trained_evaluated_or_published(
+    csv: Path, qrlsuite: Callable[..., Any]
+) -> None:
+    qrlsuite("import", csv, "--maximum", 100)
+    for words, message in (
+        (("export", "fast"), "can be compared, not trained, evaluated or published"),
+        (("evaluate", "fast"), "hold learning curves and no trained parameters"),
+        (("run", "external fast", "--task", "cartpole"), "can be compared, not trained"),
+    ):
+        result = qrlsuite(*words)
+        assert message in str(result.exception), words
+
+
+def test_power_and_rliable_take_them(qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path) -> None:
+    qrlsuite("import", csv, "--maximum", 100)
+    qrlsuite("import", csv, "--maximum", 100, "--task", "another")
+    scores = qrlsuite("export", "--rliable", "scores.npz", "--task", "external", "--task", "another")
+    assert "fast lr=0.1: 20 runs, 2 tasks" in scores.output, scores.exception
+    needs = json.loads(
+        qrlsuite("power", "fast", "slow", "--task", "external", "--draws", 20, "--json").output
+    )
+    assert needs["core_hours_basis"] == "not known" or "known" in needs["core_hours_basis"]
+    assert needs["needs"][0]["fixed_seeds"] <= 20
+
+
+POINTS = (0, 9), (7, 1), (19, 2), (40, 3), (45, 4)
+
+
+def test_unequal_steps_take_the_last_score_at_or_before_each_grid_point(tmp_path: Path) -> None:
+    path = tmp_path / "curves.csv"
+    path.write_text("entry,seed,step,score\n" + "".join(f"a,0,{s},{v}\n" for s, v in POINTS))
+    [a] = api.import_curves(path, thresholds=[2.5], every=10, runs=tmp_path / "runs")
+    curve = a.store.seed(0).read().curve
+    # at 10, 20, 30, 40: not the 9 before training, and nothing after 40
+    assert curve.tolist() == [1, 2, 2, 3]
+    assert a.notes == ("'a' has 1 seed: a verdict needs 20 of each entry",)
+
+
+def test_a_grid_is_round_where_every_run_has_begun(tmp_path: Path) -> None:
+    runs = {"a": ([0, 1], [[1.0, 2.0, 4.0], [1.5, 2.5, 3.0]])}
+    [a] = api.import_curves(runs, steps=[130, 900, 1500], thresholds=[2], runs=tmp_path)
+    assert a.store.record()["task_file"]["protocol"]["interactions"] == 200
+    assert a.store.seed(0).read().curve.tolist() == [1, 1, 1, 1, 2, 2, 2]
+
+
+def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "curves.csv"
+    rows = [(seed, step) for seed, last in ((0, 30), (1, 30), (2, 20)) for step in range(10, last + 1, 10)]
+    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
+    assert "seeds 2:3 end before the others, from step 20 on (others at 30)" in a.notes[1]
+    assert a.store.record()["task_file"]["ranking"]["horizons"] == [30]
+    assert api.load("a", runs=tmp_path / "runs").left_out == (2,)
+
+
+def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:
+    """CartPole's best return is 500 and its epochs have 1000 steps: neither is asked for."""
+    runs = {"a": ([0], [[100.0, 250.0]])}
+    api.import_curves(runs, steps=[900, 2000], task="cartpole", runs=tmp_path)
+    entry = api.load("a", runs=tmp_path)
+    file = entry.task_file
+    assert entry.steps_per_epoch == file.protocol.interactions
+    assert entry.curves[0, -1] == 250 / (file.score.max_return or 1)
+    with pytest.raises(OptionError, match="--every 7: task 'cartpole' has a grid of"):
+        api.import_curves(runs, steps=[900, 2000], task="cartpole", every=7, runs=tmp_path)
+    with pytest.raises(QrlSuiteError, match="are not between 0 and 1"):
+        api.import_curves({"a": ([0], [[5.0]])}, steps=[2000], task="beam6g", runs=tmp_path)
+
+
+def test_more_seeds_are_added_and_those_here_stay(tmp_path: Path) -> None:
+    def take(curves: dict[str, Any], **options: Any) -> Any:
+        return api.import_curves(curves, steps=[10, 20, 30], runs=tmp_path, **options)[0]
+
+    take({"a": ([0], [[1, 2, 3]])}, maximum=10)
+    more = take({"a": ([0, 1], [[1, 2, 4], [2, 3, 4]])})  # the task of the folder says all
+    assert (more.new, more.known) == ((1,), (0,))
+    assert more.notes[0] == "seeds 0:1 have other curves there than here: those here stay"
+    for options, message in (
+        ({"maximum": 20}, "task 'external' has 10; give this one another --task NAME"),
+        ({"thresholds": [5]}, "task 'external' has 6, 7, 8, 9; leave them out"),
+        ({"every": 20}, "task 'external' has a grid of 10 steps"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            take({"b": ([0], [[1, 2, 3]])}, **options)
+    with pytest.raises(QrlSuiteError, match="begins at step 20, after the first grid point at 10"):
+        api.import_curves({"b": ([0], [[1, 2]])}, steps=[20, 30], runs=tmp_path)
+
+
+def test_tables_and_data_frames(tmp_path: Path) -> None:
+    table = pyarrow.table(
+        {"entry": ["a", "a"], "seed": [0, 0], "step": [10, 20], "return": [1.0, 2.0], "x": [0, 0]}
+    )
+    [a] = api.import_curves(table, maximum=2, metric="return", runs=tmp_path)
+    assert a.store.seed(0).read().curve.tolist() == [0.5, 1]
+    with pytest.raises(OptionError, match="curves of type int: give files"):
+        api.import_curves(3, runs=tmp_path)
+
+
+GOOD = "entry,seed,step,score\n"
+BAD = {
+    "holes": (GOOD + "a,0,10,1\na,0,,2\n", "line 3: no step: every row has an entry"),
+    "a short row": (GOOD + "a,0,10\n", "line 2: 3 cells, and 4 in the first line"),
+    "NaN": (GOOD + "a,0,10,nan\n", "the score of 'a', seed 0, at step 10 is nan"),
+    "inf": (GOOD + "a,0,10,inf\n", "at step 10 is inf"),
+    "twice": (GOOD + "a,0,10,1\na,1,10,1\na,0,10,2\n", "'a', seed 0: step 10 is there twice"),
+    "decreasing": (GOOD + "a,0,10,1\na,0,5,2\n", "step 5 follows step 10"),
+    "negative": (GOOD + "a,0,-10,1\n", "step -10 is negative"),
+    "columns": (
+        "name,seed,step,reward\n",
+        "expected the columns entry, seed, step, score, each once; found name, seed",
+    ),
+    "no score": ("entry,seed,step,r\n", "--metric NAME reads another column as the score"),
+    "empty": ("", "found none"),
+    "no rows": (GOOD, "there is no score after step 0"),
+    "only before training": (GOOD + "a,0,0,1\n", "there is no score after step 0"),
+    "no number": (GOOD + "a,0,10,high\n", r"line 2: 'a', '0', '10', 'high': seed and step are whole numbers"),
+    "half a seed": (GOOD + "a,0.5,10,1\n", "seed and step are whole numbers"),
+    "a tuning seed": (GOOD + "a,1000000,10,1\n", "number the runs of an entry 0, 1, 2"),
+    "a path": (GOOD + "../a,0,10,1\n", "without slashes"),
+    "controls": (GOOD + "a\x1b[2J,0,10,1\n", r"entry 'a\\x1b\[2J': a name is one line"),
+    "a long name": (GOOD + "a" * 81 + ",0,10,1\n", "1 to 80 characters"),
+    "a long line": (GOOD + "a" * run_files._LONGEST_LINE, "a line of it has 1,000,000 characters"),
+    "copies": (
+        GOOD + "".join(f"a,{s},{t},{t}\n" for s in (0, 1) for t in (1, 2, 3)),
+        "seeds 0 and 1 of 'a' have the same",
+    ),
+    "below 0": (GOOD + "a,0,10,-1\n", "scores from -1 to -1 are not between 0 and 100, the maximum"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_csv_is_refused_and_nothing_is_written(case: str, tmp_path: Path) -> None:
+    content, message = BAD[case]
+    path = tmp_path / "curves.csv"
+    path.write_text(content)
+    with pytest.raises(QrlSuiteError, match=message) as refused:
+        api.import_curves(path, maximum=100, runs=tmp_path / "runs")
+    assert str(refused.value).isprintable()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_what_a_good_score_is_has_to_be_said(csv: Path, tmp_path: Path) -> None:
+    for options, message in (
+        ({}, "'external' is a new task: say what a good score is with --maximum"),
+        ({"maximum": -1.0}, "--maximum -1.0: give the best possible score"),
+        ({"maximum": 10.0, "thresholds": [20]}, "up to --maximum 10"),
+        ({"thresholds": [20, 20]}, "give numbers, each once"),
+        ({"maximum": 100.0, "task": "../up"}, "--task ../up: name"),
+        ({"maximum": 100.0, "every": 0}, "--every 0"),
+    ):
+        with pytest.raises(QrlSuiteError, match=message):
+            api.import_curves(csv, runs=tmp_path / "runs", **options)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_huge_files_are_refused_before_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "huge.csv"
+    with path.open("wb") as file:
+        file.truncate(run_files.MOST_BYTES + 1)
+    with pytest.raises(QrlSuiteError, match="larger than 1000 MB"):
+        points.read_files([path])
+    monkeypatch.setattr(points, "MOST_POINTS", 10)
+    with pytest.raises(QrlSuiteError, match="more than 10 points"):
+        points.read_files([write_csv(tmp_path / "a.csv", {"a": [[1.0] * 11]}, range(1, 12))])
+
+
+@pytest.fixture(scope="module")
+def sb3(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of Stable-Baselines3, with every file that it writes."""
+    gymnasium, sb = pytest.importorskip("gymnasium"), pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.callbacks import EvalCallback
+    from stable_baselines3.common.monitor import Monitor
+
+    logs = tmp_path_factory.mktemp("logs")
+    for name, width in (("small", 4), ("large", 8)):
+        folder = logs / name / "seed-3"
+        folder.mkdir(parents=True)
+        env, test = (
+            Monitor(gymnasium.make("CartPole-v1"), f"{folder}/"),
+            Monitor(gymnasium.make("CartPole-v1")),
+        )
+        model = sb.PPO(
+            "MlpPolicy", env, n_steps=64, n_epochs=1, seed=3, policy_kwargs={"net_arch": [width]},
+            tensorboard_log=str(folder), device="cpu",
+        )  # fmt: skip
+        check = EvalCallback(test, log_path=str(folder), eval_freq=100, n_eval_episodes=2, verbose=0)
+        model.learn(256, callback=check)
+        model.get_env().close()
+    return logs
+
+
+def test_evaluations_of_stable_baselines3(sb3: Path, tmp_path: Path) -> None:
+    done = api.import_curves(sorted(sb3.glob("*/*/evaluations.npz")), maximum=500, runs=tmp_path)
+    assert [(each.label, each.new) for each in done] == [("external large", (3,)), ("external small", (3,))]
+    evaluated = np.load(sb3 / "small" / "seed-3" / "evaluations.npz")
+    assert evaluated["timesteps"].tolist() == [100, 200]
+    curve = EntryStore(done[1].store.path).seed(3).read().curve
+    np.testing.assert_allclose(curve, evaluated["results"].mean(axis=1) / 500, atol=1e-7)
+
+
+def test_monitor_files_of_stable_baselines3(sb3: Path) -> None:
+    found = points.read_files(sorted(sb3.glob("*/*/monitor.csv")))
+    assert sorted(found) == [("large", 3), ("small", 3)]
+    frame = (sb3 / "small" / "seed-3" / "monitor.csv").read_text().splitlines()[2:]
+    lengths = [int(line.split(",")[1]) for line in frame]
+    own = found["small", 3]
+    assert own.steps.tolist() == np.cumsum(lengths).tolist()
+    np.testing.assert_allclose(own.scores, [np.mean(lengths[: k + 1]) for k in range(len(lengths))])
+
+
+def test_event_files_of_tensorboard(sb3: Path) -> None:
+    """A run's folder is called PPO_1, and it is seed 1; evaluations come before training episodes."""
+    pytest.importorskip("tensorboard")
+    events = sorted(sb3.glob("*/*/PPO_1/events*"))
+    found = points.read_files(events)
+    assert sorted(found) == [("large", 1), ("small", 1)]
+    evaluated = np.load(sb3 / "small" / "seed-3" / "evaluations.npz")
+    assert found["small", 1].steps.tolist() == [100, 200]
+    np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
+    assert points.read_files(events, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
+    with pytest.raises(
+        QrlSuiteError, match=r"name the scalar that is the score with --metric; found .*eval/mean_reward"
+    ):
+        points.read_files(events, "reward")
+    torn = events[0].parent / "events.out.tfevents.torn"
+    torn.write_bytes(b"no records")
+    with pytest.raises(QrlSuiteError, match="name the scalar that is the score"):
+        points.read_files([torn])
+
+
+def test_offline_files_of_wandb(tmp_path: Path) -> None:
+    wandb = pytest.importorskip("wandb")
+    for seed in (0, 1):
+        run = wandb.init(
+            project="p",
+            group="small",
+            config={"seed": seed},
+            dir=tmp_path,
+            mode="offline",
+            reinit="finish_previous",
+        )
+        for step in (1, 2):
+            run.log({"eval/mean_reward": step + seed, "global_step": 100 * step})
+        run.finish()
+    files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
+    found = points.read_files(files)
+    assert sorted(found) == [("small", 0), ("small", 1)]
+    assert found["small", 1].steps.tolist() == [100, 200]
+    assert found["small", 1].scores.tolist() == [2, 3]
+    (tmp_path / "damaged.wandb").write_bytes(files[0].read_bytes()[:10])
+    with pytest.raises(QrlSuiteError, match="not a run of W&B"):
+        points.read_files([tmp_path / "damaged.wandb"])
+
+
+def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    for name, package in (("seed-1/events.out.tfevents.1", "tensorboard"), ("run-1.wandb", "wandb")):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        with pytest.raises(QrlSuiteError, match=rf"pip install 'qrlsuite\[{package}\]'"):
+            points.read_files([path])
+
+
+def test_names_come_from_what_differs_between_paths(sb3: Path, tmp_path: Path) -> None:
+    content = (sb3 / "small" / "seed-3" / "evaluations.npz").read_bytes()
+
+    def named(*paths: str) -> list[tuple[str, int]]:
+        for name in paths:
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_bytes(content)
+        return sorted(points.read_files([tmp_path / name for name in paths]))
+
+    file = "evaluations.npz"
+    assert named(f"x/ppo/CartPole-v1_1/{file}", f"x/a2c/CartPole-v1_2/{file}") == [("a2c", 2), ("ppo", 1)]
+    assert named(f"y/small_seed3/{file}", f"y/large_seed3/{file}") == [("large", 3), ("small", 3)]
+    assert named("z/small-0.npz", "z/small-1.npz") == [("small", 0), ("small", 1)]
+    with pytest.raises(QrlSuiteError, match="which seed is 'alone'"):
+        named(f"alone/{file}")
+    with pytest.raises(QrlSuiteError, match="are both seed 1 of 'v' by their paths"):
+        named(f"v/run-1/{file}", f"v/run_1/{file}")
+
+
+def npz(**arrays: Any) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def bomb() -> bytes:
+    """Return an npz file of which an array's head promises a billion numbers."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**9,)})
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr("timesteps.npy", head.getvalue())
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"PK nonsense", "is not a readable npz file"),
+        (npz(timesteps=np.array([1, 2])), "found timesteps.npy"),
+        (npz(timesteps=np.array([{}]), results=np.ones((1, 1))), "Python objects, which are never unpickled"),
+        (npz(timesteps=np.array([1, 2]), results=np.ones(2)), r"results of shape \(2,\)"),
+        (npz(timesteps=np.array([1]), results=np.full((1, 1), np.nan)), "is nan"),
+        (bomb(), "does not have the bytes of an array of shape"),
+    ],
+)
+def test_bad_npz_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "seed-0" / "evaluations.npz"
+    path.parent.mkdir()
+    path.write_bytes(content)
+    with pytest.raises(QrlSuiteError, match=message):
+        points.read_files([path])
+
+
+def test_files_and_folders_are_told_apart(qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").touch()
+    for words, message in (
+        (("empty",), "holds no entry"),
+        (("empty", csv), "import folders and files by commands of their own"),
+        (("empty", "--maximum", 3), "--maximum is for files with curves"),
+        (("notes.txt",), "give a csv file with the columns entry,seed,step,score"),
+        (("none.csv",), "none.csv cannot be read: No such file or directory"),
+        ((csv, "--thresholds", "high"), "--thresholds high: write numbers"),
+    ):
+        assert message in str(qrlsuite("import", *words).exception), words
