@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -66,6 +67,28 @@ def quantum_parameters(module: nn.Module) -> set[str]:
     return set() if declared is None else set(declared())
 
 
+def learning_rates(module: nn.Module) -> dict[str, float]:
+    """Return a module's factors on its learning rates by the name of a parameter: its `learning_rates()`, else none.
+
+    The parameter is then trained with the algorithm's learning rate, classical or quantum, times the factor.
+
+    Raises
+    ------
+    ValueError
+        If a name is none of its parameters, or a factor is not above 0.
+    """
+    declared: Callable[[], Mapping[str, float]] | None = getattr(module, "learning_rates", None)
+    factors = {} if declared is None else {name: float(factor) for name, factor in declared().items()}
+    known = {name for name, _ in module.named_parameters()}
+    for name, factor in factors.items():
+        if name not in known or not 0 < factor < math.inf:
+            raise ValueError(
+                f"learning_rates() gives '{name}' the factor {factor:g}: name one of {', '.join(sorted(known))}, "
+                "and a number above 0"
+            )
+    return factors
+
+
 def count_parameters(module: nn.Module) -> tuple[int, int]:
     """Return the numbers of classical and quantum trainable scalars of one agent's module."""
     quantum = quantum_parameters(module)
@@ -94,17 +117,25 @@ class StackedPopulation(nn.Module):
     Modules that cannot be vmapped (data-dependent control flow, foreign code) are run in a loop over their
     slices instead; that is found out at the first forward pass, and `problem` says why. Other errors are the
     module's own, and raised. Buffers are read, never written.
+
+    Parameters
+    ----------
+    modules:
+        S built modules.
+    vmap:
+        False: run in a loop from the beginning, see `loop`.
     """
 
     problem: str | None = None
 
-    def __init__(self, modules: Sequence[nn.Module]) -> None:
+    def __init__(self, modules: Sequence[nn.Module], vmap: bool = True) -> None:
         super().__init__()
         first = modules[0]
         self.__dict__["_skeleton"] = _exact(copy.deepcopy(first))  # not a submodule: it owns no agent's state
         self._size = len(modules)
         self._quantum = frozenset(quantum_parameters(first))
-        self._vmap = True
+        self._rates = learning_rates(first)
+        self._vmap = vmap
         holder = copy.deepcopy(first)
         for name, _ in list(holder.named_parameters()):
             stacked = torch.stack([m.get_parameter(name).detach() for m in modules])
@@ -124,6 +155,10 @@ class StackedPopulation(nn.Module):
     def quantum_parameters(self) -> set[str]:
         """Return the names of the quantum parameters."""
         return set(self._quantum)
+
+    def learning_rates(self) -> dict[str, float]:
+        """Return the factors on learning rates, see the function of that name."""
+        return dict(self._rates)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
@@ -169,12 +204,31 @@ def stack(modules: Sequence[nn.Module]) -> nn.Module:
     ValueError
         If there is no module, or their parameters differ in name or shape.
     """
+    _require_alike(modules)
+    return StackedPopulation(modules)
+
+
+def _require_alike(modules: Sequence[nn.Module]) -> None:
     if not modules:
         raise ValueError("a population needs at least one module")
     shapes = [{name: tuple(p.shape) for name, p in m.named_parameters()} for m in modules]
     if any(s != shapes[0] for s in shapes):
         raise ValueError("the modules of a population must have the same parameters with the same shapes")
-    return StackedPopulation(modules)
+
+
+def loop(modules: Sequence[nn.Module], options: Any = None) -> nn.Module:
+    """Turn S modules of one architecture into a population that runs them one by one.
+
+    For modules that cannot be run by `torch.vmap`, code of another framework say: `population` of a model's spec is
+    then `"qrlsuite.population:loop"`, and nothing is tried or said at the first pass. It takes S times as long.
+
+    Raises
+    ------
+    ValueError
+        As `stack` does.
+    """
+    _require_alike(modules)
+    return StackedPopulation(modules, vmap=False)
 
 
 def joined(options: Sequence[Any]) -> Any:
@@ -221,7 +275,7 @@ class Adam:
         Module with parameters (S, ...).
     classical_lr, quantum_lr:
         Learning rates of the parameters outside and inside `quantum_parameters(population)`: of all agents, or float64
-        tensors (S,).
+        tensors (S,). A population's factors multiply them (`learning_rates`).
     betas, eps:
         Adam's constants.
     """
@@ -234,11 +288,14 @@ class Adam:
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:
-        quantum = quantum_parameters(population)
+        quantum, factors = quantum_parameters(population), learning_rates(population)
         self._named = [(name, p) for name, p in population.named_parameters() if p.requires_grad]
         if not self._named:
             raise ValueError("a population without trainable parameters has nothing to optimize")
         self._lr = {name: quantum_lr if name in quantum else classical_lr for name, _ in self._named}
+        for name, factor in factors.items():
+            if name in self._lr:
+                self._lr[name] = self._lr[name] * factor
         self.betas = betas
         self.eps = eps
         first = self._named[0][1]

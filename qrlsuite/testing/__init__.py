@@ -39,7 +39,8 @@ def check(kind: str, name_or_spec: Any, settings: Settings = None, **more: Any) 
     settings:
         Values of options; others take their defaults (and circuit models two qubits and one layer).
     more:
-        Of an environment: `deterministic=True` where all its episodes are meant to be alike.
+        Of an environment: `deterministic=True` where all its episodes are meant to be alike. Of an algorithm or model:
+        `task`, a task or its file, whose environment is taken in place of the toys.
 
     Raises
     ------

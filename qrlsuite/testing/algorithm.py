@@ -3,77 +3,129 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.error import InvalidAction
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from torch import Tensor
 
 from qrlsuite import population as populations
+from qrlsuite import specs
+from qrlsuite.actions import check_actions, size
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, array, differs
+from qrlsuite.testing.group import ROUNDS, E, ToyGroup, World, array, differs
 
 S = 5
 
 
-def check(subject: Subject) -> list[Finding]:
-    """Check an algorithm on an environment of four inputs and three actions."""
-    rules = Checklist()
+def check(subject: Subject, task: str | None = None) -> list[Finding]:
+    """Check an algorithm on toys: one for every kind of actions that its spec names, the first by all rules.
+
+    Parameters
+    ----------
+    task:
+        A task, or its file, whose environment is taken in place of the toys.
+    """
+    assert isinstance(subject.spec, specs.AlgorithmSpec)
+    if task is not None:
+        return _check(subject, World.of_task(task))
+    first, *others = subject.spec.actions
+    findings = _check(subject, World.toy(first))
+    if all(finding.ok for finding in findings):
+        for kind in others:
+            findings += _check_kind(subject, World.toy(kind), kind)
+    return findings
+
+
+def _check(subject: Subject, world: World) -> list[Finding]:
+    rules, trial = Checklist(), Trial(subject, world)
     with one_thread():
         cause = "the factory takes (envs, build_model, options, streams, device)"
-        if not rules.run(
-            "builds", "factory, and a population with one output per action", lambda: _builds(subject), cause
-        ):
+        looked_at = "factory, and a population with one output per action"
+        if not rules.run("builds", looked_at, lambda: _builds(trial), cause):
             return rules.findings
         cause = "start() resets the environments, train_epoch(rounds) steps them and returns metrics"
-        if not rules.run("trains", "an epoch gives metrics (S,) in float64", lambda: _trains(subject), cause):
+        if not rules.run("trains", "an epoch gives metrics (S,) in float64", lambda: _trains(trial), cause):
             return rules.findings
         rules.run(
-            "interactions",
-            f"{ROUNDS} rounds are {ROUNDS} steps of every lane",
-            lambda: _interactions(subject),
+            "interactions", f"{ROUNDS} rounds are {ROUNDS} steps of every lane", lambda: _interactions(trial)
         )
         cause = "act takes observations (S, B, inputs), B as many as validation has lanes"
-        rules.run(
-            "acts", "integers (S, B), the same every time, changing nothing", lambda: _acts(subject), cause
-        )
+        looked_at = "actions (S, B, ...), the same every time, changing nothing"
+        rules.run("acts", looked_at, lambda: _acts(trial), cause)
+        if trial.group([0]).remembers:
+            cause = "begins is (S, B): where it is true, what is remembered of the lane is forgotten"
+            looked_at = "what an episode left is forgotten where the next begins, lane by lane"
+            rules.run("memory of episodes", looked_at, lambda: _remembers(trial), cause)
         cause = "`qrlsuite evaluate` builds a new algorithm, never starts it, loads the policy, and calls act"
-        rules.run("learns", "every policy changes, and can be published", lambda: _learns(subject), cause)
-        rules.run("same seed", "the same streams give the same bits", lambda: _same(subject))
-        rules.run("different seed", "other seeds become other agents", lambda: _different(subject))
-        if not rules.run("state is seed-first", "every tensor of it", lambda: _seed_first(subject)):
+        rules.run("learns", "every policy changes, and can be published", lambda: _learns(trial), cause)
+        rules.run("same seed", "the same streams give the same bits", lambda: _same(trial))
+        rules.run("different seed", "other seeds become other agents", lambda: _different(trial))
+        if not rules.run("state is seed-first", "every tensor of it", lambda: _seed_first(trial)):
             return rules.findings
-        rules.run(
-            "seed independence", "alone, in pairs, shuffled: the same bits", lambda: _independence(subject)
-        )
+        looked_at = "alone, in pairs, shuffled: the same bits"
+        rules.run("seed independence", looked_at, lambda: _independence(trial))
         cause = (
             "an option marked per_agent is a float64 tensor (S,) where agents differ in it: Adam of "
             "qrlsuite.population takes one as a learning rate; reshape it to (S, 1, 1) before it multiplies (S, B, n)"
         )
-        rules.run(
-            "options per agent",
-            "two values in one population: the bits of each alone",
-            lambda: _per_agent(subject),
-            cause,
-        )
-        cause = "load_state_dict() takes what state_dict() returned, or slices of it, in place of start()"
-        rules.run("state", "saved, sliced and restored exactly", lambda: _state(subject), cause)
+        looked_at = "two values in one population: the bits of each alone"
+        rules.run("options per agent", looked_at, lambda: _per_agent(trial), cause)
+        rules.run("state", "saved, sliced and restored exactly", lambda: _state(trial), _RESTORES)
     return rules.findings
 
 
-def _builds(subject: Subject) -> None:
-    group = ToyGroup(subject, range(S))
+_RESTORES = "load_state_dict() takes what state_dict() returned, or slices of it, in place of start()"
+
+
+def _check_kind(subject: Subject, world: World, kind: str) -> list[Finding]:
+    """Check what depends on the kind of actions."""
+    rules, trial = Checklist(), Trial(subject, world)
+
+    def all_of_it() -> None:
+        for rule in (_trains, _interactions, _acts, _learns, _independence, _state):
+            rule(trial)
+
+    with one_thread():
+        cause = f"the spec says that it takes {kind} actions: build it for {world.space}"
+        looked_at = "it trains, acts, learns and resumes with them, seeds apart"
+        rules.run(f"{kind} actions", looked_at, all_of_it, cause)
+    return rules.findings
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An algorithm and the world in which it is checked."""
+
+    subject: Subject
+    world: World
+
+    def group(self, seeds: Sequence[int], lanes: int = E, options: Any = None) -> ToyGroup:
+        """Return a fresh group of seeds."""
+        return ToyGroup(self.subject, seeds, lanes, options, self.world)
+
+
+def _builds(trial: Trial) -> None:
+    group, space = trial.group(range(S)), trial.world.space
     require(
-        ACTIONS in group.outputs,
-        f"build_model was called with {group.outputs} outputs, and there are {ACTIONS} actions: take "
+        not isinstance(space, Discrete) or int(space.n) in group.outputs,
+        f"build_model was called with {group.outputs} outputs, and there are {size_of(space)} actions: take "
         "envs.single_action_space.n",
     )
 
 
-def _trains(subject: Subject) -> None:
-    metrics = ToyGroup(subject, range(S)).start().train()
+def size_of(space: Any) -> int:
+    """Return the number of choices of a discrete space, of the numbers of an action elsewhere."""
+    return int(space.n) if isinstance(space, Discrete) else size(space)
+
+
+def _trains(trial: Trial) -> None:
+    metrics = trial.group(range(S)).start().train()
     require(
         isinstance(metrics, dict), f"train_epoch returned {type(metrics).__name__}, not a dict of metrics"
     )
@@ -86,19 +138,19 @@ def _trains(subject: Subject) -> None:
         )
 
 
-def _interactions(subject: Subject) -> None:
-    group = ToyGroup(subject, range(S)).start()
+def _interactions(trial: Trial) -> None:
+    group = trial.group(range(S)).start()
     for epoch in (1, 2):
         group.train()
         require(
-            group.envs.steps == epoch * ROUNDS,
-            f"after {epoch} epochs of {ROUNDS} rounds the lanes were stepped {group.envs.steps} times: sample "
+            group.steps == epoch * ROUNDS,
+            f"after {epoch} epochs of {ROUNDS} rounds the lanes were stepped {group.steps} times: sample "
             "complexity counts interactions, so an epoch is cut where its rounds end, also inside an episode",
         )
 
 
-def _acts(subject: Subject) -> None:
-    group = ToyGroup(subject, range(S)).start()
+def _acts(trial: Trial) -> None:
+    group = trial.group(range(S)).start()
     group.train()
     before = group.save()
     first, second = group.act(), group.act()
@@ -106,15 +158,26 @@ def _acts(subject: Subject) -> None:
         isinstance(first, np.ndarray),
         f"act returned {type(first).__name__}, and must return a numpy array: end with .cpu().numpy()",
     )
-    require(
-        first.shape == (S, 8) and first.dtype == np.int64,
-        f"act returned {first.dtype} of shape {first.shape}, and must return int64 of shape ({S}, 8): one action per "
-        "observation, the best of the last axis by .argmax(2)",
+    space = trial.world.space
+    shape = (S, 8, *(space.shape or ()))
+    hint = (
+        "one action per observation, the best of the last axis by .argmax(2)"
+        if isinstance(space, Discrete)
+        else f"actions are those of {space}, and qrlsuite.actions.from_units maps numbers into a box"
     )
     require(
-        bool((first >= 0).all() and (first < ACTIONS).all()),
-        f"act chose {first.min()}..{first.max()}, and there are the actions 0..{ACTIONS - 1}",
+        first.shape == shape and first.dtype == space.dtype,
+        f"act returned {first.dtype} of shape {first.shape}, and must return {space.dtype} of shape {shape}: {hint}",
     )
+    if isinstance(space, Discrete):
+        require(
+            bool((first >= 0).all() and (first < space.n).all()),
+            f"act chose {first.min()}..{first.max()}, and there are the actions 0..{space.n - 1}",
+        )
+    try:
+        check_actions(first.reshape(S * 8, *shape[2:]), S * 8, space)
+    except InvalidAction as error:
+        require(False, f"act chose actions that are none of {space}: {error}")
     require(
         group.draws or np.array_equal(first, second),
         "act chooses differently on the same observations: it must be greedy, without exploration or sampling; an "
@@ -122,7 +185,7 @@ def _acts(subject: Subject) -> None:
     )
     name = differs(before, group.save())
     require(name is None, f"act changes the state '{name}': validation must leave no trace in training")
-    never = ToyGroup(subject, range(S)).start()
+    never = trial.group(range(S)).start()
     never.train(2)
     group.train()
     name = differs(never.save(), group.save())
@@ -133,8 +196,42 @@ def _acts(subject: Subject) -> None:
     )
 
 
-def _learns(subject: Subject) -> None:
-    group = ToyGroup(subject, range(S)).start()
+def _remembers(trial: Trial) -> None:
+    """What an algorithm remembers of an episode belongs to a lane, and ends with the episode."""
+    group = trial.group(range(S)).start()
+    group.train()
+    seen, begun = group.look(), np.zeros((S, 8), np.bool_)
+    fresh = group.act(seen)
+    group.act(seen[:, ::-1].copy(), begun)
+    require(
+        np.array_equal(group.act(seen), fresh),
+        "where all episodes begin, act chooses by what it saw in earlier ones: a validation would depend on the one "
+        "before it",
+    )
+    later = group.act(seen[:, ::-1].copy(), begun)
+    mixed = begun.copy()
+    mixed[:, 3] = True
+    group.act(seen)
+    chosen = group.act(seen[:, ::-1].copy(), mixed)
+    expected = later.copy()
+    group.act(seen)
+    expected[:, 3] = group.act(seen[:, ::-1].copy())[:, 3]
+    require(
+        np.array_equal(chosen, expected),
+        "where an episode begins in one lane, act forgets what it saw in others, or remembers it there",
+    )
+    group.act(group.look(3))
+    for name, value in group.algorithm.policy_state().items():
+        other = trial.group(range(S), lanes=1).algorithm.policy_state()[name]
+        require(
+            other.shape == value.shape,
+            f"policy '{name}' has shape {tuple(value.shape)} with {E} lanes and {tuple(other.shape)} with one: what is "
+            "remembered of episodes is no part of a policy",
+        )
+
+
+def _learns(trial: Trial) -> None:
+    group = trial.group(range(S)).start()
     before = {k: v.detach().clone() for k, v in group.algorithm.policy_state().items()}
     require(bool(before), "policy_state() is empty: it is what is published as the trained agents")
     for name, value in before.items():
@@ -150,7 +247,7 @@ def _learns(subject: Subject) -> None:
             f"after three epochs, {3 * ROUNDS * E} interactions, the policy of seed {s} is as it was: is the optimizer "
             "stepped, is policy_state() the network that act uses, and does learning begin so late by default?",
         )
-    other = ToyGroup(subject, range(S), lanes=1)
+    other = trial.group(range(S), lanes=1)
     with torch.no_grad():
         for name, value in other.algorithm.policy_state().items():
             value.copy_(after[name])
@@ -162,7 +259,7 @@ def _learns(subject: Subject) -> None:
 
 
 def _trained(
-    subject: Subject, seeds: Sequence[int], noise: int = 0, options: Any = None
+    trial: Trial, seeds: Sequence[int], noise: int = 0, options: Any = None
 ) -> dict[str, NDArray[Any]]:
     """Return everything after two epochs, with another global random state for every `noise`."""
     with torch.random.fork_rng(devices=[]):
@@ -170,7 +267,7 @@ def _trained(
         state = np.random.get_state()  # noqa: NPY002
         np.random.seed(noise)  # noqa: NPY002
         try:
-            group = ToyGroup(subject, seeds, options=options).start()
+            group = trial.group(seeds, options=options).start()
             metrics = group.train(2)
             return {
                 **group.save(),
@@ -181,8 +278,8 @@ def _trained(
             np.random.set_state(state)  # noqa: NPY002
 
 
-def _same(subject: Subject) -> None:
-    name = differs(_trained(subject, [0, 1], 1), _trained(subject, [0, 1], 2))
+def _same(trial: Trial) -> None:
+    name = differs(_trained(trial, [0, 1], 1), _trained(trial, [0, 1], 2))
     require(
         name is None,
         f"the same seeds trained twice differ in '{name}': draw from streams[s].numpy(name, epoch) or "
@@ -190,8 +287,8 @@ def _same(subject: Subject) -> None:
     )
 
 
-def _different(subject: Subject) -> None:
-    group = ToyGroup(subject, [0, 1]).start()
+def _different(trial: Trial) -> None:
+    group = trial.group([0, 1]).start()
     group.train(2)
     policy = group.algorithm.policy_state()
     require(
@@ -200,8 +297,8 @@ def _different(subject: Subject) -> None:
     )
 
 
-def _seed_first(subject: Subject) -> None:
-    group = ToyGroup(subject, range(S)).start()
+def _seed_first(trial: Trial) -> None:
+    group = trial.group(range(S)).start()
     group.train()
     state = group.algorithm.state_dict()
     require(bool(state), "state_dict() is empty: what training depends on is lost when a run is resumed")
@@ -214,10 +311,10 @@ def _seed_first(subject: Subject) -> None:
         )
 
 
-def _independence(subject: Subject) -> None:
-    whole = _trained(subject, range(S))
+def _independence(trial: Trial) -> None:
+    whole = _trained(trial, range(S))
     for members in (*SIZES, (2, 2)):  # a search trains one seed with several settings in one population
-        part = _trained(subject, members)
+        part = _trained(trial, members)
         name = differs(part, {key: value[list(members)] for key, value in whole.items()})
         require(
             name is None,
@@ -226,12 +323,12 @@ def _independence(subject: Subject) -> None:
         )
 
 
-def _per_agent(subject: Subject) -> None:
+def _per_agent(trial: Trial) -> None:
     """Train one seed with two values of each marked option: as two agents, and alone."""
-    for option, both in subject.per_agent().items():
-        together = _trained(subject, [0, 0], options=populations.joined(both))
+    for option, both in trial.subject.per_agent().items():
+        together = _trained(trial, [0, 0], options=populations.joined(both))
         for place, own in enumerate(both):
-            name = differs(_trained(subject, [0], options=own), {k: v[[place]] for k, v in together.items()})
+            name = differs(_trained(trial, [0], options=own), {k: v[[place]] for k, v in together.items()})
             require(
                 name is None,
                 f"an agent with {option} = {getattr(own, option):g} differs in '{name}' beside one with another value "
@@ -240,14 +337,14 @@ def _per_agent(subject: Subject) -> None:
             )
 
 
-def _state(subject: Subject) -> None:
-    straight = ToyGroup(subject, range(S)).start()
+def _state(trial: Trial) -> None:
+    straight = trial.group(range(S)).start()
     straight.train(2)
     saved = straight.save()
     metrics = straight.train(2)
     expected = {**straight.save(), **{f"metric {k}": v for k, v in metrics.items()}}
     for members in (list(range(S)), [3], [4, 1]):
-        other = ToyGroup(subject, members).load({key: value[members] for key, value in saved.items()})
+        other = trial.group(members).load({key: value[members] for key, value in saved.items()})
         metrics = other.train(2)
         got = {**other.save(), **{f"metric {k}": v for k, v in metrics.items()}}
         name = differs(got, {key: value[members] for key, value in expected.items()})

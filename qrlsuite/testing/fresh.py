@@ -6,6 +6,7 @@ import functools
 import hashlib
 import importlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -89,8 +90,13 @@ def resolved(references: Sequence[str]) -> dict[str, str | None]:
     return errors
 
 
-def built_in_order(subject: Any, inputs: int, outputs: int) -> dict[int, tuple[str, str]]:
+def built_in_order(subject: Any, shape: Sequence[int], outputs: int) -> dict[int, tuple[str, str]]:
     """Build two seeds of a model in two new interpreters, one in each order.
+
+    Parameters
+    ----------
+    shape:
+        Of an observation.
 
     Returns
     -------
@@ -102,7 +108,7 @@ def built_in_order(subject: Any, inputs: int, outputs: int) -> dict[int, tuple[s
     BrokenRuleError
         If an interpreter ends without an answer.
     """
-    common = [subject.spec.build, subject.spec.options, dict(subject.settings), inputs, outputs]
+    common = [subject.spec.build, subject.spec.options, dict(subject.settings), [*shape], outputs]
     processes = [
         subprocess.Popen(
             [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([_BUILD, *common, order])],
@@ -126,18 +132,27 @@ def built_in_order(subject: Any, inputs: int, outputs: int) -> dict[int, tuple[s
 
 
 def _build(
-    build: str, options: str, settings: dict[str, Any], inputs: int, outputs: int, order: Sequence[int]
+    build: str,
+    options: str,
+    settings: dict[str, Any],
+    shape: Sequence[int],
+    outputs: int,
+    order: Sequence[int],
 ) -> dict[int, str]:
     """Build seeds in this process, one after the other; returns digests of their parameters and buffers."""
     import torch
+    from gymnasium.spaces import Box
 
     from qrlsuite.training.fences import seeded
+    from qrlsuite.training.trainer import build_agent
 
+    space = Box(0.0, 1.0, tuple(shape))
     chosen = option_values.build(specs.resolve(options), settings, "the model")
     digests = {}
     for seed in order:
         with seeded(seed):
-            module = specs.resolve(build)(inputs, outputs, chosen, torch.Generator().manual_seed(seed))
+            generator = torch.Generator().manual_seed(seed)
+            module = build_agent(specs.resolve(build), math.prod(shape), outputs, chosen, generator, space)
         content = hashlib.sha256()
         for name, value in module.state_dict().items():
             content.update(

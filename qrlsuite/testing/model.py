@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import copy
+import inspect
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+from gymnasium.spaces import Box
+from gymnasium.spaces.utils import flatten_space
 from torch import Tensor, nn
 
 from qrlsuite import population as populations
@@ -15,10 +19,14 @@ from qrlsuite.errors import PluginError
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, BrokenRuleError, Checklist, Finding, one_thread, require
 from qrlsuite.testing.fresh import built_in_order
+from qrlsuite.testing.group import World
 from qrlsuite.training import unregistered
 from qrlsuite.training.fences import Fence, seeded
+from qrlsuite.training.trainer import build_agent, observed_space
 
-OBS, OUT, B, S = 4, 3, 6, 5
+OUT, B, S = 3, 6, 5
+FLAT, IMAGE = Box(-1.0, 1.0, (4,)), Box(0.0, 1.0, (10, 9, 2))
+"""What models observe here; the image those that ask for the space."""
 ODD = 5
 """Units of a layer, and what else an option counts, for which vectors of the processor leave a rest."""
 BATCHES = (B, 1, 3, 7, 13)
@@ -27,18 +35,23 @@ BATCHES = (B, 1, 3, 7, 13)
 class Subjects:
     """Builds agents and populations of the model that is checked."""
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, subject: Subject, task: str | None) -> None:
         spec = subject.spec
         assert isinstance(spec, specs.ModelSpec)
         self.spec, self.options, self.per_agent = spec, subject.options(), subject.per_agent()
         self.build = specs.resolve(spec.build)
+        asks = "space" in inspect.signature(self.build).parameters
+        self.space: Any = IMAGE if asks else FLAT
+        if task is not None:
+            self.space = observed_space(World.of_task(task).one)
+        self.inputs = math.prod(flatten_space(self.space).shape or ())
         self.sampled = getattr(self.options, "shots", None) is not None
         self.odd = {name: own for name, own in subject.counting(ODD).items() if self._builds(own)}
         """Options by the name of one that is an odd number, where the model can be built with it."""
 
     def _builds(self, options: Any) -> bool:
         try:
-            self.population([0], [options])(_x(1))
+            self.population([0], [options])(self.x(1))
         except Exception:  # a value that the model does not allow
             return False
         return True
@@ -47,8 +60,16 @@ class Subjects:
         """Return one agent, from a generator of that seed."""
         own = self.options if options is None else options
         with seeded(seed):  # as `run` builds it
-            agent: nn.Module = self.build(OBS, OUT, own, torch.Generator().manual_seed(seed))
-        return agent
+            return self.make(own, torch.Generator().manual_seed(seed))
+
+    def make(self, options: Any, generator: torch.Generator) -> nn.Module:
+        """Return one agent from a generator."""
+        return build_agent(self.build, self.inputs, OUT, options, generator, self.space)
+
+    def x(self, *lead: int, seed: int = 0, batch: int = B) -> Tensor:
+        """Return inputs (*lead, batch, inputs)."""
+        drawn = torch.rand(*lead, batch, self.inputs, generator=torch.Generator().manual_seed(seed))
+        return drawn * 2 - 1
 
     def population(self, seeds: Sequence[int], options: Sequence[Any] | None = None) -> nn.Module:
         """Return a population of freshly built agents, each with options of its own where these are given."""
@@ -60,9 +81,15 @@ class Subjects:
         return population
 
 
-def check(subject: Subject) -> list[Finding]:
-    """Check a model with 4 inputs and 3 outputs."""
-    subjects = Subjects(subject)
+def check(subject: Subject, task: str | None = None) -> list[Finding]:
+    """Check a model with 4 inputs and 3 outputs, or with an image where it asks for the observations' space.
+
+    Parameters
+    ----------
+    task:
+        A task, or its file, whose observations are taken instead.
+    """
+    subjects = Subjects(subject, task)
     rules = Checklist()
     with one_thread():
         if not rules.run(
@@ -83,9 +110,12 @@ def check(subject: Subject) -> list[Finding]:
         rules.run("quantum parameters", "declared where the family is quantum", lambda: _quantum(subjects))
         rules.run("same seed", "the generator alone decides the parameters", lambda: _same(subjects))
         rules.run("different seed", "every generator gives other parameters", lambda: _different(subjects))
-        if subject.modules and subject.distribution != "qrlsuite":  # whose streams its tests hold
+        of_others = subject.modules and subject.distribution != "qrlsuite"  # whose streams its tests hold
+        if of_others and isinstance(subjects.space, Box):
             rules.run(
-                "build order", "a seed has its parameters, whichever is built first", lambda: _order(subject)
+                "build order",
+                "a seed has its parameters, whichever is built first",
+                lambda: _order(subject, subjects),
             )
         rules.run("global randomness", "a pass moves no global generator", lambda: _global(subjects))
         rules.run("pure", "a pass changes neither inputs nor results of the next", lambda: _pure(subjects))
@@ -116,10 +146,6 @@ def check(subject: Subject) -> list[Finding]:
     return rules.findings
 
 
-def _x(*lead: int, seed: int = 0, batch: int = B) -> Tensor:
-    return torch.rand(*lead, batch, OBS, generator=torch.Generator().manual_seed(seed)) * 2 - 1
-
-
 def _builds(subjects: Subjects) -> None:
     agent = subjects.agent(0)
     require(
@@ -131,12 +157,12 @@ def _builds(subjects: Subjects) -> None:
 def _shapes(subjects: Subjects) -> None:
     agent = subjects.agent(0)
     for batch in (B, 1):
-        values = agent(_x()[:batch])
+        values = agent(subjects.x()[:batch])
         require(isinstance(values, Tensor), f"forward returned {type(values).__name__}, not a tensor")
         require(
             tuple(values.shape) == (batch, OUT),
-            f"forward maps ({batch}, {OBS}) to {tuple(values.shape)}, and it must give ({batch}, {OUT}): the last "
-            "layer has as many outputs as there are actions, and the batch comes first",
+            f"forward maps ({batch}, {subjects.inputs}) to {tuple(values.shape)}, and it must give ({batch}, {OUT}): "
+            "the last layer has as many outputs as there are actions, and the batch comes first",
         )
         require(
             values.dtype == torch.float32,
@@ -184,7 +210,9 @@ def _registered(subjects: Subjects) -> None:
 
 def _unregistered(subjects: Subjects) -> None:
     try:
-        unregistered.require_none(subjects.agent, OBS, subjects.spec.name, subjects.spec.population is None)
+        unregistered.require_none(
+            subjects.agent, subjects.inputs, subjects.spec.name, subjects.spec.population is None
+        )
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
 
@@ -240,7 +268,7 @@ def _different(subjects: Subjects) -> None:
     generator, built = torch.Generator().manual_seed(7), []
     for call in range(2):
         with seeded(call):
-            built.append(_values(subjects.build(OBS, OUT, subjects.options, generator)))
+            built.append(_values(subjects.make(subjects.options, generator)))
     require(
         _equal(*built) is not None,
         "the second network from one generator (a critic, say) equals the first: draw from the generator, do not "
@@ -248,9 +276,9 @@ def _different(subjects: Subjects) -> None:
     )
 
 
-def _order(subject: Subject) -> None:
+def _order(subject: Subject, subjects: Subjects) -> None:
     """Build two seeds in fresh processes, in both orders."""
-    for seed, (first, second) in built_in_order(subject, OBS, OUT).items():
+    for seed, (first, second) in built_in_order(subject, subjects.space.shape, OUT).items():
         require(
             first == second,
             f"seed {seed} has other parameters where another seed is built before it: something is kept from the first "
@@ -263,7 +291,7 @@ def _global(subjects: Subjects) -> None:
     agent = subjects.agent(0)
     try:
         with Fence(closed=True, alone=True).around("a pass"):
-            agent(_x())
+            agent(subjects.x())
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
 
@@ -277,7 +305,7 @@ def _require_close(values: Tensor, others: Tensor, message: str) -> None:
 
 
 def _rows(subjects: Subjects) -> None:
-    agent, x = subjects.agent(0), _x()
+    agent, x = subjects.agent(0), subjects.x()
     values = agent(x)
     for row in (0, B - 1):
         _require_close(
@@ -289,7 +317,7 @@ def _rows(subjects: Subjects) -> None:
 
 
 def _cache(subjects: Subjects) -> None:
-    first, second = _x(seed=0), _x(seed=1)
+    first, second = subjects.x(seed=0), subjects.x(seed=1)
     subjects.agent(0)(first)
     agent = subjects.agent(1)
     values = agent(second)
@@ -302,7 +330,7 @@ def _cache(subjects: Subjects) -> None:
 
 
 def _pure(subjects: Subjects) -> None:
-    agent, x = subjects.agent(0), _x()
+    agent, x = subjects.agent(0), subjects.x()
     kept = x.clone()
     first = agent(x).detach().clone()
     require(
@@ -330,7 +358,7 @@ def _gradients(module: nn.Module, x: Tensor) -> dict[str, Tensor | None]:
 
 
 def _flow(subjects: Subjects) -> None:
-    for name, gradient in _gradients(subjects.agent(0), _x()).items():
+    for name, gradient in _gradients(subjects.agent(0), subjects.x()).items():
         require(
             gradient is not None,
             f"parameter '{name}' gets no gradient: forward does not use it, or detaches what it gave",
@@ -345,7 +373,7 @@ def _flow(subjects: Subjects) -> None:
 
 def _differences(subjects: Subjects) -> None:
     agent = subjects.agent(0).double()
-    x = _x().double()
+    x = subjects.x().double()
     gradients = {name: g.clone() for name, g in _gradients(agent, x).items() if g is not None}
     exact_type = next(iter(gradients.values())).dtype == torch.float64
     step, tolerance = (1e-6, 1e-4) if exact_type else (1e-2, 5e-2)
@@ -371,7 +399,7 @@ def _differences(subjects: Subjects) -> None:
 
 
 def _copies(subjects: Subjects) -> None:
-    agent, x = subjects.agent(0), _x()
+    agent, x = subjects.agent(0), subjects.x()
     agent(x)
     copied = copy.deepcopy(agent)
     name = _equal(_values(agent), _values(copied))
@@ -389,11 +417,12 @@ def _copies(subjects: Subjects) -> None:
 
 
 def _population(subjects: Subjects) -> None:
-    together, x = subjects.population(range(S)), _x(S)
+    together, x = subjects.population(range(S)), subjects.x(S)
     values = together(x)
     require(
         tuple(values.shape) == (S, B, OUT),
-        f"the population maps ({S}, {B}, {OBS}) to {tuple(values.shape)}, and it must give ({S}, {B}, {OUT})",
+        f"the population maps ({S}, {B}, {subjects.inputs}) to {tuple(values.shape)}, and it must give "
+        f"({S}, {B}, {OUT})",
     )
     agent = subjects.agent(2)
     mine = {name: tuple(p.shape) for name, p in agent.named_parameters()}
@@ -433,7 +462,7 @@ def _independence(subjects: Subjects) -> None:
 
 def _independent(subjects: Subjects, own: Any, batch: int, at: str) -> None:
     """Compare agents with options `own`, alone and among others, for a batch; `at` names the options in messages."""
-    x = 3 * _x(S, batch=batch)  # where functions bend
+    x = 3 * subjects.x(S, batch=batch)  # where functions bend
     gradients = _gradients(subjects.population(range(S), [own] * S), x)
     values = subjects.population(range(S), [own] * S)(x).detach()
     for members in SIZES:
@@ -454,7 +483,7 @@ def _independent(subjects: Subjects, own: Any, batch: int, at: str) -> None:
 
 def _per_agent(subjects: Subjects) -> None:
     """Build one seed with two values of each marked option: as two agents, and alone."""
-    x = _x()
+    x = subjects.x()
     for option, both in subjects.per_agent.items():
         together = subjects.population([0, 0], both)
         values, gradients = together(x.expand(2, -1, -1)).detach(), _gradients(together, x.expand(2, -1, -1))
@@ -475,7 +504,7 @@ def _per_agent(subjects: Subjects) -> None:
 
 def _state(subjects: Subjects) -> None:
     first, second = subjects.population(range(S)), subjects.population(range(10, 10 + S))
-    x = _x(S)
+    x = subjects.x(S)
     first(x)  # a pass may advance a counter
     state = _values(first)
     for name, value in state.items():

@@ -151,26 +151,35 @@ def first_network(entry: Entry) -> nn.Module:
         else:
             raise PluginError(f"algorithm '{entry.algorithm.name}' builds no network when it is made")
     with _building(entry.model), seeded(0):
-        return build_agent(entry.model, envs, inputs, outputs, role, entry.model_options, torch.Generator())
+        return build_agent(
+            specs.resolve(entry.model.build),
+            inputs,
+            outputs,
+            entry.model_options,
+            torch.Generator(),
+            observed_space(envs),
+            role,
+        )
+
+
+def observed_space(envs: LaneEnv) -> spaces.Space[Any]:
+    """Return the space of observations before they were flattened, as models that ask for it get it."""
+    return envs.single_observation_space if envs.unflattened_space is None else envs.unflattened_space
 
 
 def build_agent(
-    spec: specs.ModelSpec,
-    envs: LaneEnv,
+    build: Callable[..., nn.Module],
     inputs: int,
     outputs: int,
-    role: str,
     options: Any,
     generator: torch.Generator,
+    space: spaces.Space[Any],
+    role: str = "network",
 ) -> nn.Module:
-    """Build one agent's network, for which `build` of the model is also given what it asks for: `space`, `role`."""
-    build = specs.resolve(spec.build)
-    more = {"space": envs.unflattened_space or envs.single_observation_space, "role": role}
+    """Build one agent's network by `build` of a model, which is also given what it asks for: `space`, `role`."""
     asked = inspect.signature(build).parameters
-    model: nn.Module = build(
-        inputs, outputs, options, generator, **{name: value for name, value in more.items() if name in asked}
-    )
-    return model
+    more = {name: value for name, value in (("space", space), ("role", role)) if name in asked}
+    return build(inputs, outputs, options, generator, **more)
 
 
 def count_parameters(entry: Entry) -> tuple[int, int]:
@@ -283,7 +292,7 @@ class ModelBuilder:
         self.fence = fence or Fence(closed=False)
         self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
         self.entry = self.entries[0]
-        self.envs = envs
+        self.space = observed_space(envs)
         self.observation_size = int(np.prod(envs.single_observation_space.shape or (1,)))
         self.streams = streams
         self.statistics = statistics
@@ -297,12 +306,12 @@ class ModelBuilder:
         call = len(self.built)
         given = self.observation_size if inputs is None else inputs
         with _building(spec):
+            build = specs.resolve(spec.build)
 
             def agent(streams: Streams, own: Any) -> nn.Module:
                 with seeded(stream_key(streams.task_hash, streams.seed, "build", call)):
-                    return build_agent(
-                        spec, self.envs, given, outputs, role, own, streams.torch("init", call)
-                    )
+                    generator = streams.torch("init", call)
+                    return build_agent(build, given, outputs, own, generator, self.space, role)
 
             first = self.streams[0]
             two = first, Streams(first.task_hash, first.seed + 1)

@@ -141,7 +141,7 @@ def test_an_environment_is_checked_as_a_task_has_it(
     assert (
         "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
     )
-    assert "--task and --deterministic are for an environment" in check("mlp", "--deterministic")[2]
+    assert "--deterministic is for an environment" in check("mlp", "--deterministic")[2]
 
 
 def test_ppo_that_draws_in_validation_keeps_the_rules(check: Command) -> None:

@@ -307,3 +307,46 @@ def test_state_round_trip() -> None:
         assert torch.equal(x, y)
     merged = population.prefixed(x=first.state_dict(), y=second.state_dict())
     assert set(population.part(merged, "x")) == set(first.state_dict())
+
+
+class Scaled(nn.Linear):
+    """A layer whose bias learns three times as fast."""
+
+    def learning_rates(self) -> dict[str, float]:
+        return {"bias": 3.0}
+
+
+def test_a_module_says_how_fast_its_parameters_learn() -> None:
+    together = population.stack([Scaled(4, 2), Scaled(4, 2)])
+    before = {name: value.detach().clone() for name, value in together.named_parameters()}
+    adam = Adam(together, 0.01, 1.0)
+    together(torch.ones(2, 3, 4)).sum().backward()  # Adam's first step is the learning rate
+    adam.step()
+    for name, rate in (("weight", 0.01), ("bias", 0.03)):
+        change = (before[name] - together.get_parameter(name)).abs()
+        torch.testing.assert_close(change, torch.full_like(change, rate), rtol=1e-4, atol=1e-7)
+    for wrong in ({"nothing": 1.0}, {"bias": 0.0}):
+        layer = Scaled(4, 2)
+        layer.learning_rates = lambda wrong=wrong: wrong  # type: ignore[method-assign, assignment, misc]
+        with pytest.raises(ValueError, match="name one of bias, weight, and a number above 0"):
+            Adam(population.stack([layer]), 0.01, 1.0)
+
+
+class Abroad(nn.Linear):
+    """Leaves torch for numpy and comes back, without gradients."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(torch.from_numpy(input.numpy() * 2))
+
+
+def test_a_loop_runs_modules_as_they_are() -> None:
+    modules = [Abroad(4, 2) for _ in range(3)]
+    together, x = population.loop(modules), torch.randn(3, 5, 4)
+    for s, module in enumerate(modules):
+        torch.testing.assert_close(together(x)[s], module(x[s]))
+    assert together.problem is None
+    assert {name: tuple(p.shape) for name, p in together.named_parameters()} == {
+        "weight": (3, 2, 4), "bias": (3, 2)
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="at least one module"):
+        population.loop([])

@@ -37,7 +37,8 @@ def check(
     task: Annotated[
         str | None,
         typer.Option(
-            "--task", help="Check an environment with the options that this task, or task file, gives it."
+            "--task",
+            help="Take the options of this task, or task file, for an environment, and its environment for others.",
         ),
     ] = None,
     deterministic: Annotated[
@@ -56,12 +57,20 @@ def check(
         _teach(json_output)
         return
     items = selection.select(name)
-    more = {"deterministic": True} if deterministic else {}
-    if (task or deterministic) and [item.kind for item in items] != [specs.EnvironmentSpec]:
+    more: dict[str, Any] = {"deterministic": True} if deterministic else {}
+    kinds = [item.kind for item in items]
+    if deterministic and kinds != [specs.EnvironmentSpec]:
+        raise typer.BadParameter("--deterministic is for an environment: qrlsuite check environment:NAME")
+    if task and kinds not in ([specs.EnvironmentSpec], [specs.AlgorithmSpec], [specs.ModelSpec]):
         raise typer.BadParameter(
-            "--task and --deterministic are for an environment: qrlsuite check environment:NAME"
+            "--task is for one environment, algorithm or model: qrlsuite check KIND:NAME --task TASK"
         )
-    chosen = {} if task is None else _options_in(task, items[0])
+    chosen = {}
+    if task and kinds == [specs.EnvironmentSpec]:
+        chosen = _options_in(task, items[0])
+    elif task:
+        load_task(task)
+        more["task"] = task
     chosen |= {setting.name: setting.value for setting in map(parse_setting, settings or [])}
     if chosen and len(items) > 1:
         raise typer.BadParameter("--set is for one thing: name it, qrlsuite check KIND:NAME --set NAME=VALUE")
