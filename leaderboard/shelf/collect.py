@@ -144,7 +144,7 @@ def select(
         (copy.task_hash, copy.name): copy
         for name in names
         for copy in (
-            [name] if isinstance(name, EntryResults) else _shown(_read_copies(runs, name, published, tasks))
+            [name] if isinstance(name, EntryResults) else _shown(read_copies(runs, name, published, tasks))
         )
     }
     entries, left_out = list(named.values()), list[str]()
@@ -219,7 +219,7 @@ def find(runs: Path, name: str, published: bool = False, tasks: Collection[str] 
     UnknownNameError
         If none or several match; the message says what to type.
     """
-    return best(_read_copies(runs, name, published, tasks))
+    return best(read_copies(runs, name, published, tasks))
 
 
 def best(copies: Iterable[EntryResults]) -> EntryResults:
@@ -227,8 +227,8 @@ def best(copies: Iterable[EntryResults]) -> EntryResults:
     return max(copies, key=_weight)
 
 
-def _read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
-    """Read the copies of the entry that has a name; `NAME @MARK` names its seeds of one code."""
+def read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) -> list[EntryResults]:
+    """Read the copies of the entry that has a name, see `find`; `NAME @MARK` names its seeds of one code."""
     try:
         found, mark = _every_copy(runs, name, published, tasks), ""
     except UnknownNameError:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as encode
 
 from qrlsuite.engine.terminal import command
-from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment.entry import from_record
 from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
@@ -195,7 +195,15 @@ class PublishedAgents(EntryStore):
         if not self.published.agents:
             record = self.published.record
             words = command("run", "--task", record["task_name"], record["label"], runs=runs)
-            raise StoreError(f"{folder} is published as curves without agents; {words} trains it here")
+            with_agents = [
+                f"{p.parent.parent.name}/{p.parent.name}"
+                for at in folders()
+                for p in at.glob(f"*/*/{AGENTS}")
+            ]
+            others = f" (published with agents: {listed(sorted(with_agents))})" if with_agents else ""
+            raise StoreError(
+                f"{folder} is published as curves without agents{others}; {words} trains it here"
+            )
         self.agents = self.published.parameters()
         stated = self.published.record["published"]["agents"]["sha256"]
         self.evaluations = runs / folder.parent.name / folder.name / f"evaluations-{stated[:16]}"

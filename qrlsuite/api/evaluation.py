@@ -15,15 +15,19 @@ from rich.progress import TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from qrlsuite import registry, specs
 from qrlsuite.engine.display import Bar
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.experiment.task import Task, load
 from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.leaderboard.shelf import collect
+from qrlsuite.leaderboard.shelf import published as published_entries
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.published import PublishedAgents
 from qrlsuite.notation import parse_named
-from qrlsuite.results import lookup
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, entries
 from qrlsuite.training import evaluation
 from qrlsuite.training.deployment import Deployment, steps_per_episode
 from qrlsuite.training.entanglement import PARAMETERS, Entanglement, along_episodes
@@ -176,6 +180,8 @@ def evaluate(
     entanglement: bool = False,
     backend: str | None = None,
     yes: bool = False,
+    published: bool = False,
+    perturb: Sequence[float] = (),
 ) -> Evaluation:
     """Play fresh episodes with the best trained agents of some entries, and with the reference policies.
 
@@ -186,7 +192,8 @@ def evaluate(
     names:
         The entries, of one task, as `qrlsuite.leaderboard.shelf.collect.find` finds them.
     task:
-        Look among the entries of this task only.
+        The task that is played, by name or file. Entries are looked for among its own; one that is named with another
+        task before it (`TASK/ENTRY`), or by its folder, plays it too, where observations and actions are the same.
     best, episodes, seed, device:
         As for `qrlsuite.training.evaluation.trained`.
     progress:
@@ -198,32 +205,39 @@ def evaluate(
         `qrlsuite.training.deployment`. What this costs is said first; finished episodes are kept.
     yes:
         Execute circuits on a device that is no simulator.
+    published:
+        Look among the published entries that come with the suite, too.
+    perturb:
+        Play every entry with its parameters perturbed by each of these relative sizes, too.
 
     Raises
     ------
     UnknownNameError
         If no entry, or several, have a name, or no task has the name given.
     OptionError
-        If no entry is named, the entries belong to several tasks, or a number is not positive.
+        If no entry is named, the entries belong to several tasks, or a number is not positive; or agents cannot play
+        the task.
     StoreError
         If an entry has no trained agent.
     """
-    lookup.check_tasks(runs, task)
     if not names:
         raise OptionError("name at least one entry to evaluate")
-    tasks = [task] if task else []
-    folders = dict.fromkeys(collect.find(runs, name, tasks=tasks).folder.resolve() for name in names)
-    stores = [EntryStore(folder) for folder in folders]
-    _one_task(stores)
+    on = None if task is None else the_task(runs, task, published)
+    found = (find(runs, name, None if on is None else on.name, published) for name in names)
+    stores = list({store.path.resolve(): store for store in found}.values())
+    if on is None:
+        _one_task(stores)
     there = parse_named(backend, "--backend ") if backend else None
-    deployed = [Deployment(store, *there, best, device) for store in stores] if there else []
+    deployed = [Deployment(store, *there, best, device, on) for store in stores] if there else []
     console = Console(stderr=True, quiet=not progress, highlight=False)
     for each, store in zip(deployed, stores):
-        cost = each.cost(episodes, seed, steps_per_episode(store, best, episodes, seed, device))
+        cost = each.cost(episodes, seed, steps_per_episode(store, best, episodes, seed, device, on))
         if not each.simulator and not yes:
             raise OptionError(f"{each.name} is no simulator: {cost}; add --yes to execute them")
         console.print(f"{each.name}: {cost}", soft_wrap=True)
-    measured = tuple(along_episodes(s, best, episodes, seed, device) for s in stores) if entanglement else ()
+    measured = (
+        tuple(along_episodes(s, best, episodes, seed, device, on) for s in stores) if entanglement else ()
+    )
     bar = Bar(console, TimeRemainingColumn())
 
     def report(name: str, done: int, total: int) -> None:
@@ -233,9 +247,11 @@ def evaluate(
             bar.stop()
 
     try:
-        played = [evaluation.trained(store, best, episodes, seed, device, report) for store in stores]
+        more = (best, episodes, seed, device, report, on)
+        played = [evaluation.trained(store, *more) for store in stores]
         elsewhere = [each.play(episodes, seed, report) for each in deployed]
-        entry = stores[0].entry()
+        elsewhere += [evaluation.trained(store, *more, scale) for store in stores for scale in perturb]
+        entry = evaluation.trained_entry(stores[0], on)
         references = evaluation.references(entry, episodes, seed, report)
     finally:
         bar.stop()
@@ -249,10 +265,68 @@ def evaluate(
     )
 
 
+def the_task(runs: Path, name: str, published: bool = False) -> Task:
+    """Return a task: a registered one, a file's, or one that entries here have.
+
+    Raises
+    ------
+    UnknownNameError
+        With the nearest name.
+    """
+    registered = name.endswith(".toml") or name in registry.load().of(specs.TaskSpec)
+    if registered:
+        return load(name)
+    collect.check_tasks(runs, [name], published)
+    for folder in (runs, *(published_entries.folders() if published else ())):
+        if folder.is_dir() and (stores := entries(folder, name)):
+            return stores[0].entry().task
+    return load(name)
+
+
+def find(runs: Path, name: str, task: str | None = None, published: bool = False) -> EntryStore:
+    """Return where the trained agents of an entry are; of copies that have some, the better one.
+
+    Parameters
+    ----------
+    task:
+        Look among the entries of this task, unless the name says which one: `TASK/ENTRY`, or a folder.
+
+    Raises
+    ------
+    UnknownNameError
+        If none or several match.
+    StoreError
+        If it is published, and without agents.
+    """
+    before, slash, _ = name.partition("/")
+    placed = (Path(name) / "entry.json").exists() or (slash and "=" not in before)
+    try:
+        copies = collect.read_copies(runs, name, published, [] if placed or task is None else [task])
+    except UnknownNameError:
+        if placed or task is None:
+            raise
+        other = collect.read_copies(runs, name, published, [])[0].task
+        raise UnknownNameError(
+            f"task '{task}' has no entry '{name}' in {runs}; to let agents play it that were trained on '{other}', "
+            f"write '{other}/{name}'"
+        ) from None
+    chosen = collect.best([copy for copy in copies if _has_agents(copy)] or copies)
+    if chosen.source == "published":
+        return PublishedAgents(chosen.folder, runs)
+    return EntryStore(chosen.folder)
+
+
+def _has_agents(copy: EntryResults) -> bool:
+    if copy.source == "published":
+        return (copy.folder / published_entries.AGENTS).is_file()
+    store = EntryStore(copy.folder)
+    return any(store.seed(seed).agent.is_file() for seed in copy.seeds)
+
+
 def _one_task(stores: Sequence[EntryStore]) -> None:
     tasks = {store.record()["task_hash"]: store.record()["task_name"] for store in stores}
     if len(tasks) > 1:
         raise OptionError(
             f"the entries belong to different tasks ({', '.join(sorted(tasks.values()))}), whose episodes and sums "
-            "cannot be compared: evaluate them one by one"
+            "cannot be compared: evaluate them one by one, or say which task all play, --task TASK"
         )

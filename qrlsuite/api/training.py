@@ -213,7 +213,9 @@ def evaluate(
     seed: int = 0,
     device: str = "cpu",
     backend: str | None = None,
+    perturb: float | Sequence[float] = (),
     yes: bool = False,
+    published: bool = False,
     runs: str | PathLike[str] = "runs",
     progress: bool = True,
 ) -> Evaluation:
@@ -227,7 +229,8 @@ def evaluate(
     entries:
         One or several entries of one task, each by name, label, the beginning of one of them, or folder.
     task:
-        Look among the entries of this task only.
+        The task that is played, by name or file: its own entries are meant, and those named `TASK/ENTRY`, or by their
+        folder, play it too, where observations and actions are the same. None plays the entries' own.
     best:
         How many agents of each entry.
     episodes:
@@ -239,8 +242,13 @@ def evaluate(
     backend:
         Let the same agents act on this circuit backend, too: `native`, `pennylane`, `qiskit`, or a plugin's, with
         options if need be: `"qiskit shots=1000"`. Finished episodes are kept in the entry's folder.
+    perturb:
+        Let them play with perturbed parameters, too: each trained number times 1 + perturb * z, z standard normal, for
+        every size that is given.
     yes:
         Execute circuits on a device that is no simulator.
+    published:
+        Look among the published entries that come with the suite, too.
     runs:
         The results folder.
     progress:
@@ -257,7 +265,7 @@ def evaluate(
     UnknownNameError
         If no entry, or several, have a name.
     OptionError
-        If the entries belong to different tasks, or a number cannot be used.
+        If the entries belong to different tasks, a number cannot be used, or agents cannot play the task.
     StoreError
         If an entry has no trained agent.
 
@@ -283,4 +291,6 @@ def evaluate(
         progress=progress,
         backend=backend,
         yes=yes,
+        published=published,
+        perturb=[perturb] if isinstance(perturb, int | float) else list(perturb),
     )

@@ -23,15 +23,23 @@ from qrlsuite import options, registry, specs
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.task import Task
 from qrlsuite.results.store import EntryStore, append, drop_torn_line, json_line, read_lines
 from qrlsuite.seeding import Streams
-from qrlsuite.training.evaluation import Played, Report, Round, best_runs, play, trained_agents, trained_entry
+from qrlsuite.training.evaluation import (
+    Played,
+    Report,
+    Round,
+    best_runs,
+    play,
+    policy_name,
+    trained_agents,
+    trained_entry,
+)
 from qrlsuite.training.trainer import Policy, Trainer, first_network
 
 LANES = 10
 """Episodes of every agent in a round: what a device that stops half-way can lose."""
-
-FOLDER = "evaluations"
 
 
 def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
@@ -122,9 +130,15 @@ class Deployment:
     """
 
     def __init__(
-        self, store: EntryStore, backend: str, values: Mapping[str, Any], best: int, device: str = "cpu"
+        self,
+        store: EntryStore,
+        backend: str,
+        values: Mapping[str, Any],
+        best: int,
+        device: str = "cpu",
+        on: Task | None = None,
     ) -> None:
-        entry = trained_entry(store)
+        entry = trained_entry(store, on)
         self.entry = on_backend(entry, backend, values)
         self.seeds, self.validation, self.runs = best_runs(store, best)
         # Not the agents yet: what builds a population tries it out, which on a device executes circuits.
@@ -133,15 +147,17 @@ class Deployment:
         self.shots: int | None = network.executions.shots
         self._store, self._device = store, device
         chosen = " ".join(f"{name}={value}" for name, value in values.items())
-        self.name = f"{entry.label} on {backend}{' ' if chosen else ''}{chosen}"
-        self.folder = store.path / FOLDER
-        self._description = {
+        self.name = f"{policy_name(store, on)} on {backend}{' ' if chosen else ''}{chosen}"
+        self.folder = store.evaluations
+        self._description: dict[str, Any] = {
             "format_version": 1,
             "model": self.entry.model.name,
             "model_options": options.plain(self.entry.model_options),
             "epochs": [int((store.seed(seed).record() or {})["epochs"]) for seed in self.seeds],
             "agents": self.seeds,
         }
+        if entry.task.hash != store.record()["task_hash"]:
+            self._description["task_hash"] = entry.task.hash
 
     @cached_property
     def agents(self) -> Trainer:
@@ -240,9 +256,11 @@ class Kept:
         append(self.path, json_line(line))
 
 
-def steps_per_episode(store: EntryStore, best: int, episodes: int, seed: int, device: str = "cpu") -> float:
+def steps_per_episode(
+    store: EntryStore, best: int, episodes: int, seed: int, device: str = "cpu", on: Task | None = None
+) -> float:
     """Return the mean steps of the first of the evaluation's episodes, played as the agents were trained."""
-    entry = trained_entry(store)
+    entry = trained_entry(store, on)
     seeds, _, _ = best_runs(store, best)
     agents = trained_agents(entry, store, seeds, device)
     few = min(episodes, LANES)

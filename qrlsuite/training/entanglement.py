@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.task import Task
 from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
@@ -97,13 +98,18 @@ def half_cut_entropy(states: Tensor) -> Tensor:
 
 
 def along_episodes(
-    store: EntryStore, best: int = 10, episodes: int = EPISODES, seed: int = 0, device: str = "cpu"
+    store: EntryStore,
+    best: int = 10,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    device: str = "cpu",
+    on: Task | None = None,
 ) -> Entanglement:
     """Play with the best agents of an entry and measure their circuits' states.
 
     Parameters
     ----------
-    best, seed, device:
+    best, seed, device, on:
         As for `qrlsuite.training.evaluation.trained`; the episodes are the first of those.
     episodes:
         Episodes of each agent; more than `EPISODES` are not played.
@@ -117,7 +123,7 @@ def along_episodes(
     EnvironmentFailure
         If the environment fails.
     """
-    entry = store.entry()
+    entry = evaluation.trained_entry(store, on)
     states_of(Trainer(entry, [0], device).models.built[0], entry, torch.zeros(1, 1, 0), check=True)
     seeds, _, _ = evaluation.best_runs(store, best)
     agents = evaluation.trained_agents(entry, store, seeds, device)
@@ -135,7 +141,7 @@ def along_episodes(
         for measure, per_step in zip(MEASURES, zip(*rows)):
             array = torch.stack(list(per_step), dim=-1).double().cpu().numpy()
             values[measure][which] = np.where(steps < lengths[..., None], array, np.nan)
-    return Entanglement(entry.label, qubits, tuple(seeds), steps, values)
+    return Entanglement(evaluation.policy_name(store, on), qubits, tuple(seeds), steps, values)
 
 
 def states_of(network: nn.Module, entry: Entry, x: Tensor, check: bool = False) -> Tensor:

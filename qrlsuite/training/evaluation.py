@@ -9,12 +9,13 @@ counted more often than long ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, PluginError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
+from qrlsuite.experiment.task import Task
 from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
@@ -208,20 +210,54 @@ def _misfit(expected: Mapping[str, torch.Tensor], stored: Mapping[str, NDArray[A
     return None
 
 
-def trained_entry(store: EntryStore) -> Entry:
-    """Return a stored entry that was trained here.
+def trained_entry(store: EntryStore, on: Task | None = None) -> Entry:
+    """Return a stored entry whose agents are to play.
+
+    Parameters
+    ----------
+    on:
+        The task that they play, if it is not the one that they were trained on.
 
     Raises
     ------
     StoreError
-        If it was imported, and has no trained agents.
+        If it was imported from other files, and has no trained agents.
+    OptionError
+        If observations or actions of that task are others.
     """
     if store.record().get("imported"):
         raise StoreError(
             f"{store.path} was imported from other files, which hold learning curves and no trained parameters: "
             "train the entry here with `qrlsuite run` to evaluate its policies"
         )
-    return store.entry()
+    entry = store.entry()
+    if on is None or on.hash == entry.task.hash:
+        return entry
+    there = replace(entry, task=on)
+    envs = [build_envs(each, 1, lambda: None) for each in (entry, there)]
+    for what in ("observation", "action"):
+        trained_on, played = (getattr(each, f"single_{what}_space") for each in envs)
+        if trained_on != played:
+            raise OptionError(
+                f"--task {on.name}: '{entry.label}' was trained on '{entry.task.name}', whose {what}s are "
+                f"{_short(trained_on)}, and here they are {_short(played)}: agents play where both are equal"
+            )
+    if envs[0].inner.running_statistics != envs[1].inner.running_statistics:
+        raise OptionError(
+            f"--task {on.name}: one of it and '{entry.task.name}' has normalization = 'running': not both"
+        )
+    return there
+
+
+def _short(space: spaces.Space[Any]) -> str:
+    return " ".join(str(space).split())[:100]
+
+
+def policy_name(store: EntryStore, on: Task | None = None) -> str:
+    """Return the label of an entry whose agents play, with the task of their training where they play another one."""
+    entry = store.entry()
+    elsewhere = on is not None and on.hash != entry.task.hash
+    return f"{entry.label} (trained on {entry.task.name})" if elsewhere else entry.label
 
 
 def trained(
@@ -231,6 +267,8 @@ def trained(
     seed: int = 0,
     device: str = "cpu",
     report: Report = lambda name, done, total: None,
+    on: Task | None = None,
+    perturb: float = 0.0,
 ) -> Played:
     """Evaluate the best runs of an entry.
 
@@ -243,21 +281,52 @@ def trained(
         Complete episodes of each agent.
     seed:
         Evaluation seed; another one gives other episodes.
+    on:
+        The task that is played; None for the one that they were trained on.
+    perturb:
+        Multiply every trained number by 1 + perturb * z, z standard normal, drawn anew for each agent and each round of
+        `EVALUATION_LANES` episodes. Equal seeds draw equal z, whatever the scale.
 
     Raises
     ------
     StoreError
         If there is no trained agent.
+    OptionError
+        If the task has other observations or actions, or the scale is no positive number.
     EnvironmentFailure
         If the environment fails.
     """
-    entry = trained_entry(store)
+    entry, name = trained_entry(store, on), policy_name(store, on)
+    if not 0.0 <= perturb < np.inf:
+        raise OptionError(f"--perturb {perturb:g}: give a relative size of the noise, such as 0.1")
     seeds, validation, runs = best_runs(store, best)
     agents = trained_agents(entry, store, seeds, device)
-    returns, scores, _ = play(
-        entry, len(seeds), episodes, seed, lambda envs, block: agents.act, entry.label, report
-    )
-    return Played(entry.label, returns, scores, tuple(seeds), tuple(validation), runs)
+    shake = _perturbing(agents, perturb, Streams(entry.task.hash, seed)) if perturb else None
+
+    def build(envs: LaneEnv, block: int) -> Policy:
+        if shake is not None:
+            shake(block)
+        return agents.act
+
+    name += f" perturbed {perturb:g}" if perturb else ""
+    returns, scores, _ = play(entry, len(seeds), episodes, seed, build, name, report)
+    return Played(name, returns, scores, tuple(seeds), tuple(validation), runs)
+
+
+def _perturbing(agents: Trainer, scale: float, streams: Streams) -> Callable[[int], None]:
+    """Return what perturbs the trained numbers of agents, by a relative size, anew for a round of episodes."""
+    learned = {p.data_ptr() for model in agents.models.built for p in model.parameters() if p.requires_grad}
+    state = agents.algorithm.policy_state()
+    tensors = [state[name].detach() for name in sorted(state) if state[name].data_ptr() in learned]
+    exact = [tensor.clone() for tensor in tensors]
+
+    def draw(block: int) -> None:
+        drawn = [streams.numpy(f"evaluation perturbation {seed}", block) for seed in agents.seeds]
+        for tensor, value in zip(tensors, exact):
+            noise = np.stack([stream.standard_normal(value.shape[1:]) for stream in drawn])
+            tensor.copy_(value * (1.0 + scale * torch.from_numpy(noise).to(value)))
+
+    return draw
 
 
 def references(

@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from safetensors.numpy import load, save
+from typer.testing import CliRunner
 
-from qrlsuite.errors import StoreError
+from qrlsuite import api
+from qrlsuite.cli.app import build
+from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard.shelf import collect, importing, published, verify
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
+from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
 from tests.conftest import TINY, trainer
 
@@ -226,3 +230,118 @@ def test_a_forged_agent_is_found_by_training_again(folder: Path) -> None:
         False,
         True,
     )
+
+
+OTHER = TINY.replace("degree = 3", "degree = 2").replace('name = "tiny"', 'name = "other"')
+
+
+def test_agents_play_another_task_as_that_tasks_own_would(folder: Path, tmp_path: Path) -> None:
+    """Put into the folder of an entry that was trained there, the same parameters earn the same."""
+    (tmp_path / "other.toml").write_text(OTHER)
+    there = EntryStore(trainer(str(tmp_path / "other.toml"), tmp_path)("runs", SEEDS, 2))
+    here = EntryStore(next(tmp_path.glob("runs/tiny/*")))
+    before = {seed: there.seed(seed).agent.read_bytes() for seed in SEEDS}
+    for seed in SEEDS:
+        there.seed(seed).agent.write_bytes(here.seed(seed).agent.read_bytes())
+    swapped = evaluation.trained(there, 3, 20)
+    for seed in SEEDS:
+        there.seed(seed).agent.write_bytes(before[seed])
+    found = api.evaluate(
+        ["tiny/mlp", "mlp"], task="other", best=3, episodes=20, runs=tmp_path / "runs", progress=False
+    )
+    transferred, own, *references = found.policies
+    assert (found.task, transferred.name) == ("other", "ddqn mlp width=16 (trained on tiny)")
+    for row, seed in enumerate(transferred.seeds):
+        assert np.array_equal(transferred.returns[row], swapped.returns[swapped.seeds.index(seed)])
+    assert not np.array_equal(transferred.returns, own.returns)
+    assert references[0].returns.tobytes() == evaluation.references(there.entry(), 20)[0].returns.tobytes()
+    words = [
+        "evaluate",
+        str(folder),
+        "--task",
+        str(tmp_path / "other.toml"),
+        "--runs",
+        str(tmp_path / "runs"),
+    ]
+    result = CliRunner().invoke(build(), [*words, "--best", "3", "--episodes", "20", "--json"])
+    assert json.loads(result.stdout)["policies"][0]["return"] == transferred.summary()["return"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["tiny/mlp", "--task", "cartpole"],
+            "whose observations are Box(0.0, 1.0, (3,), float32), and here they are",
+        ),
+        (["mlp", "--task", "cartpole"], "write 'tiny/mlp'"),
+        (["nothing", "--task", "cartpole"], "no entry 'nothing'"),
+        (["mlp", "--task", "cartpol"], "did you mean 'cartpole'"),
+        (["mlp", "--perturb", "-1"], "give a relative size"),
+        (["mlp", "--perturb", "nan"], "give a relative size"),
+        (["beam6g/ddqn mlp width=16", "--published"], "is published as curves without agents"),
+    ],
+)
+def test_what_agents_cannot_play_is_said_in_one_line(
+    words: list[str], message: str, folder: Path, tmp_path: Path
+) -> None:
+    result = CliRunner().invoke(build(), ["evaluate", *words, "--runs", str(tmp_path / "runs")])
+    assert isinstance(result.exception, QrlSuiteError), result.output
+    assert message in str(result.exception)
+    assert "\n" not in str(result.exception)
+
+
+def test_perturbed_numbers_are_as_large_as_asked_for_and_drawn_anew(folder: Path, tmp_path: Path) -> None:
+    store = runs_of(tmp_path)
+    entry = store.entry()
+    agents = evaluation.trained_agents(entry, store, [0, 1])
+    exact = {name: value.clone() for name, value in agents.algorithm.policy_state().items()}
+    shake = evaluation._perturbing(agents, 0.1, Streams(entry.task.hash, 0))
+
+    def noise(block: int) -> np.ndarray:
+        shake(block)
+        state = agents.algorithm.policy_state()
+        return np.concatenate(
+            [((state[n] / v - 1) / 0.1).flatten(1).numpy() for n, v in exact.items()], axis=1
+        )
+
+    first = noise(0)
+    assert np.isfinite(first).all()
+    assert abs(first.mean()) < 0.2
+    assert 0.85 < first.std() < 1.15
+    assert not np.allclose(first, noise(1), atol=0.1)
+    assert np.array_equal(first, noise(0)), "of the trained numbers, not of the perturbed ones"
+    assert not np.allclose(first[0], first[1], atol=0.1), "each agent has its own"
+
+
+def test_perturbed_agents_do_not_depend_on_their_company(folder: Path, tmp_path: Path) -> None:
+    store = runs_of(tmp_path)
+    together = evaluation.trained(store, 3, 20, perturb=0.5)
+    alone = evaluation.trained(store, 1, 20, perturb=0.5)
+    assert together.name == "ddqn mlp width=16 perturbed 0.5"
+    assert np.array_equal(together.returns[:1], alone.returns)
+    exact = evaluation.trained(store, 3, 20)
+    assert not np.array_equal(together.returns, exact.returns)
+    found = api.evaluate(
+        str(folder), best=3, episodes=20, perturb=[0.5, 0.25], runs=tmp_path / "runs", progress=False
+    )
+    assert np.array_equal(found.policies[1].returns, together.returns)
+    assert found.policies[2].name == "ddqn mlp width=16 perturbed 0.25"
+
+
+def test_published_circuits_act_with_shots_and_nothing_is_written_beside_them(
+    train: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = EntryStore(train("runs", [0, 1], 1, "vqc-native", settings=("qubits=3", "layers=1")))
+    entry = collect.read_entry(store)
+    assert entry is not None
+    folder = export(entry, tmp_path / "entries")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    arguments: dict[str, Any] = {"best": 2, "episodes": 10, "backend": "native shots=10", "progress": False}
+    here = api.evaluate(str(store.path), runs=tmp_path / "runs", **arguments)
+    there = api.evaluate(str(folder), runs=tmp_path / "fresh", **arguments)
+    assert [each.name for each in here.policies] == [each.name for each in there.policies]
+    assert np.array_equal(here.policies[1].returns, there.policies[1].returns)
+    assert not np.array_equal(there.policies[0].returns, there.policies[1].returns)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert len(list((tmp_path / "fresh").glob("*/*/evaluations-*/*.jsonl"))) == 1

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api import evaluation
-from qrlsuite.cli.arguments import AmongOption, JsonOption, RunsOption
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, names_of
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.leaderboard import pictures
 from qrlsuite.results.store import write_atomically
@@ -23,7 +23,14 @@ def evaluate(
             help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder.",
         ),
     ],
-    task: AmongOption = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            "--task",
+            help="The task that is played. Its own entries are meant; TASK/ENTRY and a folder name those of another.",
+            autocompletion=names_of("tasks"),
+        ),
+    ] = None,
     best: Annotated[
         int, typer.Option("--best", min=1, help="Evaluate the runs with the best last validation score.")
     ] = 10,
@@ -51,6 +58,14 @@ def evaluate(
             "estimator=aer', 'pennylane device=lightning.qubit', or a plugin's.",
         ),
     ] = None,
+    perturb: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--perturb",
+            metavar="P",
+            help="Also multiply each trained number by 1 + P z, z standard normal: 0.1 is ten percent. Repeatable.",
+        ),
+    ] = None,
     yes: Annotated[
         bool,
         typer.Option("--yes", help="Execute circuits on a device that is no simulator; it may cost money."),
@@ -59,17 +74,20 @@ def evaluate(
         Path | None,
         typer.Option("--out", metavar="FILE", help="Draw the histogram to a png, pdf or svg file."),
     ] = None,
+    published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
 ) -> None:
     """Play fresh episodes with an entry's best trained agents, and with reference policies.
 
-    Published entries are curves without agents, so train an entry to evaluate it (`qrlsuite run`).
+    With --published, also entries that come with the suite, as far as their agents do.
 
     The best agents are chosen by their last validation score; these episodes are new, and the same for every
     policy, so the choice does not raise the result. Agents act as in validation. It shows sums of rewards and,
     where the task knows a maximum, relative scores. The random policy is always there; an environment may offer
     others (beam6g: the optimal one and the nearest antenna).
+
+    With --task OTHER, TASK/ENTRY plays another task than it was trained on, if observations and actions are the same.
 
     With --backend the same agents act with shots, with noise or on a device, beside themselves as they were
     trained. The cost is printed first. Finished episodes are kept, and not played again.
@@ -90,6 +108,8 @@ def evaluate(
         entanglement=entanglement,
         backend=backend,
         yes=yes,
+        published=published,
+        perturb=perturb or (),
     )
     if out is not None:
         write_atomically(out, pictures.encode(evaluations.figure(), format_))
