@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, cast, get_args, get_origin
 
 import pydantic
 
@@ -52,12 +53,25 @@ def read_toml(text: str) -> dict[str, Any]:
     tomllib.TOMLDecodeError
         If it is not valid, or Python cannot hold it: hundreds of nested arrays, integers of thousands of digits.
     """
+    return cast(dict[str, Any], _copied(_tables(text)))
+
+
+@functools.lru_cache(maxsize=256)
+def _tables(text: str) -> dict[str, Any]:
+    """Return the tables of a text, read once: a study names its task's file for each of its entries."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         raise
     except (RecursionError, ValueError) as error:
         raise tomllib.TOMLDecodeError(f"too large a value: {error}") from None
+
+
+def _copied(value: Any) -> Any:
+    """Return a value of a TOML text; its tables and arrays may be changed without changing it."""
+    if isinstance(value, dict):
+        return {key: _copied(item) for key, item in value.items()}
+    return [_copied(item) for item in value] if isinstance(value, list) else value
 
 
 def validation_lines(error: pydantic.ValidationError) -> list[str]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
@@ -17,6 +15,9 @@ from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.specs import PictureSpec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,8 @@ def _of_environment(
     if len({task.environment.name for task in loaded}) > 1:
         raise OptionError(f"picture '{kind}': {' and '.join(tasks)} have different environments")
     chosen = options.build(specs.resolve(spec.options), dict(own), f"picture '{kind}'")
+    from matplotlib.figure import Figure
+
     figure = specs.resolve(spec.draw)({task.name: task.environment_options for task in loaded}, chosen)
     if not isinstance(figure, Figure):
         raise PluginError(

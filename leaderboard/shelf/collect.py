@@ -339,7 +339,8 @@ def read_each(store: EntryStore) -> list[EntryResults]:
         If a file is damaged, or a published entry is not what it says.
     """
     if published_entries.is_published(store.path):
-        return [published_entries.read(store.path).entry_results()]
+        known = published_entries.comes_with_suite(store.path)
+        return [published_entries.read(store.path, label=not known).entry_results()]
     groups = codes.of_seeds(store)
     found = [_of_code(store, group) for group in groups] if len(groups) > 1 else [read_entry(store)]
     return [entry for entry in found if entry is not None]

@@ -247,13 +247,25 @@ def folders() -> tuple[Path, ...]:
     return PUBLISHED, OF_STUDIES
 
 
+def comes_with_suite(folder: Path) -> bool:
+    """Return whether a folder is that of an entry that comes with the suite."""
+    return folder.parent.parent in folders()
+
+
 def is_published(folder: Path) -> bool:
     """Return whether a folder holds a published entry rather than runs."""
     return (folder / CURVES).exists()
 
 
-def read(folder: Path) -> PublishedEntry:
+def read(folder: Path, label: bool = True) -> PublishedEntry:
     """Read a published entry and check all that can be checked without training.
+
+    Parameters
+    ----------
+    label:
+        Check the label, for which the algorithm's and the model's code are imported, and torch with them. Boards leave
+        it out for entries that come with the suite: this file comes from the same place, and `verify` and the tests
+        check them in full.
 
     Raises
     ------
@@ -261,7 +273,7 @@ def read(folder: Path) -> PublishedEntry:
         With the first thing that is wrong.
     """
     try:
-        return _read(folder)
+        return _read(folder, label)
     except StoreError:
         raise
     except (
@@ -277,7 +289,7 @@ def read(folder: Path) -> PublishedEntry:
         raise StoreError(f"{folder}: not a published entry: {type(error).__name__}: {text}") from None
 
 
-def _read(folder: Path) -> PublishedEntry:
+def _read(folder: Path, label: bool) -> PublishedEntry:
     for name in ("entry.json", CURVES, SEEDS):
         if not (folder / name).is_file():
             raise StoreError(f"{folder}: {name} is missing; write the entry again with `qrlsuite export`")
@@ -288,6 +300,8 @@ def _read(folder: Path) -> PublishedEntry:
     published = record["published"]
     codes.read(record, folder / "entry.json")
     _check_identity(folder, record, task_file)
+    if label:
+        _check_label(folder, record, task_file)
     made_with = published["provenance"]
     _require(
         isinstance(made_with, list) and made_with != [] and all(isinstance(made, dict) for made in made_with),
@@ -389,7 +403,7 @@ def _require(holds: bool, folder: Path, problem: str) -> None:
 
 
 def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
-    """Check that place, label and protocol are those of what the hashes stand for."""
+    """Check that place and protocol are those of what the hashes stand for."""
     identity, task, expected = record["identity"], record["identity"]["task"], record["name"]
     for part in ("algorithm_options", "model_options"):
         _require(isinstance(identity[part], dict), folder, f"{part} is not a table")
@@ -414,7 +428,11 @@ def _check_identity(folder: Path, record: Mapping[str, Any], task_file: TaskFile
             folder,
             f"its task file has {name} = {value!r}, its task {task.get(name)!r}",
         )
-    known = registered()
+
+
+def _check_label(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -> None:
+    """Check the label, and that the options still make the hash, as far as the parts are installed."""
+    identity, known = record["identity"], registered()
     if not (
         identity["algorithm"] in known.of(AlgorithmSpec)
         and identity["model"] in known.of(ModelSpec)

@@ -36,6 +36,8 @@ class PublishedStudy(StudyWithLooks):
     ----------
     folder:
         The one that `export` wrote.
+    labels:
+        Check the labels of its entries, see `published.read`.
 
     Raises
     ------
@@ -43,14 +45,17 @@ class PublishedStudy(StudyWithLooks):
         If the study or an entry is damaged.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, labels: bool = True) -> None:
         super().__init__(load(folder), folder.parent)
         self.folder = folder
         self._published: dict[str, PublishedEntry] = {}
         for name, entry in self.entries.items():
-            if (path := EntryStore.find(folder, entry).path).is_dir():
-                self._published[name] = published.read(path)
-                if (length := self._published[name].curves.shape[1]) < self.epochs:
+            path = folder / entry.task.name / entry.name
+            if path.is_dir():
+                self._published[name] = read = published.read(path, labels)
+                if read.record["hash"] != entry.hash:
+                    raise StoreError(f"{path} is not the study's entry '{entry.label}' ({entry.hash})")
+                if (length := read.curves.shape[1]) < self.epochs:
                     raise StoreError(f"{path} has {length} epochs, and its study {self.epochs}")
 
     @property
@@ -95,8 +100,8 @@ def is_published(path: Path) -> bool:
     return (path / FILE).is_file()
 
 
-def read(folder: Path) -> StudyOutcome:
-    """Return what a published study has decided.
+def read(folder: Path, labels: bool = True) -> StudyOutcome:
+    """Return what a published study has decided; parameters as for `PublishedStudy`.
 
     Raises
     ------
@@ -107,7 +112,7 @@ def read(folder: Path) -> StudyOutcome:
         raise StoreError(
             f"{folder} holds no {FILE}: give a study's file, or a folder that `qrlsuite export` wrote"
         )
-    study = PublishedStudy(folder)
+    study = PublishedStudy(folder, labels)
     return StudyOutcome(study, study.read())
 
 
@@ -127,7 +132,7 @@ def collected(
     known = {outcome.study.hash for outcome in outcomes}
     for name in names() if published else []:
         try:
-            outcome = read(PUBLISHED / name)
+            outcome = read(PUBLISHED / name, labels=False)
         except QrlSuiteError as error:
             refused.append(str(error))
             continue

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from qrlsuite.api.arguments import Seeds, several
 from qrlsuite.errors import OptionError
@@ -24,6 +22,9 @@ from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Selected = tuple[list[EntryResults], list[str]]
 

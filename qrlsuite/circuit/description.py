@@ -179,7 +179,10 @@ class Parameter:
         position = (index,) if isinstance(index, int) else index
         if len(position) != len(self.shape) or not all(0 <= i < n for i, n in zip(position, self.shape)):
             raise CircuitError(f"parameter '{self.name}' of shape {self.shape} has no element {position}")
-        return Angle(weight=Element(self.name, int(np.ravel_multi_index(position, self.shape))))
+        flat = 0
+        for i, n in zip(position, self.shape):
+            flat = flat * n + int(i)
+        return Angle(weight=Element(self.name, flat))
 
 
 @dataclass(frozen=True, slots=True)

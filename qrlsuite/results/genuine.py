@@ -50,10 +50,12 @@ def require_plain(path: Path | str, content: object) -> None:
     left = [content]
     while left:
         value = left.pop()
-        if isinstance(value, str) and _CONTROLS.search(value):
-            raise StoreError(f"{path} holds a text that controls a terminal: {ascii(value)[:80]}")
-        if isinstance(value, Mapping):
-            left += [*value, *value.values()]
+        if isinstance(value, str):
+            if _CONTROLS.search(value):
+                raise StoreError(f"{path} holds a text that controls a terminal: {ascii(value)[:80]}")
+        elif isinstance(value, dict):
+            left += value
+            left += value.values()
         elif isinstance(value, list):
             left += value
 

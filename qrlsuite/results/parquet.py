@@ -185,8 +185,10 @@ class _Thrift:
         return self._content[self.place - 1]
 
     def _unsigned(self) -> int:
-        result = 0
-        for shift in range(0, 70, 7):
+        if (result := self._byte()) < 128:
+            return result
+        result &= 127
+        for shift in range(7, 70, 7):
             byte = self._byte()
             result |= (byte & 127) << shift
             if byte < 128:

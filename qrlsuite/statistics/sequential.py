@@ -60,7 +60,6 @@ class Spending(StrEnum):
         return result
 
 
-@functools.lru_cache(maxsize=256)
 def nominal_levels(
     looks: tuple[int, ...], alpha: float, spending: Spending, sides: int = 2
 ) -> tuple[float, ...]:
@@ -85,27 +84,55 @@ def nominal_levels(
     >>> [round(level, 4) for level in nominal_levels((20, 40, 60, 80, 100), 0.05, Spending.POCOCK)]
     [0.0148, 0.0152, 0.0159, 0.0165, 0.017]
     """
-    from scipy.optimize import brentq
+    return tuple(_level(looks, look, alpha, spending, sides) for look in range(len(looks)))
+
+
+def _level(looks: tuple[int, ...], look: int, alpha: float, spending: Spending, sides: int) -> float:
+    """Return the level of one look, without those of the later ones."""
     from scipy.special import ndtr
 
-    shares = np.array(looks) / looks[-1]
-    increments = sides * np.diff(spending.spent(shares.tolist(), alpha / sides), prepend=0.0)
-    # B_k = Z_k sqrt(t_k) has independent increments; `points` and `density` describe B where the study goes on
-    points, density = np.zeros(1), np.ones(1)
-    levels, before = [], 0.0
-    for share, increment in zip(shares.tolist(), increments.tolist()):
-        scale, step = math.sqrt(share), math.sqrt(share - before)
+    bounds = [
+        _bound(looks, each, alpha, spending, sides) for each in range(look + 1)
+    ]  # each rests on those before
+    return float(sides * ndtr(-bounds[-1]))
 
-        stopped = functools.partial(_stopped, points, density, scale, step, sides, increment)
-        bound = float(brentq(stopped, 0.0 if sides == 2 else -_TAIL, 40.0, xtol=1e-10))
-        levels.append(float(sides * ndtr(-bound)))
-        lower = -bound if sides == 2 else -_TAIL
-        edges = max(lower, -_TAIL) * scale, min(bound, _TAIL) * scale
-        fresh, weights = _simpson(*edges)
-        kernel = np.exp(-(((fresh[:, None] - points) / step) ** 2) / 2) / (step * math.sqrt(2 * math.pi))
-        points, density = fresh, weights * (kernel @ density)
-        before = share
-    return tuple(levels)
+
+@functools.lru_cache(maxsize=1024)
+def _bound(looks: tuple[int, ...], look: int, alpha: float, spending: Spending, sides: int) -> float:
+    """Return the bound on |Z| (on Z where sides is 1) beyond which a look stops the study."""
+    from scipy.optimize import brentq
+
+    share, step = _share_and_step(looks, look)
+    spent = spending.spent([_share_and_step(looks, each)[0] for each in range(len(looks))], alpha / sides)
+    increment = float((sides * np.diff(spent, prepend=0.0))[look])
+    points, density = _going_on(looks, look, alpha, spending, sides)
+    stopped = functools.partial(_stopped, points, density, math.sqrt(share), step, sides, increment)
+    return float(brentq(stopped, 0.0 if sides == 2 else -_TAIL, 40.0, xtol=1e-10))
+
+
+@functools.lru_cache(maxsize=64)
+def _going_on(
+    looks: tuple[int, ...], look: int, alpha: float, spending: Spending, sides: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (P,) and weighted density there of B_k = Z_k sqrt(t_k) among studies that go on to a look.
+
+    B has independent increments.
+    """
+    if look == 0:
+        return np.zeros(1), np.ones(1)
+    points, density = _going_on(looks, look - 1, alpha, spending, sides)
+    share, step = _share_and_step(looks, look - 1)
+    scale, bound = math.sqrt(share), _bound(looks, look - 1, alpha, spending, sides)
+    lower = -bound if sides == 2 else -_TAIL
+    fresh, weights = _simpson(max(lower, -_TAIL) * scale, min(bound, _TAIL) * scale)
+    kernel = np.exp(-(((fresh[:, None] - points) / step) ** 2) / 2) / (step * math.sqrt(2 * math.pi))
+    return fresh, weights * (kernel @ density)
+
+
+def _share_and_step(looks: tuple[int, ...], look: int) -> tuple[float, float]:
+    """Return a look's share of all planned runs, and the standard deviation of what it adds to B."""
+    shares = [0.0, *(np.array(looks) / looks[-1]).tolist()]
+    return shares[look + 1], math.sqrt(shares[look + 1] - shares[look])
 
 
 def _stopped(
@@ -226,15 +253,14 @@ class DecisionPlan:
 
     def level(self, look: int, undecided: int) -> float:
         """Return the level of a p at look 0, 1, ... while so many pairs are not decided."""
-        return nominal_levels(self.looks, self.alpha / undecided, self.spending)[look]
+        return _level(self.looks, look, self.alpha / undecided, self.spending, 2)
 
     def equal_level(self, look: int) -> float | None:
         """Return the level of each one-sided test of equality at a look; None before `equal_from`."""
         allowed = tuple(each for each in self.looks if each >= self.equal_from)
         if self.looks[look] not in allowed:
             return None
-        levels = nominal_levels(allowed, self.alpha, Spending.OBRIEN_FLEMING, 1)
-        return levels[allowed.index(self.looks[look])]
+        return _level(allowed, allowed.index(self.looks[look]), self.alpha, Spending.OBRIEN_FLEMING, 1)
 
 
 class Decided(StrEnum):

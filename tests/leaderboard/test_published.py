@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -476,6 +477,14 @@ def test_what_is_published_with_the_suite_chose_no_seeds() -> None:
     for root in published.folders():
         for path in root.glob("*/*"):
             assert not published.read(path).chosen_seeds
+
+
+def test_boards_of_what_comes_with_the_suite_need_neither_torch_nor_matplotlib(tmp_path: Path) -> None:
+    program = (
+        f"import sys; from qrlsuite import api; board = api.board('cartpole', runs={str(tmp_path)!r}, published=True); "
+        "assert board.sections[0].rows; assert not {'torch', 'matplotlib', 'jinja2'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_the_reruns_own_count_decides_parameters(folder: Path) -> None:

@@ -25,7 +25,6 @@ from qrlsuite.cli.arguments import (
 from qrlsuite.engine.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.boards.board import Leaderboard
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import published_studies
@@ -186,6 +185,8 @@ def _page(
     published: bool,
 ) -> bool:
     """Write the page, with the studies with looks of the tasks; returns whether there is anything to show."""
+    from qrlsuite.leaderboard import report  # its templates' engine, which other formats do without
+
     sections = tuple(section for board in boards for section in board.sections)
     held = tasks or (sorted({section.task for section in sections}) if study is not None else [])
     studies, unreadable = published_studies.collected(runs, held, published)
