@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from qrlsuite.leaderboard.boards.times import percent
+from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, percent
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted, steps_text
 from qrlsuite.statistics import (
@@ -76,6 +76,8 @@ class PairVerdict:
         Both by their final scores; None where one has a single run.
     n_last:
         Epochs of the first that its final score is the mean of.
+    adjusted:
+        Whether the verdict and p are those of a board, adjusted for all of its pairs.
     """
 
     labels: tuple[str, str]
@@ -83,6 +85,7 @@ class PairVerdict:
     thresholds: tuple[str, ...]
     scores: ScoreBoard | None
     n_last: int
+    adjusted: bool = False
 
     @property
     def sentence(self) -> str:
@@ -98,11 +101,11 @@ class PairVerdict:
             case Direction.UNDECIDED:
                 return f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); {self._not_told_apart}"
             case Direction.NOT_TOLD_APART:
-                return f"not told apart: {self._not_told_apart} ({self._seeds}, {p_text(pair.p)})"
+                return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p})"
             case Direction.TRADE_OFF:
                 return (
                     f"trade-off: {first} needs fewer steps at {self._at(1)}, {second} at {self._at(-1)} "
-                    f"({self._seeds}, {p_text(pair.p)})"
+                    f"({self._seeds}, {self._p})"
                 )
         return self._decided(pair.direction is Direction.FEWER)
 
@@ -113,13 +116,13 @@ class PairVerdict:
         if mean[1] > 0:
             return (
                 f"{winner} needs {share(mean[0])} fewer steps than {loser} ({share(mean[1])} to "
-                f"{share(mean[2])}, {self._seeds}, {p_text(self.times.p)})"
+                f"{share(mean[2])}, {self._seeds}, {self._p})"
             )
         if math.isnan(mean[1]):
-            return f"{winner} needs fewer steps than {loser} ({self._seeds}, {p_text(self.times.p)})"
+            return f"{winner} needs fewer steps than {loser} ({self._seeds}, {self._p})"
         return (
             f"{winner} needs fewer steps than {loser} at {self._at(1 if first_wins else -1)} ({self._seeds}, "
-            f"{p_text(self.times.p)}); over all {counted(len(self.thresholds), 'threshold')} "
+            f"{self._p}); over all {counted(len(self.thresholds), 'threshold')} "
             f"{_fewer_or_more(mean[0])} ({_fewer_or_more(mean[2])} to {_fewer_or_more(mean[1])})"
         )
 
@@ -136,6 +139,10 @@ class PairVerdict:
     def _seeds(self) -> str:
         one, other = self.times.n_runs
         return f"{counted(one, 'seed')} each" if one == other else f"{one} and {other} seeds"
+
+    @property
+    def _p(self) -> str:
+        return "adjusted " * self.adjusted + p_text(self.times.p)
 
     def _at(self, sign: int) -> str:
         """Name the thresholds at which the first (1) or the second (-1) needs significantly fewer steps, and its share.
@@ -296,6 +303,44 @@ def on_board(
     board = times_board(curves, grid, alpha, end)
     i, j = map(places.index, pair)
     return OnBoard(len(ranked), float(board.adjusted[i, j]), board.directions[i][j])
+
+
+def pair_on(
+    ranking: TimeRanking, first: TimeRow, second: TimeRow, grid: Grid, labels: tuple[str, str]
+) -> PairVerdict:
+    """Return two rows of a board as the board judges them: nothing is tested anew.
+
+    Parameters
+    ----------
+    grid:
+        The board's.
+    labels:
+        What the verdict calls the two.
+    """
+    board = ranking.board
+    rows = first, second
+    i, j = (ranking.order[ranking.rows.index(row)] for row in rows)
+    verdict = board.directions[i][j]
+    times = TimesPair(
+        n_runs=(board.n_runs[i], board.n_runs[j]),
+        horizon=board.horizon,
+        alpha=board.alpha,
+        direction=verdict,
+        p=float(board.adjusted[i, j]),
+        difference=np.array([board.difference[i, j], *board.difference_interval[i, j]]),
+        signs=board.signs[i, j],
+        p_each=np.full(len(grid.levels), np.nan),
+        means=np.full((2, len(grid.levels)), np.nan),
+        differences=np.full((len(grid.levels), 3), np.nan),
+        at_cap=np.stack([row.mean.at_cap for row in rows]),
+    )
+    by_mean = verdict in _DECIDED[:2] and fewer(times.difference, verdict is Direction.FEWER)[1] > 0
+    if verdict in _DECIDED and not by_mean:  # the sentence names thresholds
+        one, other = (LearningCurves(r.entry.curves, r.entry.steps_per_epoch, r.entry.name) for r in rows)
+        alone = times_pair(one, other, grid, board.alpha, board.horizon)
+        times = replace(times, p_each=alone.p_each, differences=alone.differences)
+    thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
+    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True)
 
 
 def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:

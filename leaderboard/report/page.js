@@ -81,9 +81,8 @@
     }
     select.value = table.querySelector("[aria-sort]").dataset.key;
     select.addEventListener("change", () => sort(table, select.value, select.selectedOptions[0].dataset.best));
-    const tools = document.querySelector(`[data-sort-for="${table.id}"]`);
-    tools.append(element("label", {}, "Sort by", select));
-    tools.classList.add("only-narrow");
+    const tools = document.querySelector(`[data-tools-for="${table.id}"]`);
+    tools.append(element("label", { class: "only-narrow" }, "Sort by", select));
     tools.hidden = false;
   }
 

@@ -22,7 +22,7 @@ from qrlsuite.statistics.compare import TOO_FEW
 from qrlsuite.studies.outcome import StudyOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
-SCRIPTS = ("plotly-basic.min.js", "page.js", "pairs.js", "figures.js")
+SCRIPTS = ("page.js", "curves.js", "picked.js")
 LONGEST_REASON = 600
 
 
@@ -34,8 +34,8 @@ def render(
 ) -> str:
     """Return a leaderboard as one self-contained HTML page.
 
-    It loads nothing: style, scripts, plotly.js and the learning curves are inside, and its content security
-    policy forbids connections and any script but its own.
+    It loads nothing: style, scripts and the learning curves are inside, and its content security policy forbids
+    connections and any script but its own.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def render(
             title=clean(title),
             version=qrlsuite.__version__,
             date=f"{now.day} {now:%B %Y}",
-            headline=sections.headline(boards, shown),
+            extent=sections.extent(boards, shown),
             sections=boards,
             entries=shown,
             studies=[looks_report.view(study) for study in studies],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.boards import tables
+from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.steps import Row, Section
 from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow
@@ -33,6 +35,8 @@ class RowView:
 
     place: int
     entry: EntryView
+    name: str
+    """The label, without the algorithm where all entries of the board have the same."""
     row: Row
     time: TimeRow
     mean: str
@@ -45,6 +49,11 @@ class RowView:
     interval: str
     reason: str
 
+    @property
+    def kind(self) -> str:
+        """`quantum` or `classical`."""
+        return "quantum" if self.entry.quantum else "classical"
+
 
 @dataclass(frozen=True)
 class SectionView:
@@ -55,7 +64,15 @@ class SectionView:
     section: Section
     judgement: Judgement
     horizon: str
+    algorithm: str
+    """That of all entries; empty where they differ."""
     lead: str
+    answers: tuple[str, ...]
+    """What the board says of the pairs that a reader asks for first, in sentences."""
+    picked: tuple[int, ...]
+    """Places of the entries whose learning curves are drawn at first."""
+    sentences: tuple[tuple[int, int, str], ...]
+    """Two places, and the verdict of the board on them."""
     rows: tuple[RowView, ...]
     by_tier: tuple[RowView, ...]
     """The same in the order of the tiers."""
@@ -66,7 +83,7 @@ class SectionView:
     flattered: str
     """Entries whose settings were chosen on the protocol's seeds."""
     ladder: ladder.Ladder
-    matrix: tuple[tuple[tuple[str, str, str], ...], ...]
+    matrix: tuple[tuple[tuple[str, str], ...], ...]
     surfaces: tuple[tuple[tuple[CellView, ...], ...], ...]
     bars: tuple[tuple[CellView, ...], ...]
     bar_names: tuple[str, ...]
@@ -77,7 +94,7 @@ class SectionView:
     deltas: tuple[str, ...]
     data: dict[str, Any]
     times: TimeRanking
-    decisions: tuple[tuple[timed.Cell, ...], ...]
+    decisions: tuple[tuple[tuple[str, str], ...], ...]
 
     @property
     def others(self) -> int:
@@ -103,29 +120,45 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     section = replace(section, rows=tuple(by_entry[id(time.entry)] for time in section.times.rows))
     judgement = judge(section)
     ranking = ranking_of([row.entry for row in section.rows])
-    rows = tuple(_row(place, row, entries[id(row.entry)], section) for place, row in enumerate(section.rows))
+    algorithms = {row.entry.algorithm for row in section.rows}
+    algorithm = clean(algorithms.pop()) if len(algorithms) == 1 else ""
+    shown = [entries[id(row.entry)] for row in section.rows]
+    names = [entry.label.removeprefix(f"{algorithm} ") for entry in shown]
+    if len(set(names)) < len(names):
+        names = [entry.label for entry in shown]
+    rows = tuple(
+        _row(place, *each, section) for place, each in enumerate(zip(section.rows, shown, names, strict=True))
+    )
     order = np.array(section.times.order)
     grid = judgement.grid
     bars = bar_grid(ranking)
     bar_evidence = [Evidence(curves, bars, curves.n_runs) for curves in judgement.entries]
-    names = [f"{float(value):g}" for value in grid.levels]
+    levels = [f"{float(value):g}" for value in grid.levels]
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
     missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
     surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
+    asked = _asked(rows)
     return SectionView(
         id=f"board-{number}",
         number=number,
         section=section,
         judgement=judgement,
         horizon=steps_text(section.horizon),
+        algorithm=algorithm,
         lead=_lead(rows, section.times),
+        answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) == 1) for pair in asked),
+        picked=tuple(sorted({row.place for pair in asked for row in pair})) or (0,),
+        sentences=tuple(
+            (one.place, other.place, _verdict(section, grid, one, other))
+            for one, other in itertools.combinations(rows, 2)
+        ),
         rows=rows,
         by_tier=tuple(sorted(rows, key=lambda row: by_tier.index(id(row.row.entry)))),
         protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
-        first_alone=", ".join(row.entry.label for row in rows if row.row.entry.first_network_alone),
+        first_alone=", ".join(row.name for row in rows if row.row.entry.first_network_alone),
         tuning=clean("; ".join(tables.unequal_tuning(section))),
-        flattered=", ".join(row.entry.label for row in rows if row.row.entry.on_protocol_seeds),
+        flattered=", ".join(row.name for row in rows if row.row.entry.on_protocol_seeds),
         ladder=ladder.draw(
             section.times.board.outperforms[np.ix_(order, order)],
             [0.0 if time.ranks is None else float(time.ranks[0]) for time in section.times.rows],
@@ -142,18 +175,39 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
             for value in bars.levels
             for delta in bars.deltas
         ),
-        thresholds=tuple(names),
+        thresholds=tuple(levels),
         threshold_name="epsilon" if grid.epsilons else "return",
         threshold_symbol=symbol(grid),
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
-        data=_data(section, judgement, rows, bars, bar_evidence, ranking),
+        data=_data(section, judgement, rows, ranking),
         times=section.times,
-        decisions=timed.matrix(section.times, [row.entry.label for row in rows]),
+        decisions=timed.matrix(section.times),
     )
 
 
-def _row(place: int, row: Row, entry: EntryView, section: Section) -> RowView:
+def _asked(rows: Sequence[RowView]) -> list[tuple[RowView, RowView]]:
+    """Return the pairs that are told first, the entry with fewer steps first.
+
+    All pairs of up to three ranked entries; of more, the best classical and the best quantum entry, or the first and
+    the last where there is one kind.
+    """
+    ranked = [row for row in rows if row.time.ranks is not None]
+    if len(ranked) <= 3:
+        return list(itertools.combinations(ranked, 2))
+    other = next((row for row in ranked if row.entry.quantum is not ranked[0].entry.quantum), ranked[-1])
+    return [(ranked[0], other)]
+
+
+def _verdict(section: Section, grid: Grid, one: RowView, other: RowView, kinds: bool = False) -> str:
+    """Return the board's verdict on two rows in a sentence; `kinds` says which is classical and which quantum."""
+    kinds = kinds and one.entry.quantum is not other.entry.quantum
+    first, second = (f"{row.kind} {row.name}" if kinds else row.name for row in (one, other))
+    said = pair_on(section.times, one.time, other.time, grid, (first, second)).sentence
+    return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")
+
+
+def _row(place: int, row: Row, entry: EntryView, name: str, section: Section) -> RowView:
     reference, horizon, time = row.reference, section.horizon, section.times.rows[place]
     mean, low, high = time.mean.mean, *time.mean.interval
     kind, levels = section.times.kind, section.times.levels
@@ -161,6 +215,7 @@ def _row(place: int, row: Row, entry: EntryView, section: Section) -> RowView:
     return RowView(
         place=place,
         entry=entry,
+        name=name,
         row=row,
         time=time,
         mean=steps_text(mean, digits=3),
@@ -182,29 +237,27 @@ def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:
         return f"No entry is ranked: {TOO_FEW.partition(': ')[2]}."
     best, relation = ranked[0], times.board.outperforms
     if times.n_ranked == 1:
-        return f"{best.entry.label} is the only ranked entry."
+        return f"{best.name} is the only ranked entry."
     if not relation.any():
         return f"No entry of {times.n_ranked} outperforms another."
     first = [row for row in ranked if row.time.ranks is not None and row.time.ranks[0] == 1]
     if not first:
-        return f"{best.entry.label} has rank {best.time.rank_text} of {times.n_ranked} entries."
+        return f"{best.name} has rank {best.time.rank_text} of {times.n_ranked} entries."
     if len(first) > 4:
-        return f"No entry outperforms any of {len(first)}, from {first[0].entry.label} on."
+        return f"No entry outperforms any of {len(first)}, from {first[0].name} on."
     if len(first) > 1:
-        names = [row.entry.label for row in first]
+        names = [row.name for row in first]
         return f"No entry outperforms {', '.join(names[:-1])} or {names[-1]}."
     wins, rest = int(relation[times.order[first[0].place]].sum()), times.n_ranked - 1
     if wins == rest:
-        return (
-            f"{first[0].entry.label} outperforms {f'all {rest} others' if rest > 1 else 'the other entry'}."
-        )
-    return f"{first[0].entry.label} has rank 1 and outperforms {wins} of {rest} others."
+        return f"{first[0].name} outperforms {f'all {rest} others' if rest > 1 else 'the other entry'}."
+    return f"{first[0].name} has rank 1 and outperforms {wins} of {rest} others."
 
 
-def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str, str]:
-    """Return the text, the style and the words of a cell of the matrix of pairs."""
+def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str]:
+    """Return the text and the style of a cell of the matrix of pairs."""
     if row == column:
-        return "", "self", ""
+        return "", "self"
     pair = judgement.pair(row, column)
     outcome, (wins, losses) = pair.outcome(row), pair.counts(row)
     texts = {
@@ -213,38 +266,36 @@ def _matrix_cell(judgement: Judgement, row: int, column: int) -> tuple[str, str,
         Outcome.TRADE_OFF: f"+{wins} −{losses}",
         Outcome.UNDECIDED: "?",
     }
-    return texts.get(outcome, "·"), SIGNS.get(outcome, "tie"), pair.words(row)
+    return texts.get(outcome, "·"), SIGNS.get(outcome, "tie")
 
 
 def _data(
-    section: Section,
-    judgement: Judgement,
-    rows: Sequence[RowView],
-    bars: Grid,
-    bar_evidence: Sequence[Evidence],
-    ranking: RankingSection,
+    section: Section, judgement: Judgement, rows: Sequence[RowView], ranking: RankingSection
 ) -> dict[str, Any]:
     """Return what the page's scripts need of a section."""
     reference = ranking.reference
     level = 1 - reference.epsilon if reference.epsilon is not None else reference.threshold
     relative = section.rows[0].entry.task_file.score.source == "info"
+    words = dict.fromkeys(pair.words(side) for pair in judgement.pairs for side in (pair.first, pair.second))
+    numbers = {text: number for number, text in enumerate(words)}  # many pairs share their words
     return {
         "horizon": section.horizon,
         "entries": [row.entry.index for row in rows],
+        "names": [row.name for row in rows],
         "level": level,
         "score": "validation score (received / optimal)" if relative else "validation score",
         "levelName": symbol(judgement.grid),
         "levels": [f"{float(value):g}" for value in judgement.grid.levels],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],
-        "pairs": [[pair.first, pair.second, pair.n_runs, pair.cells] for pair in judgement.pairs],
+        "pairs": [
+            [pair.first, pair.second, pair.n_runs, pair.cells]
+            + [numbers[pair.words(side)] for side in (pair.first, pair.second)]
+            for pair in judgement.pairs
+        ],
+        "words": list(words),
         "evidence": {
             f"{place}/{n_runs}": _numbers(evidence)
             for (place, n_runs), evidence in judgement.evidence.items()
-        },
-        "bars": {
-            "levels": [f"{symbol(bars)} = {float(value):g}" for value in bars.levels],
-            "deltas": [f"δ = {float(delta):g}" for delta in bars.deltas],
-            "entries": [_numbers(evidence) for evidence in bar_evidence],
         },
     }
 
@@ -259,7 +310,7 @@ def _numbers(evidence: Evidence) -> dict[str, list[int]]:
     }
 
 
-def headline(sections: Sequence[SectionView], entries: Sequence[EntryView]) -> str:
+def extent(sections: Sequence[SectionView], entries: Sequence[EntryView]) -> str:
     """Say how much the page rests on."""
     tasks = {view.section.task for view in sections}
     runs = sum(len(entry.curves.seeds) for entry in entries)

@@ -1,4 +1,4 @@
-"""Sample complexity over a grid of cells: the surface of an entry, and the few cells drawn as bars."""
+"""Sample complexity over a grid of cells: the surface of an entry, and the few cells with intervals in sight."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from qrlsuite.statistics import Evidence, Grid, at_cap, unsettled
 LEVELS = 10
 """Shades of a surface."""
 BARS = ((0.2, 0.15, 0.1), (0.5, 0.75))
-"""The paper's cells for bars: epsilons and deltas (its figure 6)."""
+"""The cells of the paper's bars: epsilons and deltas (its figure 6)."""
 
 
 @dataclass(frozen=True)
 class CellView:
-    """A cell of a surface: its text, its shade and what a pointer shows."""
+    """A cell of a surface: its text, its shade and what a pointer shows; `interval` is in percent of the horizon."""
 
     text: str
     level: int
@@ -24,6 +24,8 @@ class CellView:
     unsettled: bool
     reference: bool
     title: str
+    interval: tuple[float, float, float]
+    """Low end, S_hat, high end."""
 
 
 def surface(evidence: Evidence, ranking: RankingSection) -> tuple[tuple[CellView, ...], ...]:
@@ -49,6 +51,11 @@ def surface(evidence: Evidence, ranking: RankingSection) -> tuple[tuple[CellView
                     unsettled=bool(open_end[i, j]),
                     reference=value == reference_level and float(delta) == ranking.reference.delta,
                     title=f"{sign}{steps_text(float(point[i, j]))} ({low} to {high}{mark})",
+                    interval=(
+                        100 * float(interval[i, j, 0]) / horizon,
+                        100 * share,
+                        100 * float(interval[i, j, 1]) / horizon,
+                    ),
                 )
             )
         lines.append(tuple(cells))

@@ -18,7 +18,7 @@ from qrlsuite import options as option_values
 from qrlsuite.testing.findings import BrokenRuleError
 
 HEAVY = (
-    "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "plotly", "pandas", "sklearn",
+    "torch", "pennylane", "qiskit", "cirq", "numba", "gymnasium", "scipy", "matplotlib", "pandas", "sklearn",
     "jax", "tensorflow",
 )  # fmt: skip
 """Packages that take long to import, and so must wait until a command needs them."""

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -99,3 +100,32 @@ def test_what_others_use_is_in_the_reference(site: Path, page: str, names: list[
     text = (site / "api" / f"{page}.html").read_text()
     missing = [name for name in names if f'id="{name}"' not in text]
     assert not missing
+
+
+def test_the_statements_are_filtered_by_words_and_verdict(site: Path, chromium: Any) -> None:
+    tab = chromium.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.goto((site / "statements.html").as_uri())
+    bar = tab.locator("#statements")
+    rows, count = tab.locator("tbody tr:visible"), bar.locator("output")
+    total = rows.count()
+    assert total > 100
+    assert count.inner_text() == f"{total} of {total}"
+    bar.get_by_label("Search statements").fill("WIDTH  antennas")
+    texts = [text.lower() for text in rows.all_inner_texts()]
+    assert 0 < len(texts) < total
+    assert all("width" in text and "antennas" in text for text in texts)
+    assert count.inner_text() == f"{len(texts)} of {total}"
+    bar.get_by_label("Search statements").fill("")
+    bar.get_by_label("Verdict").select_option("does not hold")
+    assert 0 < rows.count() < total
+    kinds = "(rows) => rows.map((row) => row.querySelector('[data-kind]').dataset.kind)"
+    assert set(rows.evaluate_all(kinds)) == {"does not hold"}
+    bar.get_by_label("Search statements").fill("no such words anywhere")
+    assert (rows.count(), count.inner_text()) == (0, f"0 of {total}")
+    bar.get_by_label("Search statements").fill("")
+    bar.get_by_label("Verdict").select_option("")
+    assert rows.count() == total
+    tab.close()
+    assert errors == []

@@ -165,3 +165,30 @@ def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
     (named,), (unchanged,) = (boards.of([one, same]).sheets(explain=True) for one in (changed, first))
     assert said in named.markdown()
     assert "thresholds changed" not in unchanged.markdown()
+
+
+def test_the_board_says_of_a_pair_what_compare_says_with_its_own_p() -> None:
+    """A board of two is the pair's own test, so that all words but p's name are equal; a larger board adjusts p."""
+    early, late = entry("early", spread(18), 0.72), entry("late", spread(40))
+    early.curves[:, 90:] = 0.95  # a trade-off
+    equal = entry("equal", spread(40)), entry("as equal", spread(40))
+    for one, other in (
+        (early, late),
+        (entry("fast", spread(18)), late),
+        equal,
+        (entry("few", spread(9, 5)), late),
+    ):
+        alone = compare_entries(one, other)
+        [section] = boards.of([one, other]).sections
+        rows = {row.entry.label: row for row in section.times.rows}
+        row_of = [rows[each.label] for each in (one, other)]
+        on = pair.pair_on(section.times, *row_of, alone.grid, alone.labels)
+        assert on.sentence.replace("adjusted ", "") == alone.verdict
+    close = entry("first", np.arange(10, 50)), entry("second", np.arange(16, 56))
+    [section] = boards.of([*close, *(entry(f"other {k}", spread(20 + k)) for k in range(6))]).sections
+    rows = {row.entry.label: row for row in section.times.rows}
+    alone = compare_entries(*close)
+    on = pair.pair_on(section.times, rows["first"], rows["second"], alone.grid, alone.labels)
+    assert alone.verdict.startswith("first needs ")
+    assert on.sentence.startswith("not told apart: first needs ")
+    assert on.times.p > alone.pair.times.p
