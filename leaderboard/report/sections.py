@@ -51,7 +51,9 @@ class RowView:
 
     @property
     def kind(self) -> str:
-        """`quantum` or `classical`."""
+        """`quantum`, `classical`, or `external`: of what another program trained, nobody here knows what it is."""
+        if self.entry.curves.external:
+            return "external"
         return "quantum" if self.entry.quantum else "classical"
 
 
@@ -79,6 +81,8 @@ class SectionView:
     protocol_seeds: int
     missing: str
     first_alone: str
+    external: str
+    """Which entries other programs trained."""
     tuning: str
     flattered: str
     """Entries whose settings were chosen on the protocol's seeds."""
@@ -157,6 +161,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
         first_alone=", ".join(row.name for row in rows if row.row.entry.first_network_alone),
+        external=clean("".join(tables.external_entries([row.entry for row in section.rows]))),
         tuning=clean("; ".join(tables.unequal_tuning(section))),
         flattered=", ".join(row.name for row in rows if row.row.entry.on_protocol_seeds),
         ladder=ladder.draw(
@@ -195,13 +200,14 @@ def _asked(rows: Sequence[RowView]) -> list[tuple[RowView, RowView]]:
     ranked = [row for row in rows if row.time.ranks is not None]
     if len(ranked) <= 3:
         return list(itertools.combinations(ranked, 2))
-    other = next((row for row in ranked if row.entry.quantum is not ranked[0].entry.quantum), ranked[-1])
-    return [(ranked[0], other)]
+    best = [next((row for row in ranked if row.kind == kind), None) for kind in ("classical", "quantum")]
+    both = sorted((row for row in best if row is not None), key=lambda row: row.place)
+    return [(both[0], both[1]) if len(both) == 2 else (ranked[0], ranked[-1])]
 
 
 def _verdict(section: Section, grid: Grid, one: RowView, other: RowView, kinds: bool = False) -> str:
     """Return the board's verdict on two rows in a sentence; `kinds` says which is classical and which quantum."""
-    kinds = kinds and one.entry.quantum is not other.entry.quantum
+    kinds = kinds and {one.kind, other.kind} == {"classical", "quantum"}
     first, second = (f"{row.kind} {row.name}" if kinds else row.name for row in (one, other))
     said = pair_on(section.times, one.time, other.time, grid, (first, second)).sentence
     return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")

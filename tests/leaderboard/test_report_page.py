@@ -124,6 +124,14 @@ def test_a_board_of_three_begins_with_every_pair(opened: Open) -> None:
     )
 
 
+def test_what_another_program_trained_is_neither_classical_nor_quantum(opened: Open) -> None:
+    entries = [boards.entry(f"at {speed}", speed=speed, quantum=9 * (speed == 1)) for speed in (3, 2, 1, 0.5)]
+    tab = opened(boards.of([dataclasses.replace(entries[0], external=True), *entries[1:]]))
+    assert "external" in tab.locator("#board-0-table tbody tr").first.inner_text()
+    assert tab.locator(".answers span").inner_text().startswith("classical at 2 needs ")
+    assert "Curves that other programs made" in tab.locator("#board-0-notes").inner_text()
+
+
 def picked(tab: Any) -> list[str]:
     """The entries whose curves are drawn, by the legend."""
     names: list[str] = tab.locator("#board-0 .legend li > span").all_inner_texts()
