@@ -3,8 +3,8 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/verdicts_calibration.py [--pairs 10000] [PART ...]
 
 Fresh runs are drawn from smoothed models (`SmoothedRuns`) of the published entries of task beam6g, on the 49 cells of
-its surface grid. `--pairs` is the number of simulated pairs or plans per line (parts equals, unequal, decisions,
-equality); a tenth of it for power, seeds and plans of five entries, 1/25 for coverage, a hundredth for boards. Many
+its surface grid. `--pairs` is the number of simulated pairs or studies per line (parts equals, unequal, decisions,
+equality); a tenth of it for power, seeds and studies of five entries, 1/25 for coverage, a hundredth for boards. Many
 tables of docs/error-rates.md are its output. `benchmarks/calibration.py` measures entries of
 your own.
 """
@@ -21,12 +21,12 @@ import numpy as np
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import (
     Decided,
-    DecisionPlan,
     Direction,
     Grid,
     IntervalRule,
     LearningCurves,
     MaxT,
+    SequentialDesign,
     SmoothedRuns,
     TimesRule,
     bootstrap_interval,
@@ -97,7 +97,7 @@ def found(ours: np.ndarray, theirs: np.ndarray, skewed: bool) -> float:
 
 
 def print_unequal(pairs: int) -> None:
-    """Both rules; a tenth of the pairs for plans. The last column is the chance that no failing run was seen."""
+    """Both rules; a tenth of the pairs for studies. The last column is the chance that no failing run was seen."""
     columns = ("runs that fail", "runs of each", "times", "times-skewed", "no failing run among them")
     head(f"Equal means, unequal laws, {pairs} pairs: any difference", *columns)
     generator = np.random.default_rng(0)
@@ -114,16 +114,20 @@ def print_unequal(pairs: int) -> None:
         line(n_fail, n_other, *(found(*pair, kind) for kind in (False, True)))
     count = max(10, pairs // 2)
     head(
-        f"The same in plans of two entries, {count} plans", "runs that fail", "looks", "times", "times-skewed"
+        f"The same in studies with looks of two entries, {count} studies",
+        "runs that fail",
+        "looks",
+        "times",
+        "times-skewed",
     )
     for share in (0.05, 0.15):
         drawn = unequal_laws(share, 100, 100, count, generator)
         for looks in ((20, 40, 60, 80, 100), (40, 60, 80, 100)):
-            plans = (DecisionPlan(("a", "b"), looks, rule=rule) for rule in ("times", "times-skewed"))
+            designs = (SequentialDesign(("a", "b"), looks, rule=rule) for rule in ("times", "times-skewed"))
             line(
                 f"{share:.0%}",
                 ", ".join(map(str, looks)),
-                *(play(plan, drawn).any_difference for plan in plans),
+                *(play(design, drawn).any_difference for design in designs),
             )
 
 
@@ -172,31 +176,31 @@ def print_replication(pairs: int) -> None:
 
 
 def print_decisions(pairs: int) -> None:
-    plan = DecisionPlan(("a", "b"))
-    head(f"Decision plan, two equals, {pairs} studies", "entry", "differ", "equal within 10%", "mean runs")
+    design = SequentialDesign(("a", "b"))
+    head(f"Study with looks, two equals, {pairs} studies", "entry", "differ", "equal within 10%", "mean runs")
     for name in (*POPULATIONS, W128, Q8):
         rates = decision_rates(
-            [MODELS[name]] * 2, plan, GRID, pairs if name in POPULATIONS else pairs // 10, seed=1
+            [MODELS[name]] * 2, design, GRID, pairs if name in POPULATIONS else pairs // 10, seed=1
         )
         line(name, rates.any_difference, rates.verdicts[0][Decided.EQUAL], f"{rates.mean_runs[0]:.0f}")
 
 
 def print_five(pairs: int) -> None:
-    plan = DecisionPlan(tuple("abcde"))
-    head(f"Decision plan, five equals, {pairs // 10} studies", "entry", "any pair differs", "mean runs")
+    design = SequentialDesign(tuple("abcde"))
+    head(f"Study with looks, five equals, {pairs // 10} studies", "entry", "any pair differs", "mean runs")
     for name in POPULATIONS:
-        rates = decision_rates([MODELS[name]] * 5, plan, GRID, pairs // 10, seed=2)
+        rates = decision_rates([MODELS[name]] * 5, design, GRID, pairs // 10, seed=2)
         line(name, rates.any_difference, f"{np.mean(rates.mean_runs):.0f}")
 
 
 def print_equality(pairs: int) -> None:
     """The second's times are the first's law times 1.1: differences are not looked for (alpha is next to nothing)."""
-    plan = DecisionPlan(("a", "b"))
+    design = SequentialDesign(("a", "b"))
     head(f"Equality at a true ratio of 1.1, {pairs} studies", "entry", "wrongly within 10%")
     for name in POPULATIONS:
         generator = np.random.default_rng(3)
         first, second = (draw_times(MODELS[name], 100, pairs, GRID, generator) for _ in range(2))
-        rates = play(plan, [first, second * 11 // 10])
+        rates = play(design, [first, second * 11 // 10])
         line(name, rates.within_margin[0])
 
 
@@ -262,10 +266,10 @@ def _times(values: np.ndarray) -> np.ndarray:
 
 def print_seeds(pairs: int) -> None:
     count = pairs // 10
-    plan = DecisionPlan(("a", "b"))
-    head(f"Decision plan, {count} studies", "pair", "first", "second", "trade-off", "equal", "mean runs")
+    design = SequentialDesign(("a", "b"))
+    head(f"Study with looks, {count} studies", "pair", "first", "second", "trade-off", "equal", "mean runs")
     for name, first, second in rivals(ENTRIES):
-        rates = decision_rates([first, second], plan, GRID, count, seed=5)
+        rates = decision_rates([first, second], design, GRID, count, seed=5)
         shares = rates.verdicts[0]
         kinds = (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF, Decided.EQUAL)
         line(name, *(shares[kind] for kind in kinds), f"{rates.mean_runs[0]:.0f}")

@@ -16,7 +16,7 @@ import numpy as np
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics.compare import MIN_RUNS
 from qrlsuite.statistics.grid import Grid, IntArray, whole
-from qrlsuite.statistics.sequential import Decided, Decision, DecisionPlan, PairDecision, Spending
+from qrlsuite.statistics.sequential import Decided, Decision, PairDecision, SequentialDesign, Spending
 from qrlsuite.statistics.simulation import SmoothedRuns, draw_times, judge_times, play, slower
 from qrlsuite.statistics.times import check_probability
 
@@ -38,7 +38,7 @@ class Need:
     looks:
         Looks of a study of the same power; empty if more than allowed.
     mean_runs:
-        Runs of each entry that the plan needs on average; NaN without a plan.
+        Runs of each entry that the design needs on average; NaN without a design.
     """
 
     power: float
@@ -69,11 +69,11 @@ def runs_needed(
     powers:
         In (0, 1).
     alpha:
-        Of the test and of the plan.
+        Of the test and of the design.
     most:
         Runs of an entry that are allowed at most, 20 or more.
     spending:
-        Of the plan.
+        Of the design.
     n_pairs:
         Simulated pairs: the power at each number of runs has a standard error of sqrt(power (1 - power) / n_pairs).
     seed:
@@ -120,15 +120,15 @@ def runs_at_difference(decision: Decision, pair: PairDecision, power: float = 0.
         If the power is not between 0 and 1.
     """
     check_probability(power, "power")
-    plan, normal = decision.plan, NormalDist()
+    design, normal = decision.design, NormalDist()
     if not pair.p or not math.isfinite(pair.interval[1]) or pair.difference == 0:
         return None
     look = len(pair.p) - 1
     ratio = math.log1p(pair.difference)
     width = math.log1p(pair.interval[1]) - ratio
-    error = width / -normal.inv_cdf(plan.level(look, len(plan.family)) / 2)
+    error = width / -normal.inv_cdf(design.level(look, len(design.family)) / 2)
     undecided = sum(not each.differs for each in decision.pairs)
-    level = plan.level(min(look + 1, len(plan.looks) - 1), undecided)
+    level = design.level(min(look + 1, len(design.looks) - 1), undecided)
     factor = (normal.inv_cdf(power) - normal.inv_cdf(level / 2)) * error / ratio
     return math.ceil(pair.n_runs * factor**2)
 
@@ -169,14 +169,14 @@ def even_looks(most: int, count: int = 5) -> tuple[int, ...]:
 def _with_plan(
     drawn: Sequence[IntArray], power: float, fixed: int | None, alpha: float, spending: Spending
 ) -> Need:
-    """Return a need with the smallest plan of its power, at most twice as long as all at once."""
+    """Return a need with the smallest design of its power, at most twice as long as all at once."""
     for factor in _INFLATION if fixed is not None else ():
         assert fixed is not None
         most = math.ceil(factor * fixed)
         if most > drawn[0].shape[1]:
             break
-        plan = DecisionPlan(("first", "second"), even_looks(most), alpha, spending)
-        rates = play(plan, [each[:, :most] for each in drawn])
+        design = SequentialDesign(("first", "second"), even_looks(most), alpha, spending)
+        rates = play(design, [each[:, :most] for each in drawn])
         if rates.verdicts[0][Decided.FIRST] >= power:
-            return Need(power, fixed, plan.looks, rates.mean_runs[0])
+            return Need(power, fixed, design.looks, rates.mean_runs[0])
     return Need(power, fixed, (), math.nan)

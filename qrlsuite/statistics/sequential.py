@@ -1,4 +1,4 @@
-"""Decision plans: several looks at growing numbers of runs, with one error probability for all looks.
+"""Sequential designs: several looks at growing numbers of runs, with one error probability for all looks.
 
 Whoever looks at the data again and again and stops at the first p below .05 errs far more often than that. Here
 alpha is spent over the looks by a function that is fixed in advance (Lan and DeMets 1983, Biometrika 70), and over
@@ -11,7 +11,7 @@ The test is that of rule `times` (`MaxT`); labels are exchanged within the block
 A pair is equal within the margin if two one-sided tests on the log ratio of the mean times say so (Schuirmann
 1987), with O'Brien-Fleming spending of their own: alpha per side, for each pair by itself.
 
-`decide` is a function of the plan and the runs so far: nothing else is remembered between looks, so that an
+`decide` is a function of the design and the runs so far: nothing else is remembered between looks, so that an
 interrupted study goes on where it was.
 """
 
@@ -35,7 +35,7 @@ from qrlsuite.statistics.times import check_probability, student_quantile, times
 from qrlsuite.statistics.times_board import direction, log_ratios
 
 RULES = ("times", "times-skewed")
-"""What may judge the pairs of a plan."""
+"""What may judge the pairs of a design."""
 MOST_RELABELINGS = 200_000
 """At levels below 1e-4 a decision needs p = 1 / 200,001 or so; at levels below that there is none."""
 _POINTS = 1001  # of the numerical integration
@@ -163,7 +163,7 @@ def _simpson(low: float, high: float) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class DecisionPlan:
+class SequentialDesign:
     """What is fixed before the first run: who is compared, when, and at which error.
 
     Attributes
@@ -296,7 +296,7 @@ class PairDecision:
     within_margin:
         Whether the difference is significantly smaller than the margin, either way.
     margin:
-        As in the plan.
+        As in the design.
     leading:
         Number of the threshold with the largest |t| at the last look, which gave the pair its p.
     leading_difference, leading_interval:
@@ -344,19 +344,19 @@ class PairDecision:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """All pairs of a plan after the looks for which there are runs.
+    """All pairs of a design after the looks for which there are runs.
 
     Attributes
     ----------
-    plan:
-        The plan.
+    design:
+        The design.
     pairs:
         The planned pairs, in order.
     wanted:
         For each entry with an open pair: the runs that the next look needs. Empty when all is decided.
     """
 
-    plan: DecisionPlan
+    design: SequentialDesign
     pairs: tuple[PairDecision, ...]
     wanted: Mapping[str, int]
 
@@ -366,15 +366,15 @@ class Decision:
         return not self.wanted
 
 
-def decide(plan: DecisionPlan, runs: Mapping[str, LearningCurves], grid: Grid) -> Decision:
-    """Return what a plan decides from the runs so far.
+def decide(design: SequentialDesign, runs: Mapping[str, LearningCurves], grid: Grid) -> Decision:
+    """Return what a design decides from the runs so far.
 
     Parameters
     ----------
-    plan:
-        The plan.
+    design:
+        The design.
     runs:
-        For each entry of the plan its runs so far, in the order of their seeds; entries without any may be
+        For each entry of the design its runs so far, in the order of their seeds; entries without any may be
         absent. A look takes place once every entry with an open pair has the runs for it. Runs beyond a look
         count for later ones only; runs that come after all pairs of an entry are closed are not looked at.
     grid:
@@ -383,32 +383,32 @@ def decide(plan: DecisionPlan, runs: Mapping[str, LearningCurves], grid: Grid) -
     Raises
     ------
     OptionError
-        If a name is not in the plan, or entries end at different horizons.
+        If a name is not in the design, or entries end at different horizons.
     """
     for name in runs:
-        if name not in plan.entries:
-            raise OptionError(f"'{name}' is not one of the plan's entries {list(plan.entries)}")
+        if name not in design.entries:
+            raise OptionError(f"'{name}' is not one of the design's entries {list(design.entries)}")
     ends = {name: entry.horizon for name, entry in runs.items()}
     if len(set(ends.values())) > 1:
         raise OptionError(f"the entries end at different horizons: {ends}; cut them to one")
     times = {name: times_below(each.values, grid, each.steps_per_epoch) for name, each in runs.items()}
-    return decide_times(plan, times)
+    return decide_times(design, times)
 
 
-def decide_times(plan: DecisionPlan, times: Mapping[str, IntArray]) -> Decision:
-    """Return what a plan decides from times below threshold, (N, E) for each entry: see `decide`."""
-    pairs = begin(plan)
-    for look, n_runs in enumerate(plan.looks):
+def decide_times(design: SequentialDesign, times: Mapping[str, IntArray]) -> Decision:
+    """Return what a design decides from times below threshold, (N, E) for each entry: see `decide`."""
+    pairs = begin(design)
+    for look, n_runs in enumerate(design.looks):
         wanted = wanted_at(pairs, n_runs)
         if any(name not in times or len(times[name]) < n_runs for name in wanted):
-            return Decision(plan, tuple(pairs), wanted)
-        [pairs] = next_look(plan, look, [pairs], [times])
-    return Decision(plan, tuple(pairs), {})
+            return Decision(design, tuple(pairs), wanted)
+        [pairs] = next_look(design, look, [pairs], [times])
+    return Decision(design, tuple(pairs), {})
 
 
-def begin(plan: DecisionPlan) -> list[PairDecision]:
-    """Return a plan's pairs before the first look: all open."""
-    return [PairDecision(first, second, margin=plan.margin) for first, second in plan.family]
+def begin(design: SequentialDesign) -> list[PairDecision]:
+    """Return a design's pairs before the first look: all open."""
+    return [PairDecision(first, second, margin=design.margin) for first, second in design.family]
 
 
 def wanted_at(pairs: Sequence[PairDecision], n_runs: int) -> dict[str, int]:
@@ -417,23 +417,23 @@ def wanted_at(pairs: Sequence[PairDecision], n_runs: int) -> dict[str, int]:
 
 
 def next_look(
-    plan: DecisionPlan,
+    design: SequentialDesign,
     look: int,
     studies: Sequence[Sequence[PairDecision]],
     times: Sequence[Mapping[str, IntArray]],
 ) -> list[list[PairDecision]]:
-    """Return the pairs of several studies of one plan after look 0, 1, ...; closed ones stay as they are.
+    """Return the pairs of several studies of one design after look 0, 1, ...; closed ones stay as they are.
 
     Parameters
     ----------
-    plan, look:
-        The plan, and which of its looks.
+    design, look:
+        The design, and which of its looks.
     studies:
         For each study the planned pairs as the look before left them.
     times:
         For each study the times of its entries, (N, E) with N at least the look's runs.
     """
-    n_runs = plan.looks[look]
+    n_runs = design.looks[look]
     todo = [
         (study, index)
         for study, pairs in enumerate(studies)
@@ -446,41 +446,41 @@ def next_look(
     for study, index in todo:
         pair = studies[study][index]
         data.append((times[study][pair.first][:n_runs], times[study][pair.second][:n_runs]))
-    test = MaxT(data, plan.blocks[: look + 1], plan.seed, skewed=plan.rule == "times-skewed")
-    test.extend(min(relabelings_for(plan.level(look, len(plan.family))), MOST_RELABELINGS))
+    test = MaxT(data, design.blocks[: look + 1], design.seed, skewed=design.rule == "times-skewed")
+    test.extend(min(relabelings_for(design.level(look, len(design.family))), MOST_RELABELINGS))
     p, p_each = test.p, test.p_each
     result = [list(pairs) for pairs in studies]
     rows: dict[int, dict[int, int]] = {}  # of each study: the row of the test for each open pair
     for row, (study, index) in enumerate(todo):
-        result[study][index] = _looked(plan, look, studies[study][index], data[row], float(p[row]))
+        result[study][index] = _looked(design, look, studies[study][index], data[row], float(p[row]))
         rows.setdefault(study, {})[index] = row
     for study, of_study in rows.items():
-        _reject(plan, look, result[study], of_study, test.t, p_each)
+        _reject(design, look, result[study], of_study, test.t, p_each)
         for index, row in of_study.items():
             result[study][index] = _led(result[study][index], data[row], test.t[row])
-        _close(plan, look, result[study])
+        _close(design, look, result[study])
     return result
 
 
 def _looked(
-    plan: DecisionPlan,
+    design: SequentialDesign,
     look: int,
     pair: PairDecision,
     data: tuple[IntArray, IntArray],
     p: float,
 ) -> PairDecision:
     """Return a pair with its p, difference, interval and test of equality at a look."""
-    level = plan.level(look, len(plan.family))
+    level = design.level(look, len(design.family))
     difference, interval = _repeated(data, level)
-    equal_level = plan.equal_level(look)
+    equal_level = design.equal_level(look)
     within = False
     if math.isfinite(difference) and equal_level is not None:
         ratio, error, freedom = _log_ratio(data)
         reach = error * float(student_quantile(1 - equal_level, freedom))
-        within = abs(ratio) + reach < math.log1p(plan.margin)
+        within = abs(ratio) + reach < math.log1p(design.margin)
     return replace(
         pair,
-        n_runs=plan.looks[look],
+        n_runs=design.looks[look],
         p=(*pair.p, p),
         difference=difference,
         interval=interval,
@@ -512,7 +512,7 @@ def _repeated(data: Sequence[IntArray], level: float) -> tuple[float, tuple[floa
 
 
 def _reject(
-    plan: DecisionPlan,
+    design: SequentialDesign,
     look: int,
     pairs: list[PairDecision],
     rows: Mapping[int, int],
@@ -520,10 +520,10 @@ def _reject(
     p_each: FloatArray,
 ) -> None:
     """Group-sequential Holm: decide open pairs at the level for those that are left, until none follows."""
-    strictest = plan.level(look, len(pairs))
+    strictest = design.level(look, len(pairs))
     while True:
         undecided = sum(not pair.differs for pair in pairs)
-        level = plan.level(look, max(1, undecided))
+        level = design.level(look, max(1, undecided))
         rejected = [index for index in rows if pairs[index].decided is None and pairs[index].p[-1] <= level]
         if not rejected:
             break
@@ -537,10 +537,10 @@ def _reject(
         pairs[index] = replace(pairs[index], levels=(*pairs[index].levels, level))
 
 
-def _close(plan: DecisionPlan, look: int, pairs: list[PairDecision]) -> None:
+def _close(design: SequentialDesign, look: int, pairs: list[PairDecision]) -> None:
     """Close open pairs that are equal, and at the last look all."""
     for index, pair in enumerate(pairs):
         if pair.decided is None and pair.within_margin:
             pairs[index] = replace(pair, decided=Decided.EQUAL)
-        elif pair.decided is None and look == len(plan.looks) - 1:
+        elif pair.decided is None and look == len(design.looks) - 1:
             pairs[index] = replace(pair, decided=Decided.NOT_TOLD_APART)

@@ -6,7 +6,7 @@ A significance rule's promise is only worth what a simulation of it shows. Two w
   N/2 runs, and the splits of one entry share its runs: quote the spread over entries, never over splits.
 - `false_winners` and `board_false_winners`: draw independent runs from a smoothed model of an entry's curves
   (`SmoothedRuns`), at any numbers of runs. `power` draws from two models. `judge` is behind all of these, and
-  judges the same pairs by several rules. `decision_rates` plays whole decision plans.
+  judges the same pairs by several rules. `decision_rates` plays whole sequential designs.
 
 Rates are reported per cell, per grid (any cell of a pair; and: a pair with an overall winner) and per board
 (any pair among M entries).
@@ -25,7 +25,7 @@ from qrlsuite.statistics.compare import Outcome, overall
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
 from qrlsuite.statistics.permutation import MaxT, relabelings_for
-from qrlsuite.statistics.sequential import Decided, DecisionPlan, begin, next_look
+from qrlsuite.statistics.sequential import Decided, SequentialDesign, begin, next_look
 from qrlsuite.statistics.significance import (
     Evidence,
     IntervalRule,
@@ -355,14 +355,14 @@ def judge_times(ours: IntArray, theirs: IntArray, alpha: float = 0.05) -> TimesR
 
 @dataclass(frozen=True, slots=True)
 class DecisionRates:
-    """What a decision plan comes to, over many simulated studies.
+    """What a sequential design comes to, over many simulated studies.
 
     Attributes
     ----------
     n_studies:
         Simulated studies.
     verdicts:
-        For each pair of the plan: fraction of studies with each verdict.
+        For each pair of the design: fraction of studies with each verdict.
     within_margin:
         For each pair: fraction of studies that found the difference within the margin, of either verdict.
     mean_runs:
@@ -380,13 +380,13 @@ class DecisionRates:
 
 def decision_rates(
     models: Sequence[SmoothedRuns],
-    plan: DecisionPlan,
+    design: SequentialDesign,
     grid: Grid,
     n_studies: int = 200,
     seed: int = 0,
     tick: Callable[[], object] | None = None,
 ) -> DecisionRates:
-    """Play a decision plan many times, its entries drawn from as many models, in the plan's order.
+    """Play a sequential design many times, its entries drawn from as many models, in the design's order.
 
     All studies are played together; `tick` is called for each of them at the end.
 
@@ -395,25 +395,25 @@ def decision_rates(
     OptionError
         If there are not as many models as entries, or an argument is out of its range.
     """
-    if len(models) != len(plan.entries):
-        raise OptionError(f"{len(models)} models for the {len(plan.entries)} entries of the plan")
+    if len(models) != len(design.entries):
+        raise OptionError(f"{len(models)} models for the {len(design.entries)} entries of the design")
     generator = np.random.default_rng(whole(seed, "seed", at_least=0))
     count = whole(n_studies, "n_studies", at_least=1)
-    drawn = [draw_times(model, plan.looks[-1], count, grid, generator) for model in models]
-    rates = play(plan, drawn)
+    drawn = [draw_times(model, design.looks[-1], count, grid, generator) for model in models]
+    rates = play(design, drawn)
     if tick is not None:
         for _ in range(count):
             tick()
     return rates
 
 
-def play(plan: DecisionPlan, drawn: Sequence[IntArray]) -> DecisionRates:
-    """Return what a plan comes to on times of each entry, (studies, N, E) with N the runs of the last look."""
+def play(design: SequentialDesign, drawn: Sequence[IntArray]) -> DecisionRates:
+    """Return what a design comes to on times of each entry, (studies, N, E) with N the runs of the last look."""
     count = len(drawn[0])
-    times = [{name: each[k] for name, each in zip(plan.entries, drawn)} for k in range(count)]
-    studies = [list(begin(plan)) for _ in range(count)]
-    for look in range(len(plan.looks)):
-        studies = next_look(plan, look, studies, times)
+    times = [{name: each[k] for name, each in zip(design.entries, drawn)} for k in range(count)]
+    studies = [list(begin(design)) for _ in range(count)]
+    for look in range(len(design.looks)):
+        studies = next_look(design, look, studies, times)
     by_pair = list(zip(*studies))
     return DecisionRates(
         n_studies=count,

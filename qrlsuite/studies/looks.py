@@ -33,7 +33,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, append, json_line, read_lines, write_atomically
-from qrlsuite.statistics import DecisionPlan, Grid, LearningCurves, decide
+from qrlsuite.statistics import Grid, LearningCurves, SequentialDesign, decide
 from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.study import (
     EntriesSection,
@@ -156,9 +156,9 @@ class StudyWithLooks:
             raise OptionError(f"{self.source}: {error}") from None
         self._check_block()
 
-    def _design(self, names: tuple[str, ...]) -> DecisionPlan:
+    def _design(self, names: tuple[str, ...]) -> SequentialDesign:
         looks = self.looks
-        return DecisionPlan(
+        return SequentialDesign(
             names,
             tuple(looks.looks),
             looks.alpha,
@@ -519,7 +519,7 @@ def _hash(file: StudyFile) -> str:
     return digest(_content(file))
 
 
-def _lines(design: DecisionPlan, decision: Decision) -> list[dict[str, Any]]:
+def _lines(design: SequentialDesign, decision: Decision) -> list[dict[str, Any]]:
     """Return what each look found: for every pair that was open, its p and how it was closed."""
     lines = []
     for index, look in enumerate(design.looks):

@@ -12,9 +12,9 @@ import qrlsuite.statistics
 from qrlsuite import registry, specs
 from qrlsuite.statistics import (
     Decided,
-    DecisionPlan,
     Outcome,
     PairDecision,
+    SequentialDesign,
     Spending,
     Verdict,
     nominal_levels,
@@ -46,7 +46,7 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
         "times_below",
         "mean_time",
         "times_board",
-        "DecisionPlan",
+        "SequentialDesign",
         "decide",
         "runs_needed",
         "runs_to_detect",
@@ -66,10 +66,12 @@ def test_rules_verdicts_and_outcomes_are_on_the_page() -> None:
 
 
 def test_decisions_on_the_page_are_those_of_the_code() -> None:
-    plan = DecisionPlan(("A", "B"))
-    assert " ".join(f"{level:.4f}"[1:] for level in nominal_levels(plan.looks, 0.05, Spending.POCOCK)) in PAGE
+    design = SequentialDesign(("A", "B"))
+    assert (
+        " ".join(f"{level:.4f}"[1:] for level in nominal_levels(design.looks, 0.05, Spending.POCOCK)) in PAGE
+    )
     assert "Looks at 20, 40, 60, 80 and 100 runs" in PAGE
-    assert plan.looks == (20, 40, 60, 80, 100)
+    assert design.looks == (20, 40, 60, 80, 100)
     for decided in Decided:
         pair = PairDecision("A", "B", decided, 100, interval=(0, 0.12))
         assert f"`{pair.verdict}`" in PAGE.replace("above x percent", "above 12 percent")

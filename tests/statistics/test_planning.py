@@ -13,8 +13,8 @@ import pytest
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
     Decided,
-    DecisionPlan,
     LearningCurves,
+    SequentialDesign,
     SmoothedRuns,
     TimesRule,
     decision_rates,
@@ -68,19 +68,19 @@ def test_even_looks() -> None:
 
 
 def test_a_plan_played_many_times() -> None:
-    plan = DecisionPlan(("a", "b"), looks=(20, 40))
-    rates = decision_rates([PILOT, PILOT], plan, SURFACE, n_studies=40)
+    design = SequentialDesign(("a", "b"), looks=(20, 40))
+    rates = decision_rates([PILOT, PILOT], design, SURFACE, n_studies=40)
     assert sum(rates.verdicts[0].values()) == pytest.approx(1)
     assert rates.any_difference <= 0.15
     assert 20 <= rates.mean_runs[0] <= 40
-    apart = decision_rates([PILOT, SmoothedRuns(entry(1))], plan, SURFACE, n_studies=10)
+    apart = decision_rates([PILOT, SmoothedRuns(entry(1))], design, SURFACE, n_studies=10)
     assert apart.verdicts[0][Decided.FIRST] == 1
     assert apart.mean_runs == (20,)
 
 
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(OptionError, match="3 models for the 2 entries"):
-        decision_rates([PILOT] * 3, DecisionPlan(("a", "b")), SURFACE)
+        decision_rates([PILOT] * 3, SequentialDesign(("a", "b")), SURFACE)
     short = SmoothedRuns(LearningCurves(entry(1).values[:, :50], 2000, "short"))
     with pytest.raises(OptionError, match="cut them to one horizon"):
         runs_needed(PILOT, short, SURFACE)
@@ -92,12 +92,12 @@ def test_bad_arguments_are_named() -> None:
 
 def test_runs_that_the_present_difference_needs() -> None:
     """A ratio of z / sqrt(2) standard errors at 20 runs is z standard errors at 40: found there in half of cases."""
-    plan = DecisionPlan(("a", "b"))
-    now, following = (NormalDist().inv_cdf(1 - plan.level(look, 1) / 2) for look in (0, 1))
+    design = SequentialDesign(("a", "b"))
+    now, following = (NormalDist().inv_cdf(1 - design.level(look, 1) / 2) for look in (0, 1))
     ratio = 0.1 * following / math.sqrt(2)
     interval = (math.expm1(ratio - 0.1 * now), math.expm1(ratio + 0.1 * now))
     pair = PairDecision("a", "b", None, 20, (0.1,), (0.0147,), math.expm1(ratio), interval)
-    decision = Decision(plan, (pair,), {"a": 40, "b": 40})
+    decision = Decision(design, (pair,), {"a": 40, "b": 40})
     assert abs((planning.runs_at_difference(decision, pair, power=0.5) or 0) - 40) <= 1
     assert (planning.runs_at_difference(decision, pair) or 0) > 60, "more power needs more"
     assert planning.runs_at_difference(decision, replace(pair, p=())) is None

@@ -15,11 +15,11 @@ from scipy.special import ndtr, ndtri
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
     Decided,
-    DecisionPlan,
     Grid,
     LearningCurves,
     MaxT,
     PairDecision,
+    SequentialDesign,
     SmoothedRuns,
     Spending,
     decide,
@@ -39,8 +39,8 @@ def learner(name: str, *first_good: int, n_runs: int, epochs: int = 40) -> Learn
     return LearningCurves((np.arange(epochs) >= starts[:, None]).astype(float), 100, name)
 
 
-def plan(*entries: str, **options: Any) -> DecisionPlan:
-    return DecisionPlan(entries or ("a", "b"), **options)
+def design(*entries: str, **options: Any) -> SequentialDesign:
+    return SequentialDesign(entries or ("a", "b"), **options)
 
 
 def test_a_single_look_has_all_of_alpha() -> None:
@@ -78,24 +78,24 @@ def test_levels_spend_alpha_in_a_simulation() -> None:
 
 def test_a_clear_pair_is_decided_at_the_first_look() -> None:
     runs = {"a": learner("a", 4, 6, n_runs=20), "b": learner("b", 20, 22, n_runs=20)}
-    decision = decide(plan(), runs, CELL)
+    decision = decide(design(), runs, CELL)
     [pair] = decision.pairs
     assert decision.finished
     assert (pair.decided, pair.n_runs, pair.verdict) == (Decided.FIRST, 20, "a needs fewer")
     assert pair.difference == pytest.approx(3.2), "21 epochs are 320 percent more than 5"
     assert list(pair.p) == pytest.approx([1 / (CHUNK + 1)])
     assert list(pair.levels) == pytest.approx([0.01477], abs=1e-5)
-    assert decide(plan("b", "a"), runs, CELL).pairs[0].verdict == "a needs fewer"
-    assert decide(plan("b", "a"), runs, CELL).pairs[0].decided is Decided.SECOND
+    assert decide(design("b", "a"), runs, CELL).pairs[0].verdict == "a needs fewer"
+    assert decide(design("b", "a"), runs, CELL).pairs[0].decided is Decided.SECOND
 
 
 def test_equal_entries_are_found_equal_once_that_is_allowed() -> None:
     runs = {name: learner(name, 20, 22, n_runs=100) for name in "ab"}
-    [pair] = decide(plan(), runs, CELL).pairs
+    [pair] = decide(design(), runs, CELL).pairs
     assert (pair.verdict, pair.n_runs) == ("equal within 10 percent", 40)
-    [late] = decide(plan(equal_from=60), runs, CELL).pairs
+    [late] = decide(design(equal_from=60), runs, CELL).pairs
     assert late.n_runs == 60
-    [never] = decide(plan(equal_from=101), runs, CELL).pairs
+    [never] = decide(design(equal_from=101), runs, CELL).pairs
     assert never.decided is Decided.NOT_TOLD_APART
     # log ratio 0, standard error sqrt(2 / 100) s / m with m = 21 epochs, s = 1.005; level .0169 on both sides
     assert never.interval[1] == pytest.approx(math.expm1(2.41 * math.sqrt(0.02) * 1.005 / 21), rel=0.01)
@@ -107,7 +107,7 @@ def test_few_percent_fewer_is_both() -> None:
         "a": learner("a", 99, 101, n_runs=100, epochs=200),
         "b": learner("b", 102, 104, n_runs=100, epochs=200),
     }
-    [pair] = decide(plan(looks=(40, 100)), runs, CELL).pairs
+    [pair] = decide(design(looks=(40, 100)), runs, CELL).pairs
     assert pair.verdict == "a needs fewer, by under 10 percent"
 
 
@@ -117,7 +117,7 @@ def test_a_look_waits_for_the_runs_of_open_pairs_only() -> None:
     late = np.concatenate([np.zeros((40, 60)), base[:, :-60]], axis=1)
     runs = {name: LearningCurves(values, 2000, name) for name, values in
             {"a": base, "b": base[::-1], "late": late}.items()}  # fmt: skip
-    three = plan("a", "b", "late")
+    three = design("a", "b", "late")
     nothing = decide(three, {}, SURFACE)
     assert nothing.wanted == {"a": 20, "b": 20, "late": 20}
     assert [pair.verdict for pair in nothing.pairs] == ["open"] * 3
@@ -140,10 +140,10 @@ def test_levels_are_divided_and_grow_with_each_rejection() -> None:
     draws = [model.draw(20, np.random.default_rng(seed)).values for seed in (0, 1)]
     late = np.concatenate([np.zeros((20, 60)), draws[0][:, :-60]], axis=1)
     runs = {name: LearningCurves(values, 2000) for name, values in zip("abc", (*draws, late))}
-    pairs = decide(plan("a", "b", "c"), runs, SURFACE).pairs
+    pairs = decide(design("a", "b", "c"), runs, SURFACE).pairs
     assert [pair.levels[0] for pair in pairs] == [pytest.approx(0.01477, abs=1e-5)] * 3
     same = {name: LearningCurves(draws[0], 2000) for name in "abc"}
-    undivided = decide(plan("a", "b", "c"), same, SURFACE).pairs
+    undivided = decide(design("a", "b", "c"), same, SURFACE).pairs
     third = nominal_levels(LOOKS, 0.05 / 3, Spending.POCOCK)[0]
     assert [pair.levels[0] for pair in undivided] == [third] * 3
 
@@ -154,7 +154,7 @@ def test_a_pair_found_equal_keeps_its_share_of_alpha() -> None:
         "b": learner("b", 20, 22, n_runs=60),
         "c": learner("c", *range(5, 38), n_runs=60),
     }
-    pairs = decide(plan("a", "b", "c", looks=(40, 60)), runs, CELL).pairs
+    pairs = decide(design("a", "b", "c", looks=(40, 60)), runs, CELL).pairs
     assert pairs[0].decided is Decided.EQUAL
     assert pairs[1].levels[1] == nominal_levels((40, 60), 0.05 / 3, Spending.POCOCK)[1]
 
@@ -180,7 +180,7 @@ def test_labels_are_nested_across_looks() -> None:
 def test_a_decision_relabels_within_the_blocks_of_its_looks() -> None:
     model, generator = SmoothedRuns(entry(0)), np.random.default_rng(8)
     runs = {name: model.draw(40, generator) for name in "ab"}
-    [pair] = decide(plan(alpha=1e-4), runs, SURFACE).pairs
+    [pair] = decide(design(alpha=1e-4), runs, SURFACE).pairs
     times = [times_below(runs[name].values, SURFACE, 2000) for name in "ab"]
     for look, expected in enumerate(pair.p):
         n_runs = LOOKS[look]
@@ -205,9 +205,9 @@ def test_sentences_of_all_kinds() -> None:
 
 def test_degenerate_pairs_are_closed() -> None:
     capped = {name: learner(name, 40, n_runs=100) for name in "ab"}
-    assert decide(plan(), capped, CELL).pairs[0].verdict == "equal within 10 percent"
+    assert decide(design(), capped, CELL).pairs[0].verdict == "equal within 10 percent"
     at_once = {name: learner(name, 0, n_runs=100) for name in "ab"}
-    [pair] = decide(plan(), at_once, CELL).pairs
+    [pair] = decide(design(), at_once, CELL).pairs
     assert pair.verdict == "not told apart by 100 seeds", "0 of 0 is no ratio"
     assert math.isnan(pair.difference)
 
@@ -232,19 +232,19 @@ def test_degenerate_pairs_are_closed() -> None:
 )
 def test_bad_plans_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        DecisionPlan(**{"entries": ("a", "b"), **options})
+        SequentialDesign(**{"entries": ("a", "b"), **options})
 
 
 def test_a_reason_allows_an_early_look_and_a_name_of_a_function_is_enough() -> None:
-    assert plan(looks=(10, 20), reason="a pilot").looks == (10, 20)
-    assert plan(spending="obrien-fleming").spending is Spending.OBRIEN_FLEMING
+    assert design(looks=(10, 20), reason="a pilot").looks == (10, 20)
+    assert design(spending="obrien-fleming").spending is Spending.OBRIEN_FLEMING
 
 
 def test_bad_runs_are_named() -> None:
-    with pytest.raises(OptionError, match="'z' is not one of the plan's entries"):
-        decide(plan(), {"z": learner("z", 3, n_runs=20)}, CELL)
+    with pytest.raises(OptionError, match="'z' is not one of the design's entries"):
+        decide(design(), {"z": learner("z", 3, n_runs=20)}, CELL)
     with pytest.raises(OptionError, match="different horizons"):
-        decide(plan(), {"a": learner("a", 3, n_runs=20), "b": learner("b", 3, n_runs=20, epochs=50)}, CELL)
+        decide(design(), {"a": learner("a", 3, n_runs=20), "b": learner("b", 3, n_runs=20, epochs=50)}, CELL)
 
 
 def test_equals_are_rarely_told_apart_and_slow_ones_are_found_early() -> None:
@@ -253,9 +253,9 @@ def test_equals_are_rarely_told_apart_and_slow_ones_are_found_early() -> None:
     found, seeds = 0, []
     for _ in range(30):
         draws = [each.draw(100, generator) for each in (model, model, worse)]
-        [pair] = decide(plan(), dict(zip("ab", draws[:2])), SURFACE).pairs
+        [pair] = decide(design(), dict(zip("ab", draws[:2])), SURFACE).pairs
         found += pair.decided in (Decided.FIRST, Decided.SECOND, Decided.TRADE_OFF)
-        [pair] = decide(plan(), dict(zip("ab", draws[1:])), SURFACE).pairs
+        [pair] = decide(design(), dict(zip("ab", draws[1:])), SURFACE).pairs
         seeds.append(pair.n_runs)
         assert pair.decided is Decided.FIRST
     assert found <= 5

@@ -351,7 +351,7 @@ def _say_look(decision: Decision, console: Console) -> None:
     looks = max((len(pair.p) for pair in decision.pairs), default=0)
     if not looks:
         return
-    console.print(f"\n[bold]look at {decision.plan.looks[looks - 1]} seeds[/bold]")
+    console.print(f"\n[bold]look at {decision.design.looks[looks - 1]} seeds[/bold]")
     for pair in decision.pairs:
         if len(pair.p) == looks:
             console.print(
