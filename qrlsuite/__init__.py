@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import new_study as new_study
     from qrlsuite.api import plot as plot
     from qrlsuite.api import read_study as read_study
+    from qrlsuite.api import register as register
     from qrlsuite.api import run_study as run_study
     from qrlsuite.api import train as train
     from qrlsuite.api import tune as tune
@@ -36,7 +37,7 @@ __version__ = "0.1.1"
 
 __all__ = [
     "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load", "new_study",
-    "plot", "read_study", "register_environments", "run_study", "train", "tune",
+    "plot", "read_study", "register", "register_environments", "run_study", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}
@@ -61,6 +62,11 @@ def __getattr__(name: str) -> object:
         from qrlsuite.circuit.layer import layer
 
         return layer
+    if name == "register":
+        from qrlsuite import own
+
+        if own.is_loading():  # by a plugin's file, for which the api is long to import
+            return own.note
     if name == "api" or name in _FROM_API:
         import importlib
 

@@ -401,7 +401,7 @@ def _supported(
     return action, observation, spaces.Box(limits[0], limits[1], dtype=np.float32)
 
 
-def quick_task(env_id: str) -> dict[str, Any]:
+def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     """Return the content of a task file for a quick look at a Gymnasium environment, `--task gym:ID`.
 
     20 seeds, 100 epochs of 1000 steps in 10 environments, 20 validation episodes. Thresholds on the return are
@@ -411,6 +411,12 @@ def quick_task(env_id: str) -> dict[str, Any]:
     tells nothing apart, and is left out; where none is left, the highest of these returns is the threshold. The
     summary says so. Without a time limit, episodes are cut at 1000 steps.
 
+    Parameters
+    ----------
+    name:
+        Of the registered environment that has the id, where the task is to have that with all its options and be named
+        after it; its own time limit stands then.
+
     Raises
     ------
     qrlsuite.errors.OptionError
@@ -419,7 +425,7 @@ def quick_task(env_id: str) -> dict[str, Any]:
     """
     known = specification(env_id)
     options: dict[str, Any] = {"id": env_id}
-    if known.max_episode_steps is None:
+    if known.max_episode_steps is None and name is None:
         options["max_episode_steps"] = QUICK_STEPS
     envs = GymLanes(env_id, 1)
     envs.close()
@@ -430,24 +436,26 @@ def quick_task(env_id: str) -> dict[str, Any]:
         derived = sorted({float(solved - abs(solved) * part) for part in (1, 0.5, 0.25, 0)})
     lowest, highest = _random_returns(env_id, options.get("max_episode_steps"))
     thresholds = [level for level in derived if level > lowest]
-    summary = f"{env_id} of Gymnasium, with settings for a quick look"
+    what = f"{env_id} of Gymnasium" if name is None else f"environment '{name}'"
+    summary = f"{what}, with settings for a quick look"
     if len(thresholds) < len(derived):
         reached = ", ".join(f"{level:g}" for level in derived if level <= lowest)
         summary += f"; without threshold {reached}, which random actions always reach"
     if not thresholds:
         if highest == lowest:
             raise OptionError(
-                f"gym:{env_id}: random actions always have the return {lowest:g}, which reaches every threshold that "
-                "is known (0, or what Gymnasium calls solved): write a task file that says what a good return is"
+                f"{name or f'gym:{env_id}'}: random actions always have the return {lowest:g}, which reaches every "
+                "threshold that is known (0, or what Gymnasium calls solved): write a task file that "
+                "says what a good return is"
             )
         thresholds = [highest]
         summary += "; instead of it, the highest return of 10 random episodes"
     return {
         "format_version": 1,
-        "name": quick_name(env_id),
+        "name": name or quick_name(env_id),
         "summary": summary,
         **({} if kind == "discrete" else {"default_algorithm": _algorithm(kind)}),
-        "environment": {"name": "gym", "options": options},
+        "environment": {"name": "gym", "options": options} if name is None else {"name": name},
         "protocol": {
             "seeds": 20,
             "epochs": 100,

@@ -15,7 +15,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from types import SimpleNamespace
@@ -91,6 +91,8 @@ class Registry:
     plugins: list[Plugin] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     strict: bool = False
+    own: Any = None
+    """What `qrlsuite.own` keeps of the plugins that were loaded by path."""
 
     def of(self, kind: type[S]) -> Mapping[str, Registered[S]]:
         """Return what is registered of a kind, by name."""
@@ -136,6 +138,16 @@ class Registry:
         Raises
         ------
         PluginError
+            As `collect`.
+        """
+        return self.add(self.collect(plugin, distribution))
+
+    def collect(self, plugin: Any, distribution: str) -> list[Registered[Any]]:
+        """Register a plugin object with the manager; returns what its hooks hand over, which is not looked up yet.
+
+        Raises
+        ------
+        PluginError
             If it implements a hook that does not exist, one of its hooks has a wrong signature, raises, or hands
             over something that is not a spec.
         """
@@ -159,11 +171,24 @@ class Registry:
             raise PluginError(
                 f"plugin '{name.partition(':')[2]}' of distribution '{distribution}': {error}"
             ) from error
+        return handed
+
+    def add(self, new: Iterable[Registered[Any]]) -> dict[str, list[str]]:
+        """Add what was registered; returns its names by kind in the plural."""
         registered: dict[str, list[str]] = {}
-        for each in handed:
+        for each in new:
             registered.setdefault(each.spec.kinds, []).append(each.spec.name)
             self._add(each)
         return registered
+
+    def remove(self, distribution: str) -> None:
+        """Forget all that a distribution has registered, and its hooks."""
+        for entries in self.entries.values():
+            for name in [name for name, each in entries.items() if each.distribution == distribution]:
+                del entries[name]
+        for name, plugin in self.manager.list_name_plugin():
+            if plugin is not None and name.startswith(f"{distribution}:"):
+                self.manager.unregister(plugin)
 
     def _know_hooks(self, plugin: Any) -> None:
         """Refuse implementations of hooks that do not exist (pluggy's `check_pending`, for one plugin)."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from typer import Abort, BadParameter
 
-from qrlsuite.cli.app import build, renamed_option
+from qrlsuite.cli.app import build, renamed_option, split_plugins
 from qrlsuite.engine.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.registry import STRICT, PluginWarning
@@ -38,7 +38,9 @@ def main() -> None:
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         try:
-            sys.exit(build()(prog_name="qrlsuite", standalone_mode=False))
+            words, paths = split_plugins(sys.argv[1:])
+            _load_plugins(paths)
+            sys.exit(build()(words, prog_name="qrlsuite", standalone_mode=False))
         except UsageError as error:
             if error.ctx is None or type(error).__name__ == "NoArgsIsHelpError":
                 error.show()
@@ -58,3 +60,14 @@ def main() -> None:
         except BrokenPipeError:
             sys.stderr.close()  # the reader (head, less) has gone
             sys.exit(0)
+
+
+def _load_plugins(paths: list[str]) -> None:
+    """Load plugins by path, and say what each registers."""
+    if not paths:
+        return
+    from qrlsuite.results import codes
+
+    for path in paths:
+        for each in codes.load_plugins(path):
+            print(printable(each.sentence), file=sys.stderr)

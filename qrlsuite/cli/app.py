@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -123,18 +124,60 @@ def renamed_option(command: str, option: str) -> str | None:
     return {**RENAMED_OPTIONS[""], **RENAMED_OPTIONS.get(command, {})}.get(option)
 
 
+PluginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        metavar="PATH",
+        help="Use a plugin that lies there: a Python file, a package's folder, or an entry's folder. Repeatable.",
+        expose_value=False,
+    ),
+]
+"""An option of every command: `cli.main` takes it out of the words before they are parsed, this one is for --help."""
+
+
+def _common(plugin: PluginOption = None) -> None:
+    pass
+
+
 @functools.cache
 def load(command: LazyCommand) -> Any:
     """Import a built-in command and return it as Typer builds it."""
     target = resolve(command.reference)
     holder = typer.Typer(rich_markup_mode=None)
-    holder.callback()(lambda: None)  # with a callback it is a group, even of one command
+    holder.callback()(_common)  # with a callback it is a group, even of one command
     if isinstance(target, typer.Typer):
         holder.add_typer(target, name=command.name)
     else:
         holder.command(command.name, cls=resolve(command.cls) if command.cls else None)(target)
     group: Any = get_command(holder)
-    return group.commands[command.name]
+    built = group.commands[command.name]
+    for each in getattr(built, "commands", {"": built}).values():
+        each.params += [option for option in group.params if option.name == "plugin"]
+    return built
+
+
+def split_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a command's words without `--plugin PATH`, and the paths: what these register is what words name.
+
+    Raises
+    ------
+    OptionError
+        If the last one has no path.
+    """
+    rest, paths = list[str](), list[str]()
+    left = iter(words)
+    for word in left:
+        option, equals, path = word.partition("=")
+        if word == "--":
+            rest += [word, *left]
+        elif option != "--plugin":
+            rest.append(word)
+        elif path := path if equals else next(left, ""):
+            paths.append(path)
+        else:
+            raise OptionError("--plugin needs a path, for example --plugin ring.py")
+    return rest, paths
 
 
 class LazyGroup(TyperGroup):
@@ -179,8 +222,9 @@ def build() -> typer.Typer:
                 "--strict", help="Stop at a broken plugin instead of skipping it (or QRLSUITE_STRICT=1)."
             ),
         ] = False,
+        plugin: PluginOption = None,
     ) -> None:
-        pass  # `cli.main` sees to --strict, for plugins are loaded before options are read
+        pass  # `cli.main` sees to --strict and --plugin, for plugins are loaded before options are read
 
     add_commands(app, registry.load())
     return app

@@ -166,7 +166,7 @@ def train(
     fresh = not work.store.path.exists()
     EntryStore.create(work.runs, work.entry)
     if work.groups:
-        codes.prepare(work.store, code)
+        codes.prepare(work.store, code, identity.plugins(work.entry))
     holders = sorted({f"process {claim.pid} on {claim.host}" for claim in certain(work.store)})
     display.begin(where.submits, holders)
     if not work.groups:

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qrlsuite import own
 from qrlsuite.errors import EnvironmentFailure, PluginError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, from_record
@@ -154,10 +155,13 @@ def in_fresh_process(entry: Entry, seeds: Sequence[int], epochs: int, device: st
     _ProbeFailed
         If the process was killed, or cannot train for another reason: it finds no such device, say.
     """
-    task = {"entry": entry.record(), "seeds": list(seeds), "epochs": epochs, "device": device}
+    task: dict[str, Any] = {"entry": entry.record(), "seeds": list(seeds), "epochs": epochs, "device": device}
+    task["plugins"] = []
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as output:
         answer = Path(folder) / "answer"
+        for plugin in identity.plugins(entry):
+            task["plugins"].append(str(own.write(plugin, Path(folder) / plugin.mark)))
         (Path(folder) / "task").write_text(json.dumps(task))
         with (Path(folder) / "task").open("rb") as given:
             process = subprocess.Popen(
@@ -292,6 +296,8 @@ def main(arguments: Sequence[str]) -> int:
     header: dict[str, Any] = {"error": None}
     arrays: Arrays = {}
     try:
+        for path in task["plugins"]:
+            own.load(path)
         side = train(from_record(task["entry"], "the probe"), task["seeds"], task["epochs"], task["device"])
         header |= {"lines": side.lines, "changed": side.changed}
         arrays = side.arrays

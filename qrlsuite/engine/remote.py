@@ -259,6 +259,7 @@ class _Run:
             "device": self.work.device,
             "versions": self.versions,
             "code": self.code.record()["parts"],
+            "plugins": [plugin.packed() for plugin in identity.plugins(self.entry)],
         }
         task = pack(header, arrays)
         if len(task) > MOST_BYTES:

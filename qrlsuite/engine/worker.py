@@ -21,7 +21,7 @@ from pathlib import Path
 
 from qrlsuite.engine import probe as probing
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.results import probes
+from qrlsuite.results import codes, probes
 from qrlsuite.results.checkpoint import group_id
 from qrlsuite.results.claims import HEARTBEAT, HEARTBEAT_THREAD, Claim, SeedsClaimedError, acquire, living
 from qrlsuite.results.progress import Progress, ProgressFile
@@ -200,6 +200,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _set_checkpoint_seconds()
         folder, *others = options.folders
+        for path in options.folders:
+            codes.load_copies(EntryStore(path))
         seeds, parent = parse_seeds(options.seeds), options.follow_parent
         train_group(folder, seeds, options.epochs, options.device, parent, others)
     except SeedsClaimedError as error:

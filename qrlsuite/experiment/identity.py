@@ -23,7 +23,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from qrlsuite import circuit, options, registry, specs
+from qrlsuite import circuit, options, own, registry, specs
 from qrlsuite.circuit.description import Circuit, canonical
 from qrlsuite.experiment import source
 from qrlsuite.experiment.entry import Entry
@@ -86,6 +86,22 @@ def of(entry: Entry) -> CodeIdentity:
         for role, each in entry.registered().items()
     ]
     return CodeIdentity((*parts, *_files(entry)))
+
+
+def plugins(entry: Entry) -> list[own.Source]:
+    """Return the plugins by path whose code makes an entry's numbers, or watches its training."""
+    roots = {
+        reference.partition(":")[0]
+        for role, each in entry.registered().items()
+        for name in _CODE[role]
+        if (reference := getattr(each.spec, name)) is not None
+    }
+    reached = source.reached(roots, lambda name, spec: name in own.modules())
+    needed = {Path(file).parts[0].removesuffix(".py") for file in reached}
+    watching = {each.distribution for each in registry.load().of(specs.TrackerSpec).values()}
+    return [
+        each.source for each in own.loaded() if each.source.module in needed or each.source.name in watching
+    ]
 
 
 def numerics(entry: Entry) -> dict[str, int]:
@@ -161,6 +177,9 @@ def _gymnasium_module(env_id: str) -> str | None:
 def _modules(roots: Sequence[str], distribution: str) -> dict[str, str]:
     """Return the modules that roots reach within their distribution; without one, within their own folder."""
     tops = {root.partition(".")[0] for root in roots}
+    if own.of_distribution(distribution) is not None:  # one plugin by path may import another
+        paths = own.modules()
+        return source.reached(roots, lambda name, spec: name in paths)
     listed = _listed(distribution)
     places = {_place(spec) for top in tops if (spec := source.find(top)) is not None} - {None}
 

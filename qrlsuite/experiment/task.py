@@ -15,7 +15,8 @@ from pydantic import (
     model_validator,
 )
 
-from qrlsuite import files, options, registry, specs
+import qrlsuite
+from qrlsuite import files, options, own, registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.preset import TuningRecord
 from qrlsuite.statistics.grid import Grid
@@ -319,7 +320,7 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def parse(text: str, source: str) -> Task:
+def parse(text: str, source: str, folder: Path | None = None) -> Task:
     """Parse and validate a task.
 
     Parameters
@@ -328,8 +329,10 @@ def parse(text: str, source: str) -> Task:
         TOML.
     source:
         Where it came from, for messages.
+    folder:
+        Of the file: what the paths in its key `plugins` are relative to.
     """
-    data = _whole(text, source)
+    data = _whole(text, source, folder=folder)
     try:
         file = TaskFile.model_validate(data)
     except pydantic.ValidationError as error:
@@ -338,10 +341,11 @@ def parse(text: str, source: str) -> Task:
     return Task(file, source)
 
 
-def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a file's content; where it has `extends = TASK`, that task's, with this file's values in place of its own.
+def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | None = None) -> dict[str, Any]:
+    """Return a file's content, with that of the task which it extends, and load the plugins that it names.
 
-    Tables are merged key by key. Every other value, a list too, replaces the one of the extended task.
+    Where it has `extends = TASK`, the content is that task's, with this file's values in place of its own. Tables are
+    merged key by key. Every other value, a list too, replaces the one of the extended task.
 
     Parameters
     ----------
@@ -349,6 +353,7 @@ def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any
         The tasks whose files lead here by `extends`.
     """
     data = files.parse(text, source)
+    own.load_named(data.pop("plugins", []), folder, source)
     if "extends" not in data:
         return data
     name = data.pop("extends")
@@ -360,7 +365,8 @@ def _whole(text: str, source: str, below: tuple[str, ...] = ()) -> dict[str, Any
         path = Path(registry.get(specs.TaskSpec, name).path)
     except UnknownNameError as error:
         raise FileError(f"{source}: extends: {error}") from None
-    return _merged(_whole(files.read(path, "task file"), path.name, (*below, name)), data)
+    base = _whole(files.read(path, "task file"), path.name, (*below, name), path.parent)
+    return _merged(base, data)
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -393,7 +399,8 @@ def _environment_problems(section: Any) -> list[str]:
 def load(name: str) -> Task:
     """Load a registered task by name, a task file by path (anything that ends in `.toml`), or `gym:ID`.
 
-    `gym:Acrobot-v1` is a task with settings for a quick look at an environment that Gymnasium knows.
+    `gym:Acrobot-v1` is a task with settings for a quick look at an environment that Gymnasium knows. So is the name of
+    a registered environment without lanes of its own, where no task has that name.
 
     Raises
     ------
@@ -404,9 +411,18 @@ def load(name: str) -> Task:
     OptionError
         If Gymnasium knows no such environment, or the algorithms cannot act or observe in it.
     """
+    environment, known = (
+        registry.load().of(specs.EnvironmentSpec).get(name),
+        registry.load().of(specs.TaskSpec),
+    )
     if name.startswith("gym:"):
         from qrlsuite.gymlanes import quick_task
 
         return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
+    if name not in known and environment is not None and environment.spec.vector is None:
+        from qrlsuite.gymlanes import quick_task
+
+        qrlsuite.register_environments()
+        return Task(TaskFile.model_validate(quick_task(environment.spec.gymnasium_id, name)), name)
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.TaskSpec, name).path)
-    return parse(files.read(path, "task file"), path.name)
+    return parse(files.read(path, "task file"), path.name, path.parent)

@@ -8,15 +8,19 @@ that nobody knows. What an author declared to be the same in effect stands in `e
 from __future__ import annotations
 
 import datetime
+import os
+import re
+import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qrlsuite.errors import OptionError, StoreError, listed
+from qrlsuite import own
+from qrlsuite.errors import OptionError, PluginError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.identity import CodeIdentity
-from qrlsuite.results import survey
+from qrlsuite.results import genuine, survey
 from qrlsuite.results.claims import move_away
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, read_json, write_json
@@ -299,10 +303,132 @@ def require_sent(store: EntryStore, current: CodeIdentity, host: str) -> None:
         )
 
 
-def prepare(store: EntryStore, current: CodeIdentity) -> None:
-    """Write down with which code an entry is trained from now on; workers refuse another one."""
-    if store.record().get("code") != current.record():
+def prepare(store: EntryStore, current: CodeIdentity, plugins: Sequence[own.Source] = ()) -> None:
+    """Write down with which code an entry is trained from now on; workers refuse another one.
+
+    Parameters
+    ----------
+    plugins:
+        The plugins by path among that code. They are copied into the entry's folder, where workers find them.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be written.
+    """
+    record = store.record()
+    kept = {code: list(places) for code, places in _kept(store, record).items() if code != current.digest}
+    places = [_copied(store, plugin) for plugin in plugins]
+    if places:
+        kept[current.digest] = places
+    if record.get("code") != current.record():
         _note(store, "code", current.record())
+    if kept != record.get("plugins", {}):
+        _note(store, "plugins", kept)
+
+
+PLUGINS = "plugins"
+"""The folder, in an entry's, of copies of plugins by path: each in a folder named by its content."""
+
+_COPY = re.compile(rf"{PLUGINS}/([0-9a-f]{{16}})/[A-Za-z_][A-Za-z0-9_]*(\.py)?")
+
+
+def _kept(store: EntryStore, record: Mapping[str, Any]) -> Mapping[str, list[str]]:
+    """Return where an entry's copies of plugins are, by the digest of the code that they belong to.
+
+    Raises
+    ------
+    StoreError
+        If the record says something else than that.
+    """
+    kept = record.get("plugins", {})
+    if not isinstance(kept, dict) or not all(
+        isinstance(places, list) and all(isinstance(each, str) and _COPY.fullmatch(each) for each in places)
+        for places in kept.values()
+    ):
+        raise StoreError(f"{store.path / 'entry.json'}: plugins names no copies of plugins; restore the file")
+    return kept
+
+
+def _copied(store: EntryStore, plugin: own.Source) -> str:
+    """Copy a plugin into an entry's folder, whatever is there in its place; returns where it is in that folder."""
+    place = f"{PLUGINS}/{plugin.mark}/{plugin.name}"
+    folder = store.path / PLUGINS / plugin.mark
+    try:
+        genuine.require_no_link(store.path, store.path / PLUGINS, folder, folder / plugin.name)
+        if not folder.is_dir() or own.read(folder / plugin.name).mark != plugin.mark:
+            raise PluginError("it is not there, or is not what it was")
+    except PluginError:
+        draft = store.path / PLUGINS / f".{plugin.mark}-{os.getpid()}"
+        try:
+            shutil.rmtree(draft, ignore_errors=True)
+            own.write(plugin, draft)
+            shutil.rmtree(folder, ignore_errors=True)
+            draft.rename(folder)
+        except OSError as error:
+            shutil.rmtree(draft, ignore_errors=True)
+            raise StoreError(f"{folder} cannot be written: {error.strerror or error}") from None
+    return place
+
+
+def copies(store: EntryStore) -> list[Path]:
+    """Return the copies of plugins by path with which an entry is trained now; imports nothing.
+
+    Raises
+    ------
+    StoreError
+        If the entry's record is damaged.
+    """
+    record = store.record()
+    code = read(record, store.path / "entry.json")
+    places = [] if code is None else _kept(store, record).get(code.digest, [])
+    for place in places:
+        path = store.path / place
+        genuine.require_no_link(store.path, store.path / PLUGINS, path.parent, path)
+    return [store.path / place for place in places]
+
+
+def load_plugins(path: str | os.PathLike[str]) -> list[own.Loaded]:
+    """Load a plugin's file or folder; of an entry's folder, the copies with which the entry is trained.
+
+    Nothing else imports what lies in a results folder: to read an entry never does.
+
+    Raises
+    ------
+    PluginError
+        See `qrlsuite.own.load`; or if the entry has no copies.
+    StoreError
+        If a copy is not what it was when it was made.
+    """
+    store = EntryStore(Path(path))
+    if not (store.path / "entry.json").is_file():
+        return [own.load(path)]
+    found = load_copies(store)
+    if not found:
+        raise PluginError(
+            f"{path} has no copies of plugins: its code is the suite's, or of installed plugins"
+        )
+    return found
+
+
+def load_copies(store: EntryStore) -> list[own.Loaded]:
+    """Load the copies of plugins by path with which an entry is trained.
+
+    Raises
+    ------
+    PluginError
+        If one cannot be loaded.
+    StoreError
+        If a copy is not what it was when it was made.
+    """
+    sources = [own.read(path) for path in copies(store)]
+    for source in sources:
+        if source.mark != source.path.parent.name:
+            raise StoreError(
+                f"{source.path} is not what it was when it was copied: restore it, or give the plugin itself with "
+                "--plugin FILE"
+            )
+    return [own.load_source(source) for source in sources]
 
 
 def declare_same(store: EntryStore, current: CodeIdentity, reason: str) -> None:

@@ -33,7 +33,7 @@ import pyarrow
 import pyarrow.parquet
 from numpy.typing import NDArray
 
-from qrlsuite.errors import StoreError
+from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
@@ -705,7 +705,11 @@ class EntryStore:
                 f"{self.path} holds curves that another program made: they can be compared, not trained, evaluated or "
                 "published"
             )
-        return from_record(self.record(), str(self.path / "entry.json"))
+        record = self.record()
+        try:
+            return from_record(record, str(self.path / "entry.json"))
+        except UnknownNameError as error:
+            raise UnknownNameError(f"{error}{copies_of_plugins(self, record)}") from None
 
     def seed(self, seed: int) -> SeedStore:
         """Return the folder of one seed (it need not exist)."""
@@ -724,6 +728,35 @@ class EntryStore:
             if record and record.get("status") == "finished" and int(record.get("epochs", 0)) >= epochs:
                 done.add(seed)
         return done
+
+
+def copies_of_plugins(store: EntryStore, record: Mapping[str, Any]) -> str:
+    """Say what to type for the copies of plugins that an entry has; nothing where it has none."""
+    kept = record.get("plugins")
+    places = [str(place) for each in kept.values() for place in each] if isinstance(kept, dict) else []
+    if not places:
+        return ""
+    names = " and ".join(sorted({Path(place).name for place in places}))
+    return f"; {store.path} has a copy of {names}: if you trust it, add --plugin {store.path}"
+
+
+def plugins_in(runs: Path, unknown: str) -> str:
+    """Say what to type where an entry of a results folder has a copy of the plugin with an unknown name.
+
+    Parameters
+    ----------
+    unknown:
+        The message that says it: the name stands in quotes.
+    """
+    name = unknown.partition("'")[2].partition("'")[0]
+    for store in entries(runs) if runs.is_dir() else ():
+        try:
+            record = read_json(store.path / "entry.json")
+        except StoreError:
+            continue
+        if f'"{name}"' in json.dumps(record.get("identity")) and (said := copies_of_plugins(store, record)):
+            return said
+    return ""
 
 
 def entries(runs: Path, task: str | None = None) -> list[EntryStore]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import AwareDatetime, Field, model_validator
 
-from qrlsuite import files, notation, options, registry, specs
+from qrlsuite import files, notation, options, own, registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.experiment.entry import Entry, option_sides, resolve
 from qrlsuite.experiment.preset import EntryTuning
@@ -352,9 +352,17 @@ def _has(sides: Mapping[str, type[Any]], setting: Setting) -> bool:
     return any(setting.name in options.field_names(cls) for cls in chosen)
 
 
-def parse(text: str, source: str) -> Study:
-    """Parse and validate a study; the entries are resolved by `Study.members`."""
-    data = _with_table(files.parse(text, source))
+def parse(text: str, source: str, folder: Path | None = None) -> Study:
+    """Parse and validate a study; the entries are resolved by `Study.members`.
+
+    Parameters
+    ----------
+    folder:
+        Of the file: what the paths in its key `plugins` are relative to.
+    """
+    content = files.parse(text, source)
+    own.load_named(content.pop("plugins", []), folder, source)
+    data = _with_table(content)
     return Study(files.validate(data, StudyFile, source), source)
 
 
@@ -395,4 +403,4 @@ def dumps(file: StudyFile) -> str:
 def load(name: str) -> Study:
     """Load a registered study by name, or a study file by path (anything that ends in `.toml`)."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
-    return parse(files.read(path, "study file"), path.name)
+    return parse(files.read(path, "study file"), path.name, path.parent)

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from qrlsuite import hookspecs, registry, specs
+from qrlsuite import hookspecs, own, registry, specs
 from qrlsuite import options as option_values
 from qrlsuite.testing.findings import BrokenRuleError
 
@@ -45,7 +45,7 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
         None by reference; `crash`: the last line of stderr, where the interpreter itself ended.
     """
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([modules, references])],
+        [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([_plugins(), modules, references])],
         capture_output=True,
         text=True,
         check=False,
@@ -60,6 +60,11 @@ def fresh_process(modules: tuple[str, ...], references: tuple[str, ...]) -> dict
             return answer
     lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}, and no message"]
     return {"modules": {}, "heavy": [], "references": {}, "crash": lines[-1]}
+
+
+def _plugins() -> list[str]:
+    """Return the paths of the plugins that were loaded by path."""
+    return [str(each.source.path) for each in own.loaded()]
 
 
 def _look(modules: Sequence[str], references: Sequence[str]) -> dict[str, Any]:
@@ -111,7 +116,14 @@ def built_in_order(subject: Any, shape: Sequence[int], outputs: int) -> dict[int
     common = [subject.spec.build, subject.spec.options, dict(subject.settings), [*shape], outputs]
     processes = [
         subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-m", __name__, json.dumps([_BUILD, *common, order])],
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                __name__,
+                json.dumps([_plugins(), _BUILD, *common, order]),
+            ],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -163,6 +175,8 @@ def _build(
 
 
 if __name__ == "__main__":
-    _given = json.loads(sys.argv[1])
+    _paths, *_given = json.loads(sys.argv[1])
+    for _path in _paths:
+        own.load(_path)
     _result = _build(*_given[1:]) if _given[0] == _BUILD else _look(*_given)
     print(f"\n{_MARK}{json.dumps(_result)}")

@@ -1,8 +1,8 @@
 """Trains a group of seeds for a minute, from bytes to bytes: the work of engines without a shared folder.
 
 A *task* and its *answer* are bytes: a safetensors file with the checkpoint, in whose metadata the rest stands as JSON.
-Nothing is read from or written to a disk, and the same task gives the same answer, times aside, however often and
-wherever it is worked on.
+Nothing but plugins by path is written to a disk, and the same task gives the same answer, times aside, however often
+and wherever it is worked on.
 
 Of a task:
 
@@ -14,6 +14,7 @@ Of a task:
     device          `cpu`, `cuda` or `cuda:1`
     versions        of the distributions that make the numbers: a worker with others refuses the task
     code            the parts of the entry's code identity: the same
+    plugins         the plugins by path among that code: name, and content in base64 by file
 
 Of an answer:
 
@@ -36,15 +37,18 @@ import functools
 import json
 import platform
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from qrlsuite import own
 from qrlsuite.errors import QrlSuiteError, StoreError, listed
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import from_record
@@ -115,16 +119,38 @@ def work_on(task: bytes) -> bytes:
     answer: dict[str, Any] = {"token": token, "seeds": seeds, "refused": None, "error": None}
     if different:
         return pack({**answer, "refused": f"{socket.gethostname()} has {different}"}, {})
-    if changed := _changed_code(header):
-        return pack({**answer, "refused": f"{socket.gethostname()} has other code: {changed}"}, {})
     keep_freed_memory()
     with _one_at_a_time:
+        try:
+            _load_plugins(header.get("plugins", []))
+        except QrlSuiteError as error:
+            return pack({**answer, "refused": f"{socket.gethostname()}: {error}"}, {})
+        if changed := _changed_code(header):
+            return pack({**answer, "refused": f"{socket.gethostname()} has other code: {changed}"}, {})
         more, arrays = _trained(header, seeds, arrays)
     content = pack({**answer, **more}, arrays)
     if len(content) > MOST_BYTES:
         nothing = {"epoch": header["epoch"], "lines": [], "timings": []}
         return pack({**answer, **more, **nothing, "error": too_large(len(content), len(seeds))}, {})
     return content
+
+
+def _load_plugins(packed: Sequence[Any]) -> None:
+    """Load the plugins by path that a task has, in the place of those of earlier tasks; the same again does nothing."""
+    folder = Path(_folder().name)
+    sources = [own.Source.unpacked(each, folder) for each in packed]
+    for each in own.loaded():
+        if each.source.path.is_relative_to(folder) and each.source not in sources:
+            own.unload(each)
+    for source in sources:
+        own.write(source, source.path.parent)
+        own.load_source(source)
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """Return this process's folder of plugins that came with tasks."""
+    return tempfile.TemporaryDirectory(prefix="qrlsuite-plugins-")
 
 
 def _changed_code(header: Mapping[str, Any]) -> str:

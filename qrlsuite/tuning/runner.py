@@ -102,7 +102,8 @@ def _run(
         works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
         for work in works:
             missing.check_memory(work, where)
-            codes.prepare(EntryStore.create(work.runs, work.entry), identity.of(work.entry))
+            store = EntryStore.create(work.runs, work.entry)
+            codes.prepare(store, identity.of(work.entry), identity.plugins(work.entry))
             trained += len(work.todo)
         display.begin_trials(works)
         for together in where.divide(works):

@@ -18,8 +18,8 @@ FOLDERS = {
     "qrlsuite.leaderboard": ROOT / "leaderboard",
 }
 TOP = {
-    "actions", "algorithm", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization", "notation",
-    "options", "population", "registry", "seeding", "specs",
+    "actions", "algorithm", "cells", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
+    "notation", "options", "own", "population", "registry", "seeding", "shortforms", "specs",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""
 

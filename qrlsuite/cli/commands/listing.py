@@ -79,7 +79,7 @@ def _list_plugins(known: Registry, json_output: bool) -> None:
     for plugin in known.plugins:
         if plugin.distribution != last:
             needs = f", for qrlsuite{plugin.requires}" if plugin.requires else ""
-            if not needs and plugin.distribution != "qrlsuite":
+            if not needs and plugin.version and plugin.distribution != "qrlsuite":
                 needs = ", for any qrlsuite (its pyproject.toml should say dependencies = ['qrlsuite>=...'])"
             typer.echo(("\n" if last else "") + printable(f"{plugin.distribution} {plugin.version}{needs}"))
             last = plugin.distribution

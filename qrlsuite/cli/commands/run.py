@@ -22,10 +22,11 @@ from qrlsuite.cli.training import (
 )
 from qrlsuite.engine import missing
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.notation import Written, parse_entry
 from qrlsuite.results.seeds import parse_seeds
+from qrlsuite.results.store import plugins_in
 from qrlsuite.training import trackers
 
 QUICK_SEEDS = 8
@@ -101,7 +102,10 @@ def run(
     --set qubits=6
     """
     written = _written(entry or [], model, settings or [])
-    resolved = resolve(task, _quick(written) if quick else written)
+    try:
+        resolved = resolve(task, _quick(written) if quick else written)
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{error}{plugins_in(runs, str(error))}") from None
     if track:
         trackers.ask(track)
     seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None

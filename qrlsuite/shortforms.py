@@ -1,0 +1,328 @@
+"""Short forms of what a plugin by path registers: a function or class alone, its options taken from the signature.
+
+    form                     signature                                          registered as
+    a function               (qubits, layers, ...) -> Circuit                   ansatz
+    a torch.nn.Module        __init__(self, inputs, outputs, ...)               model
+    a gymnasium.Env          __init__(self, ...)                                environment
+    an algorithm's class     __init__(self, envs, build_model, streams, device, ...)   algorithm
+
+Every further parameter is an option, with its annotation and its default. In the place of further parameters there may
+be a parameter `options`, annotated with a dataclass, as a package writes it. The name is that of the function or class
+in lower case with hyphens, the summary the first line of its docstring.
+
+A model's class attribute `family = "quantum"` says that it is one; otherwise it is one where its `__init__` or module
+says `qrlsuite.layer`. Episodes of an environment end after 1000 steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import re
+import sys
+import typing
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Annotated, Any
+
+import pydantic
+
+from qrlsuite import specs
+from qrlsuite.errors import PluginError
+
+EPISODE_STEPS = 1000
+"""At which episodes of an environment end."""
+
+_ALGORITHM = ("start", "train_epoch", "act", "state_dict", "load_state_dict", "policy_state")
+"""The methods by which an algorithm is known."""
+
+_HANDED = ("envs", "build_model", "streams", "device")
+"""What an algorithm's class is built with, beside options."""
+
+
+def kebab(name: str) -> str:
+    """Return the name under which a function or class is registered: `RingNet` becomes `ring-net`."""
+    words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", lambda m: f"{m[1] or m[3]}-{m[2] or ''}", name)
+    return re.sub(r"[-_]+", "-", words).strip("-").lower()
+
+
+def kind_of(thing: Any) -> type[specs.Spec] | None:
+    """Return the kind that a function or class is a short form of, None where it is of none."""
+    if inspect.isfunction(thing):
+        return specs.AnsatzSpec if _builds_circuits(thing) else None
+    if not isinstance(thing, type):
+        return None
+    gymnasium, torch = sys.modules.get("gymnasium"), sys.modules.get("torch")
+    if gymnasium is not None and issubclass(thing, gymnasium.Env):
+        return specs.EnvironmentSpec
+    if torch is not None and issubclass(thing, torch.nn.Module):
+        return specs.ModelSpec
+    if all(callable(getattr(thing, name, None)) for name in _ALGORITHM):
+        return specs.AlgorithmSpec
+    return None
+
+
+def _builds_circuits(function: Callable[..., Any]) -> bool:
+    """Return whether a function is annotated to return a circuit; or, without such a word, takes qubits and layers."""
+    returned = function.__annotations__.get("return", inspect.Parameter.empty)
+    if returned is not inspect.Parameter.empty:
+        word = returned if isinstance(returned, str) else getattr(returned, "__name__", "")
+        return word.rpartition(".")[2] == "Circuit"
+    return list(inspect.signature(function).parameters)[:2] == ["qubits", "layers"]
+
+
+def recognized(module: ModuleType) -> list[Any]:
+    """Return the functions and classes in a module that are short forms: public ones that are defined there.
+
+    A `torch.nn.Module` whose `__init__` cannot be that of a model is a part of one, and is left out.
+    """
+    own = [
+        thing
+        for name, thing in vars(module).items()
+        if not name.startswith("_")
+        and getattr(thing, "__module__", "").partition(".")[0] == module.__name__
+        and getattr(thing, "__name__", None) == name
+    ]
+    found = [(thing, kind_of(thing)) for thing in own]
+    return [
+        thing
+        for thing, kind in found
+        if kind is not None and not (kind is specs.ModelSpec and _is_part(thing))
+    ]
+
+
+def _is_part(cls: type[Any]) -> bool:
+    try:
+        _signature(cls, ("inputs", "outputs"))
+    except PluginError:
+        return True
+    return False
+
+
+def line_of(thing: Any) -> int | None:
+    """Return the line where a function or class begins, None where it is not known."""
+    code = getattr(thing, "__code__", None)
+    if code is not None:
+        return int(code.co_firstlineno)
+    try:
+        return inspect.getsourcelines(thing)[1]
+    except (OSError, TypeError):
+        return None
+
+
+def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
+    """Return the spec of a short form; what its references name is put into the module.
+
+    Parameters
+    ----------
+    origin:
+        The plugin's name, for the summary of a thing without a docstring.
+
+    Raises
+    ------
+    PluginError
+        If it is no short form, or a parameter cannot be an option; the message says what to write.
+    """
+    kind = kind_of(thing)
+    if kind is None:
+        raise PluginError(f"{_title(thing)} cannot be registered: {_REFUSED}")
+    name = kebab(thing.__name__)
+    if not specs.NAME.fullmatch(name):
+        raise PluginError(
+            f"{_title(thing)} needs a name with letters, of which 'ring-net' is made for RingNet"
+        )
+    makers: dict[type[specs.Spec], Callable[[Any, str, str, _Holder], specs.Spec]] = {
+        specs.AnsatzSpec: _ansatz,
+        specs.ModelSpec: _model,
+        specs.EnvironmentSpec: _environment,
+        specs.AlgorithmSpec: _algorithm,
+    }
+    # not the docstring of a base class
+    own = vars(thing).get("__doc__") if isinstance(thing, type) else getattr(thing, "__doc__", None)
+    summary = (own or "").strip().partition("\n")[0].strip()
+    return makers[kind](
+        thing, name, summary or f"{thing.__name__} of {origin}", _Holder(module, thing.__name__)
+    )
+
+
+_REFUSED = (
+    "it is neither a spec nor a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or "
+    "algorithm class"
+)
+
+
+def _title(thing: Any) -> str:
+    return f"'{getattr(thing, '__name__', None) or repr(thing)[:60]}'"
+
+
+class _Holder:
+    """Puts what references name into a module."""
+
+    def __init__(self, module: ModuleType, name: str) -> None:
+        self.module, self.name = module, name
+
+    def put(self, word: str, value: Any) -> str:
+        """Return the reference to a value."""
+        attribute = f"_qrlsuite_{self.name}_{word}"
+        known = str(value.__name__)
+        if isinstance(value, type) and getattr(self.module, known, None) is value:
+            return f"{self.module.__name__}:{known}"  # an options class that is written out
+        value.__module__, value.__qualname__ = self.module.__name__, attribute
+        value.__name__ = attribute
+        setattr(self.module, attribute, value)
+        return f"{self.module.__name__}:{attribute}"
+
+
+def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
+    options, call = _signature(function, ("qubits", "layers"))
+
+    def build(qubits: int, layers: int, chosen: Any) -> Any:
+        return call(qubits, layers, options=chosen)
+
+    return specs.AnsatzSpec(
+        name, summary, options=holder.put("options", options), build=holder.put("build", build)
+    )
+
+
+def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
+    options, call = _signature(cls, ("inputs", "outputs"), optional=("generator",))
+
+    def build(obs_dim: int, out_dim: int, chosen: Any, generator: Any) -> Any:
+        return call(obs_dim, out_dim, options=chosen, generator=generator)
+
+    family: Any = getattr(cls, "family", None) or ("quantum" if _uses_circuits(cls) else "classical")
+    return specs.ModelSpec(
+        name, summary, family=family, options=holder.put("options", options), build=holder.put("build", build)
+    )
+
+
+def _uses_circuits(cls: type[Any]) -> bool:
+    """Return whether a model's `__init__` names `qrlsuite.layer`, or another of the suite's functions of circuits."""
+    init = vars(cls).get("__init__")
+    names, scope = getattr(getattr(init, "__code__", None), "co_names", ()), getattr(init, "__globals__", {})
+    return any(
+        name == "layer" or getattr(scope.get(name), "__module__", "").startswith("qrlsuite.circuit")
+        for name in names
+    )
+
+
+def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
+    options, _ = _signature(cls, ())
+
+    def make(**arguments: Any) -> Any:
+        from gymnasium.wrappers import TimeLimit
+
+        return TimeLimit(cls(**arguments), EPISODE_STEPS)
+
+    return specs.EnvironmentSpec(
+        name,
+        summary,
+        options=holder.put("options", options),
+        gymnasium_id=f"own/{cls.__name__}-v0",
+        entry_point=holder.put("make", make),
+    )
+
+
+def _algorithm(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
+    options, call = _signature(cls, (), named=_HANDED)
+
+    def factory(envs: Any, build_model: Any, chosen: Any, streams: Any, device: Any) -> Any:
+        return call(options=chosen, envs=envs, build_model=build_model, streams=streams, device=device)
+
+    return specs.AlgorithmSpec(
+        name, summary, options=holder.put("options", options), factory=holder.put("factory", factory)
+    )
+
+
+def _signature(
+    thing: Callable[..., Any],
+    first: tuple[str, ...],
+    named: tuple[str, ...] = (),
+    optional: tuple[str, ...] = (),
+) -> tuple[type[Any], Callable[..., Any]]:
+    """Return the options class of a signature, and a function that calls with an object of it as `options`.
+
+    Parameters
+    ----------
+    first:
+        What is handed over by position; the parameters may have other names.
+    named, optional:
+        What is handed over by name: always, and where there is such a parameter.
+    """
+    parameters = [
+        each
+        for each in inspect.signature(thing).parameters.values()
+        if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+    ]
+    written = f"{thing.__name__}({', '.join([*first, *named, '...'])})"
+    if len(parameters) < len(first) or any(p.kind is p.KEYWORD_ONLY for p in parameters[: len(first)]):
+        raise PluginError(f"{_title(thing)} takes {len(parameters)} arguments, and is called as {written}")
+    rest = [each for each in parameters[len(first) :] if each.name not in (*named, *optional)]
+    missing = [name for name in named if name not in {each.name for each in parameters}]
+    if missing:
+        raise PluginError(f"{_title(thing)} has no parameter '{missing[0]}', and is called as {written}")
+    hints = _hints(thing)
+    positional = [each.name for each in rest if each.kind is each.POSITIONAL_ONLY]
+    if positional:
+        raise PluginError(f"{_title(thing)}: '{positional[0]}' cannot be given by name: leave the / out")
+    takes = {each.name for each in parameters}
+    if [each.name for each in rest] == ["options"] and dataclasses.is_dataclass(hints.get("options")):
+        return hints["options"], _calling(thing, takes, lambda chosen: {"options": chosen})
+    fields = [_field(thing, each, hints) for each in rest]
+    body: dict[str, Any] = {name: default for name, _, default in fields}
+    body |= {
+        "__annotations__": {name: annotation for name, annotation, _ in fields},
+        "__doc__": f"Options of {thing.__name__}.",
+    }
+    made = pydantic.dataclasses.dataclass(
+        type("Options", (), body), frozen=True, config=pydantic.ConfigDict(extra="forbid")
+    )
+    names = [each.name for each in rest]
+    return made, _calling(thing, takes, lambda chosen: {name: getattr(chosen, name) for name in names})
+
+
+def _calling(thing: Callable[..., Any], takes: set[str], unfold: Callable[[Any], Mapping[str, Any]]) -> Any:
+    def call(*given: Any, options: Any, **named: Any) -> Any:
+        return thing(
+            *given, **{name: value for name, value in named.items() if name in takes}, **unfold(options)
+        )
+
+    return call
+
+
+def _hints(thing: Any) -> Mapping[str, Any]:
+    function: Any = getattr(thing, "__init__") if isinstance(thing, type) else thing  # noqa: B009
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except Exception as error:  # a name that is not there, say
+        raise PluginError(
+            f"{_title(thing)}: its annotations cannot be read: {type(error).__name__}: {error}"
+        ) from None
+
+
+def _field(
+    thing: Callable[..., Any], parameter: inspect.Parameter, hints: Mapping[str, Any]
+) -> tuple[str, Any, Any]:
+    """Return a parameter as a field of the options class."""
+    name, default = parameter.name, parameter.default
+    if default is parameter.empty:
+        kind = parameter.annotation if isinstance(parameter.annotation, str) else "int"
+        raise PluginError(
+            f"{_title(thing)}: parameter '{name}' needs a default, for example {name}: {kind} = 1"
+        )
+    annotation = hints.get(name)
+    if annotation is None:
+        if not isinstance(default, bool | int | float | str):
+            raise PluginError(
+                f"{_title(thing)}: parameter '{name}' needs a type, for example {name}: int = 1"
+            )
+        annotation = type(default)
+    described = any(getattr(each, "description", None) for each in getattr(annotation, "__metadata__", ()))
+    if not described:
+        annotation = Annotated[annotation, pydantic.Field(description=f"argument of {thing.__name__}")]
+    factory = functools.partial(type(default), default) if isinstance(default, list | dict | set) else None
+    given = (
+        dataclasses.field(default=default) if factory is None else dataclasses.field(default_factory=factory)
+    )
+    return name, annotation, given

@@ -1,0 +1,244 @@
+"""`--plugin PATH`: commands, workers and later readers of a plugin that is a file, as a user types and edits it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.commands import qrlsuite, start
+from tests.conftest import HANGS, TINY, results
+from tests.core.test_own import ALL, RING
+
+ENTRY = "vqc-native ansatz=ring qubits=2 layers=1"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "tiny.toml").write_text(TINY)
+    (tmp_path / "ring.py").write_text(RING)
+    return tmp_path
+
+
+def run(
+    folder: Path, *words: str, plugin: str = "ring.py", code: int = 0, epochs: int = 2, entry: str = ENTRY
+) -> str:
+    """Train two seeds, and return what was said."""
+    seeds = () if "--seeds" in words else ("--seeds", "2")
+    command = ["run", entry, "--task", "tiny.toml", *seeds, "--epochs", str(epochs), "--workers", "2", *words]
+    done = qrlsuite(*command, *(("--plugin", plugin) if plugin else ()), cwd=folder)
+    assert done.returncode == code, done.stderr
+    return done.stdout + done.stderr
+
+
+def entry_of(folder: Path) -> Path:
+    (found,) = (folder / "runs" / "tiny").iterdir()
+    return found
+
+
+def test_train_edit_and_read_without_the_file(folder: Path) -> None:
+    said = run(folder)
+    assert said.startswith("ring.py: ansatz ring\n")
+    entry = entry_of(folder)
+    before = results(entry, 0)
+    (copy,) = entry.glob("plugins/*/ring.py")
+    assert copy.read_text() == RING
+
+    ring = folder / "ring.py"
+    ring.write_text(RING.replace("A ring.", "The same, in other words."))
+    assert "0 of 2 seeds" not in run(folder)
+    ring.write_text(RING.replace('"RX"', '"RY"'))
+    refused = run(folder, code=2)
+    assert "the circuit of ansatz 'ring' of ring.py has changed" in refused
+    assert "--fresh trains anew" in refused
+    assert len(refused.splitlines()) == 2
+    assert "are now in" in run(folder, "--fresh")
+    aside = next(path for path in entry.parent.iterdir() if "@" in path.name)
+    assert results(aside, 0) == before
+    ring.write_text(RING)
+    run(folder, "--fresh")
+    assert results(entry, 0) == before
+
+    ring.rename(folder / "elsewhere")
+    board = qrlsuite("leaderboard", "--task", "tiny", "--format", "csv", cwd=folder)
+    assert board.returncode == 0
+    assert board.stdout.count("ansatz=ring") == 2
+    assert qrlsuite("show", entry.name, cwd=folder).returncode == 0
+    both = [path.name for path in sorted(entry.parent.iterdir())]
+    assert qrlsuite("compare", *both, cwd=folder).returncode == 0
+    for words in (("evaluate", entry.name, "--episodes", "2"), ("show", entry.name, "--identity")):
+        lacking = qrlsuite(*words, cwd=folder)
+        assert lacking.returncode == 2
+        path = f"runs/tiny/{entry.name}"
+        assert lacking.stderr.endswith(
+            f"; {path} has a copy of ring.py: if you trust it, add --plugin {path}\n"
+        )
+        assert qrlsuite(*words, "--plugin", path, cwd=folder).returncode == 0
+    assert f"has a copy of ring.py: if you trust it, add --plugin runs/tiny/{entry.name}" in run(
+        folder, plugin="", code=2
+    )
+    run(folder, "--seeds", "3", plugin=str(entry))
+    assert len(list(entry.glob("seed-*"))) == 3
+    assert results(entry, 0) == before
+
+
+def test_a_copy_that_was_altered_is_not_imported(folder: Path) -> None:
+    run(folder)
+    entry = entry_of(folder)
+    (copy,) = entry.glob("plugins/*/ring.py")
+    copy.write_text("open('it-ran', 'w')\n" + RING)
+    (folder / "ring.py").rename(folder / "elsewhere")
+    for words in (("leaderboard",), ("show", entry.name), ("runs",)):
+        assert qrlsuite(*words, cwd=folder).returncode == 0
+    assert "is not what it was when it was copied" in run(folder, "--seeds", "3", plugin=str(entry), code=2)
+    assert not list(folder.rglob("it-ran"))
+    (folder / "elsewhere").rename(folder / "ring.py")
+    run(folder, "--seeds", "3")
+    assert copy.read_text() == RING, "a command with the plugin makes the copy anew"
+
+
+def test_a_record_that_names_other_files_is_refused(folder: Path) -> None:
+    run(folder)
+    entry = entry_of(folder)
+    (folder / "evil.py").write_text("open('it-ran', 'w')\n")
+    path = entry / "entry.json"
+    record = json.loads(path.read_text())
+    for place in ("../../../evil.py", str(folder / "evil.py"), "plugins/../../../../evil.py"):
+        record["plugins"] = {code: [place] for code in record["plugins"]}
+        path.write_text(json.dumps(record))
+        assert "plugins names no copies of plugins; restore the file" in run(
+            folder, plugin=str(entry), code=2
+        )
+    assert not (folder / "it-ran").exists()
+    run(folder, "--seeds", "3", code=2)
+
+
+@pytest.mark.parametrize("engine", ["local", "command"])
+def test_a_killed_run_goes_on_to_the_same_bytes(folder: Path, engine: str) -> None:
+    """The file is gone in between: workers have the entry's copy, and the entry says where it is."""
+    words = ("run", ENTRY, "--task", "tiny.toml", "--seeds", "2", "--workers", "2", "--engine", engine)
+    command = start(*words, "--epochs", "100000", "--plugin", "ring.py", cwd=folder)
+    deadline = time.monotonic() + HANGS
+    while not [
+        path for path in folder.glob("runs/tiny/*/seed-*/epochs.jsonl") if path.read_text().count("\n") > 1
+    ]:
+        assert command.poll() is None, command.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    command.send_signal(signal.SIGINT if engine == "command" else signal.SIGKILL)
+    command.wait()
+    entry = entry_of(folder)
+    (folder / "ring.py").rename(folder / "elsewhere")
+    while qrlsuite("runs", "--json", cwd=folder).stdout.count('"training"') and time.monotonic() < deadline:
+        time.sleep(0.05)
+    epochs = 1 + max(len(path.read_text().splitlines()) for path in entry.glob("seed-*/epochs.jsonl"))
+    run(folder, "--engine", engine, epochs=epochs, plugin=str(entry))
+    shutil.move(folder / "runs", folder / "killed")
+    shutil.move(folder / "elsewhere", folder / "ring.py")
+    run(folder, epochs=epochs)
+    for seed in (0, 1):
+        assert results(entry_of(folder), seed) == results(folder / "killed" / "tiny" / entry.name, seed)
+
+
+def test_an_environment_a_model_and_an_algorithm_of_one_file_in_processes_of_their_own(folder: Path) -> None:
+    """Nothing is forked here: the command, its worker and the probe are started as a user's are."""
+    (folder / "mine.py").write_text(ALL)
+    words = ["run", "slow http-net2 scale=2 lr=0.02", "--task", "line-walk", "--seeds", "2", "--epochs", "1"]
+    command = [sys.executable, "-P", "-m", "qrlsuite", *words, "--workers", "1", "--plugin=mine.py"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "mine.py: ansatz two-rings" not in done.stderr
+    assert done.stderr.startswith(
+        "mine.py: environment line-walk, model http-net2, model quantum, algorithm slow"
+    )
+    (entry,) = (folder / "runs" / "line-walk").iterdir()
+    record = json.loads((entry / "entry.json").read_text())
+    owners = {part["role"]: part["distribution"] for part in record["code"]["parts"]}
+    assert owners == {"environment": "mine.py", "algorithm": "mine.py", "model": "mine.py"}
+    assert json.loads((entry / "seed-0000" / "run.json").read_text())["status"] == "finished"
+
+
+def test_a_study_and_a_task_name_their_plugins(folder: Path) -> None:
+    (folder / "code").mkdir()
+    (folder / "ring.py").rename(folder / "code" / "ring.py")
+    (folder / "tiny.toml").write_text('plugins = ["code/ring.py"]\n' + TINY)
+    run(folder, plugin="")
+    (folder / "tiny.toml").write_text(TINY)
+    (folder / "two.toml").write_text(
+        f"""
+        format_version = 1
+        name = "two"
+        summary = "Two circuits"
+        plugins = ["code/ring.py"]
+        [[entries]]
+        task = "tiny.toml"
+        model = "{ENTRY}"
+        [[pictures]]
+        kind = "curves"
+        """
+    )
+    words = ("study", "run", "two.toml", "--seeds", "2", "--epochs", "2")
+    done = qrlsuite(*words, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert len(list((folder / "runs" / "tiny").iterdir())) == 1, "the entry is the same"
+
+
+def test_other_commands_take_it_too(folder: Path) -> None:
+    for words, expected in (
+        (("show", "ansatz", "ring"), "distribution: ring.py"),
+        (("list", "ansatzes"), "A ring.  [ring.py]"),
+        (("list", "plugins"), "ring.py"),
+        (("check", "ring"), "rules hold"),
+        (("check", "ring.py"), "rules hold"),
+        (("show", "ring", "--identity"), "circuit"),
+    ):
+        done = qrlsuite(*words, "--plugin", "ring.py", cwd=folder)
+        assert done.returncode == 0, done.stderr
+        assert expected in done.stdout
+        assert done.stderr == "ring.py: ansatz ring\n"
+    first = qrlsuite("--plugin", "ring.py", "list", "ansatzes", cwd=folder)
+    assert "[ring.py]" in first.stdout
+    for words in (("run", "--help"), ("study", "run", "--help"), ("--help",), ("check", "-h")):
+        assert "--plugin PATH" in qrlsuite(*words, cwd=folder).stdout
+
+
+def test_a_plugin_by_path_may_add_commands(folder: Path) -> None:
+    (folder / "hello.py").write_text(
+        "from qrlsuite import hookimpl\n\n@hookimpl\ndef register_commands(app):\n"
+        "    @app.command('hello')\n    def hello() -> None:\n        print('hello')\n"
+    )
+    done = qrlsuite("hello", "--plugin", "hello.py", cwd=folder)
+    assert (done.stdout, done.stderr) == ("hello\n", "hello.py: commands alone\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--plugin",), "--plugin needs a path, for example --plugin ring.py"),
+        (("--plugin", "none.py"), "there is no plugin none.py"),
+        (("--plugin", "broken.py"), "broken.py:2: ZeroDivisionError: division by zero"),
+        (("--plugin", "ring.py", "--plugin", "b/ring.py"), "two plugins are called ring: "),
+        (
+            ("--plugin", "ring.py", "--plugin", "again.py"),
+            "ansatz 'ring' is registered already, by ring.py (",
+        ),
+        (("--plugin", "b"), "plugin b is no package: it has no __init__.py"),
+    ],
+)
+def test_bad_input_is_a_line_and_exit_code_2(folder: Path, words: tuple[str, ...], expected: str) -> None:
+    (folder / "broken.py").write_text("x = 1\nx / 0\n")
+    (folder / "again.py").write_text(RING)
+    (folder / "b").mkdir()
+    (folder / "b" / "ring.py").write_text(RING + "\nx = 1\n")
+    done = qrlsuite("list", "ansatzes", *words, cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    lines = [line for line in done.stderr.splitlines() if line != "ring.py: ansatz ring"]
+    assert len(lines) == 1
+    assert lines[0].startswith("qrlsuite: ")
+    assert expected in lines[0]
