@@ -41,6 +41,10 @@ _HANDED = ("envs", "build_model", "streams", "device")
 """What an algorithm's class is built with, beside options."""
 
 
+_ASKED = ("generator", "space", "role")
+"""What a model's class is built with where it has such a parameter, see `qrlsuite.specs.ModelSpec`."""
+
+
 def kebab(name: str) -> str:
     """Return the name under which a function or class is registered: `RingNet` becomes `ring-net`."""
     words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", lambda m: f"{m[1] or m[3]}-{m[2] or ''}", name)
@@ -186,10 +190,19 @@ def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Hold
 
 
 def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
-    options, call = _signature(cls, ("inputs", "outputs"), optional=("generator",))
+    options, call = _signature(cls, ("inputs", "outputs"), optional=_ASKED)
 
-    def build(obs_dim: int, out_dim: int, chosen: Any, generator: Any) -> Any:
-        return call(obs_dim, out_dim, options=chosen, generator=generator)
+    def build(obs_dim: int, out_dim: int, chosen: Any, generator: Any, **more: Any) -> Any:
+        return call(obs_dim, out_dim, options=chosen, generator=generator, **more)
+
+    given = inspect.signature(build)
+    asked = [each for each in inspect.signature(cls).parameters if each in _ASKED[1:]]
+    build.__signature__ = given.replace(  # type: ignore[attr-defined]
+        parameters=[
+            *list(given.parameters.values())[:-1],
+            *(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in asked),
+        ]
+    )
 
     family: Any = getattr(cls, "family", None) or ("quantum" if _uses_circuits(cls) else "classical")
     return specs.ModelSpec(

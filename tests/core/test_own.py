@@ -17,6 +17,7 @@ from qrlsuite.errors import FileError, PluginError, UnknownNameError
 from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.training.remote_task import pack, unpack, work_on
+from qrlsuite.training.trainer import first_network
 
 RING = '''
 from qrlsuite.circuit import Circuit
@@ -72,8 +73,10 @@ class HTTPNet2(torch.nn.Module):
     Of one layer.
     """
 
-    def __init__(self, inputs, outputs, scale: float = 1.0):
+    def __init__(self, inputs, outputs, scale: float = 1.0, *, role="", generator=None):
         super().__init__()
+        assert role
+        assert generator is not None
         self.inner, self.scale = torch.nn.Linear(inputs, outputs), float(scale)
 
     def forward(self, x):
@@ -185,7 +188,9 @@ def test_an_environment_has_a_task_of_its_name_for_a_quick_look() -> None:
     quick = task.load("line-walk")
     assert (quick.name, quick.environment.name) == ("line-walk", "line-walk")
     assert quick.with_environment({"size": 5}).environment_options.size == 5
-    assert resolve("line-walk", "slow http-net2 lr=0.1 scale=2").algorithm_options.lr == 0.1
+    entry = resolve("line-walk", "slow http-net2 lr=0.1 scale=2")
+    assert entry.algorithm_options.lr == 0.1
+    assert first_network(entry).scale == 2, "and it is given what it asks for"
 
 
 def test_an_options_class_is_taken_as_it_is() -> None:
