@@ -45,6 +45,7 @@ from qrlsuite.training.trainer import ModelBuilder, build_envs
 FloatArray = NDArray[np.float64]
 Act = Callable[[NDArray[np.float32]], NDArray[np.int64]]
 EPISODES, ENVIRONMENTS, INTERACTIONS = 100, 10, 1000
+THRESHOLDS: tuple[float, ...] = (0.5, 0.95)
 SETTINGS = {"ddqn": [], "ppo": ["batch=50"]}
 
 
@@ -67,7 +68,7 @@ class Runs:
         reached = {
             f"steps to {t:g}": INTERACTIONS
             * (1.0 + np.where((self.scores >= t).any(1), (self.scores >= t).argmax(1), self.scores.shape[1]))
-            for t in (0.5, 0.95)
+            for t in THRESHOLDS
         }
         return {**reached, "mean score": self.scores.mean(1), "final score": self.scores[:, -1]}
 
@@ -78,7 +79,7 @@ def ours(entry: Entry, seeds: range, epochs: int) -> Runs:
     envs = build_envs(entry, ENVIRONMENTS * len(seeds), lambda: None)
     envs.seed_lanes([s.numpy("environment", lane) for s in streams for lane in range(ENVIRONMENTS)])
     agents = reference(entry.algorithm.factory)(
-        envs, ModelBuilder(entry, 4, streams), entry.algorithm_options, streams, torch.device("cpu")
+        envs, ModelBuilder(entry, envs, streams), entry.algorithm_options, streams, torch.device("cpu")
     )
     agents.start()
     play = Evaluation(entry, streams)
@@ -240,7 +241,7 @@ def report(all_runs: list[Runs]) -> None:
     for source, runs in enumerate(all_runs):
         print(f"\n{runs.name}: {runs.seconds:.2f} s per seed ({runs.seconds / mine.seconds:.1f} times ours)")
         for measure, values in runs.measures().items():
-            form = (lambda v: f"{v:,.0f}") if measure.startswith("steps") else (lambda v: f"{v:.3f}")
+            form = (lambda v: f"{v:,.0f}") if measure.startswith("steps") else (lambda v: f"{v:.4g}")
             low, high = np.percentile(draws(values, source), [5, 95])
             line = f"  {measure:14}{form(np.median(values)):>9} ({form(low)} to {form(high)})"
             if measure.startswith("steps"):

@@ -45,7 +45,7 @@ def training(model: str, settings: list[str], seeds: int) -> tuple[Any, torch.Te
     streams = [Streams(entry.task.hash, seed) for seed in parse_seeds(f"0:{seeds}")]
     envs = build_envs(entry, 10 * seeds, lambda: None)
     envs.seed_lanes([s.numpy("environment", lane) for s in streams for lane in range(10)])
-    build = ModelBuilder(entry, 3, streams)
+    build = ModelBuilder(entry, envs, streams)
     ddqn = reference(entry.algorithm.factory)(
         envs, build, entry.algorithm_options, streams, torch.device("cpu")
     )

@@ -351,6 +351,20 @@ class Adam:
             self.square[name].copy_(state[f"square.{name}"])
 
 
+def gradients(loss: Tensor, population: nn.Module) -> None:
+    """Set the gradients of a loss in a population's trainable parameters, and leave those of others that it uses."""
+    parameters = [p for p in population.parameters() if p.requires_grad]
+    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters, allow_unused=True)):
+        parameter.grad = gradient
+
+
+@torch.no_grad()
+def follow(target: nn.Module, population: nn.Module, tau: float) -> None:
+    """Move a target network's parameters by `tau` of the way to those of the network that it is a copy of."""
+    for slow, parameter in zip(target.parameters(), population.parameters()):
+        slow.lerp_(parameter, tau)
+
+
 def by_seed(lanes: NDArray[Any], seeds: int, device: torch.device) -> Tensor:
     """Return values of seed-major lanes, (S * E, ...) of any type, as float32 of shape (S, E, features)."""
     values = np.ascontiguousarray(lanes, np.float32)

@@ -10,7 +10,7 @@ from qrlsuite.specs import AlgorithmSpec
 
 @hookimpl
 def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
-    """Register `ddqn`, `ppo` and `reinforce`."""
+    """Register `ddqn`, `ppo`, `reinforce`, `sac` and `td3`."""
     register(
         AlgorithmSpec(
             name="ddqn",
@@ -27,6 +27,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
             memory="qrlsuite.plugins.algorithms.ppo:memory",
+            actions=("discrete", "box", "multi-discrete", "multi-binary"),
         )
     )
     register(
@@ -36,5 +37,25 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.reinforce:REINFORCEOptions",
             factory="qrlsuite.plugins.algorithms.reinforce:Reinforce",
             memory="qrlsuite.plugins.algorithms.reinforce:memory",
+        )
+    )
+    register(
+        AlgorithmSpec(
+            name="sac",
+            summary="Soft actor-critic with a learned temperature, for continuous or discrete actions",
+            options="qrlsuite.plugins.algorithms.sac:SACOptions",
+            factory="qrlsuite.plugins.algorithms.sac:SAC",
+            memory="qrlsuite.plugins.algorithms.sac:memory",
+            actions=("box", "discrete"),
+        )
+    )
+    register(
+        AlgorithmSpec(
+            name="td3",
+            summary="Twin delayed deterministic policy gradient, for continuous actions",
+            options="qrlsuite.plugins.algorithms.td3:TD3Options",
+            factory="qrlsuite.plugins.algorithms.td3:TD3",
+            memory="qrlsuite.plugins.algorithms.td3:memory",
+            actions=("box",),
         )
     )

@@ -1,6 +1,6 @@
 """Proximal policy optimization (Schulman et al. 2017, arXiv:1707.06347) for a population of S seeds.
 
-With actor pi (a softmax over the model's outputs), critic V, discount g, GAE parameter l (Schulman et al. 2016,
+With actor pi, critic V, discount g, GAE parameter l (Schulman et al. 2016,
 arXiv:1506.02438, eq. 16) and T steps of E environments per epoch:
 
     delta_t = r_t + g (1 - terminated_t) V(s'_t) - V(s_t)     s'_t: where step t arrived, before any reset
@@ -14,6 +14,15 @@ A and R are computed once per epoch; A is normalized in every minibatch to mean 
 the T x E samples are passed through `repeats` times, every time in a fresh random order, in minibatches of `batch`;
 a remainder is merged into the last one (2000 samples, batch 64: 30 of 64, one of 80). Actor and critic are separate
 networks of the same architecture; every agent makes the same number of Adam steps.
+
+The actor's outputs are pi by the kind of the environment's actions:
+
+- discrete: the logits of a softmax;
+- multi-discrete, multi-binary: the logits of a softmax for each number of an action, which are independent given the
+  state: log pi(a|s) and entropy are sums over them;
+- box: the means of independent normals u with spreads e^l, l being A numbers beside the network that no state changes
+  and Adam trains with it (`log_spread` at first; not counted as the model's parameters). An action is u clipped to
+  -1 .. 1, linear in the box (`qrlsuite.actions.from_units`); log pi is that of u, as in Stable-Baselines3.
 
 Rollouts run across the ends of episodes and are cut where the epoch ends; what would have followed is estimated by
 the critic, there and where a time limit truncated an episode, not where one terminated.
@@ -31,18 +40,20 @@ Deviations from the paper (its algorithm 'Estimating the Sample Complexity of PP
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from torch import Tensor
+from torch import Tensor, nn
 
+from qrlsuite.actions import from_units, size
 from qrlsuite.algorithm import BuildModel, Memory
-from qrlsuite.environment import LaneEnv
-from qrlsuite.options import Tuned
+from qrlsuite.environment import LaneEnv, arrived
+from qrlsuite.options import Since, Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
 
@@ -75,6 +86,115 @@ class PPOOptions:
     validation: Annotated[
         Literal["greedy", "sampled"], Field(description="actions in validation: most probable, or drawn")
     ] = "greedy"
+    log_spread: Annotated[
+        float,
+        Field(ge=-20, le=2, description="of a box's actions, at first: logarithm, in halves of their range"),
+        Since("0.2.0"),
+    ] = 0.0
+
+
+class Choices:
+    """Independent softmaxes, one for each number of an action: one alone where actions are discrete.
+
+    Attributes
+    ----------
+    sizes:
+        How many choices each has.
+    outputs, numbers:
+        Of the actor, and of an action.
+    """
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.space = space
+        if isinstance(space, spaces.Discrete):
+            self.sizes = [int(space.n)]
+        elif isinstance(space, spaces.MultiDiscrete):
+            self.sizes = [int(n) for n in space.nvec.reshape(-1)]
+        else:
+            self.sizes = [2] * size(space)
+        self.outputs, self.numbers = sum(self.sizes), len(self.sizes)
+
+    def noise(self, generator: np.random.Generator, *shape: int) -> NDArray[np.float64]:
+        """Draw what `draw` adds (*shape, outputs)."""
+        return generator.gumbel(size=(*shape, self.outputs))
+
+    def draw(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Draw actions (..., numbers): the argmax of logits plus standard Gumbel noise draws from their softmax."""
+        return self.best(outputs + noise)
+
+    def best(self, outputs: Tensor) -> Tensor:
+        """Return the most probable actions (..., numbers) int64."""
+        return torch.cat([each.argmax(-1, keepdim=True) for each in torch.split(outputs, self.sizes, -1)], -1)
+
+    def judge(self, outputs: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log pi of chosen actions (..., numbers), and the entropy of pi, both (...)."""
+        log_probs, entropies = [], []
+        for logits, number in zip(torch.split(outputs, self.sizes, -1), torch.split(chosen, 1, -1)):
+            log_policy = torch.log_softmax(logits, -1)
+            log_probs.append(log_policy.gather(-1, number).squeeze(-1))
+            entropies.append(-(log_policy.exp() * log_policy).sum(-1))
+        return _total(log_probs), _total(entropies)
+
+    def lanes(self, chosen: Tensor) -> NDArray[Any]:
+        """Return actions (..., numbers) as the environments take them."""
+        shape = (*chosen.shape[:-1], *(self.space.shape or ()))
+        return chosen.reshape(shape).cpu().numpy().astype(self.space.dtype)
+
+
+class Gaussian(nn.Module):
+    """Independent normals, one for each number of an action, with spreads of their own.
+
+    Attributes
+    ----------
+    log_spread:
+        (S, numbers).
+    outputs, numbers:
+        Of the actor, and of an action.
+    """
+
+    def __init__(self, space: spaces.Box, seeds: int, log_spread: float) -> None:
+        super().__init__()
+        self.space = space
+        self.outputs = self.numbers = size(space)
+        self.log_spread = nn.Parameter(torch.full((seeds, self.numbers), log_spread))
+
+    def _spread(self, outputs: Tensor) -> Tensor:
+        """Return the logarithms of the spreads, to broadcast to outputs (S, ..., numbers)."""
+        return self.log_spread.view(len(outputs), *[1] * (outputs.dim() - 2), -1)
+
+    def noise(self, generator: np.random.Generator, *shape: int) -> NDArray[np.float64]:
+        """Draw what `draw` adds (*shape, outputs)."""
+        return generator.standard_normal((*shape, self.outputs))
+
+    def draw(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Draw u (S, ..., numbers)."""
+        return outputs + self._spread(outputs).exp() * noise
+
+    def best(self, outputs: Tensor) -> Tensor:
+        """Return the means."""
+        return outputs
+
+    def judge(self, outputs: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log pi of u (S, ..., numbers), and the entropy of pi, both (S, ...)."""
+        log_spread = self._spread(outputs).expand_as(outputs)
+        away = (chosen - outputs) * (-log_spread).exp()
+        log_probs = (-0.5 * away.square() - log_spread - HALF_LOG_2_PI).sum(-1)
+        return log_probs, (log_spread + 0.5 + HALF_LOG_2_PI).sum(-1)
+
+    def lanes(self, chosen: Tensor) -> NDArray[Any]:
+        """Return u (..., numbers) as the environments take them."""
+        return from_units(chosen.cpu().numpy(), self.space)
+
+
+HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
+
+
+def _total(parts: Sequence[Tensor]) -> Tensor:
+    """Add tensors, and leave a single one as it is."""
+    total = parts[0]
+    for each in parts[1:]:
+        total = total + each
+    return total
 
 
 class Rollout(NamedTuple):
@@ -85,7 +205,7 @@ class Rollout(NamedTuple):
     arrived: Tensor
     """Where each step arrived, before any reset (S, N, obs)."""
     actions: Tensor
-    """(S, N) int64"""
+    """(S, N, numbers): of a box u, before it was clipped, else int64"""
     log_probs: Tensor
     """Of the actions, under the policy that chose them (S, N)."""
     rewards: FloatArray
@@ -146,12 +266,19 @@ class PPO:
         self.envs, self.options, self.streams, self.device = envs, options, streams, device
         self.S = len(streams)
         self.E = envs.num_envs // self.S
-        self.n_actions = int(envs.single_action_space.n)  # type: ignore[attr-defined]
         self.obs_dim = int(np.prod(envs.single_observation_space.shape or (1,)))
-        self.actor = build_model(self.n_actions).to(device)
-        self.critic = build_model(1).to(device)
+        space = envs.single_action_space
+        self.policy: Choices | Gaussian = Choices(space)
+        if isinstance(space, spaces.Box):
+            self.policy = Gaussian(space, self.S, options.log_spread).to(device)
+        self.actor = build_model(self.policy.outputs, role="actor").to(device)
+        self.critic = build_model(1, role="critic").to(device)
         self.actor_adam = Adam(self.actor, options.lr, options.quantum_lr)
         self.critic_adam = Adam(self.critic, options.lr, options.quantum_lr)
+        self.adams = [self.actor_adam, self.critic_adam]
+        if isinstance(self.policy, Gaussian):
+            self.spread_adam = Adam(self.policy, options.lr, options.quantum_lr)
+            self.adams.append(self.spread_adam)
         self.epoch = 0
         self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
         self._validation: list[np.random.Generator] = []
@@ -173,7 +300,7 @@ class PPO:
         states = rollout.states.reshape(-1, self.obs_dim)
         # one row per quantity and not one per sample: every minibatch column is then contiguous
         columns = torch.stack([rollout.log_probs, advantages, returns]).view(3, -1)
-        actions = rollout.actions.reshape(-1)
+        actions = rollout.actions.reshape(-1, self.policy.numbers)
         samples = rounds * self.E
         total = torch.zeros((4, self.S), device=self.device)
         steps = 0
@@ -182,7 +309,7 @@ class PPO:
                 picked = order[:, piece].reshape(-1)
                 total += self._learn(
                     states.index_select(0, picked).view(self.S, -1, self.obs_dim),
-                    actions.index_select(0, picked).view(self.S, -1),
+                    actions.index_select(0, picked).view(self.S, -1, self.policy.numbers),
                     *columns.index_select(1, picked).view(3, self.S, -1),
                 )
                 steps += 1
@@ -199,44 +326,39 @@ class PPO:
         return torch.from_numpy(np.stack(drawn, axis=1) + offset).to(self.device)
 
     def _collect(self, rounds: int) -> Rollout:
-        """Step every environment `rounds` times with the stochastic policy.
-
-        An action is the argmax of logits plus standard Gumbel noise, which draws from their softmax (Gumbel-max).
-        """
+        """Step every environment `rounds` times with the stochastic policy."""
         shape = (self.S, rounds, self.E)
-        noise = np.empty((*shape, self.n_actions), dtype=np.float32)
+        drawn = np.empty((*shape, self.policy.outputs), dtype=np.float32)
         for s, streams in enumerate(self.streams):
-            noise[s] = streams.numpy("exploration", self.epoch).gumbel(size=noise.shape[1:])
-        gumbel = torch.from_numpy(noise).to(self.device)
+            drawn[s] = self.policy.noise(streams.numpy("exploration", self.epoch), rounds, self.E)
+        noise = torch.from_numpy(drawn).to(self.device)
         states = torch.empty((*shape, self.obs_dim), device=self.device)
-        arrived = torch.empty_like(states)
-        actions = torch.empty(shape, dtype=torch.int64, device=self.device)
-        logits = torch.empty((*shape, self.n_actions), device=self.device)
+        arrivals = torch.empty_like(states)
+        outputs = torch.empty((*shape, self.policy.outputs), device=self.device)
+        chosen = []
         rewards = np.empty(shape)
         terminated, truncated = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         for k in range(rounds):
             states[:, k] = self.observations
             with torch.no_grad():
-                logits[:, k] = self.actor(self.observations)
-            actions[:, k] = (logits[:, k] + gumbel[:, k]).argmax(2)
-            lanes = actions[:, k].reshape(-1).cpu().numpy()
+                outputs[:, k] = self.actor(self.observations)
+                chosen.append(self.policy.draw(outputs[:, k], noise[:, k]))
+            lanes = self.policy.lanes(chosen[k].reshape(self.S * self.E, -1))
             after, reward, terminal, limit, infos = self.envs.step(lanes)
             self.observations = by_seed(after, self.S, self.device)
-            arrived[:, k] = self.observations
-            if "final_obs" in infos:
-                done = torch.from_numpy(np.asarray(infos["_final_obs"], dtype=bool)).view(self.S, self.E, 1)
-                final = by_seed(infos["final_obs"], self.S, self.device)
-                arrived[:, k] = torch.where(done.to(self.device), final, self.observations)
+            arrivals[:, k] = by_seed(arrived(after, infos), self.S, self.device)
             rewards[:, k] = np.reshape(reward, (self.S, self.E))
             terminated[:, k] = np.reshape(terminal, (self.S, self.E))
             truncated[:, k] = np.reshape(limit, (self.S, self.E))
+        actions = torch.stack(chosen, 1)  # (S, rounds, E, numbers)
         samples = (self.S, rounds * self.E)
-        chosen = torch.log_softmax(logits, -1).gather(3, actions[..., None])
+        with torch.no_grad():
+            log_probs, _ = self.policy.judge(outputs, actions)
         return Rollout(
             states.view(*samples, -1),
-            arrived.view(*samples, -1),
-            actions.view(samples),
-            chosen.view(samples),
+            arrivals.view(*samples, -1),
+            actions.view(*samples, -1),
+            log_probs.view(samples),
             rewards,
             terminated,
             truncated,
@@ -277,7 +399,9 @@ class PPO:
         ----------
         states:
             (S, B, obs).
-        actions, old_log_probs, advantages, returns:
+        actions:
+            (S, B, numbers).
+        old_log_probs, advantages, returns:
             (S, B).
 
         Returns
@@ -286,40 +410,44 @@ class PPO:
             Policy loss, value loss, entropy and divergence (4, S).
         """
         o = self.options
-        log_policy = torch.log_softmax(self.actor(states), -1)  # (S, B, actions)
-        log_ratio = log_policy.gather(2, actions[..., None]).squeeze(2) - old_log_probs
+        log_probs, entropies = self.policy.judge(self.actor(states), actions)
+        log_ratio = log_probs - old_log_probs
         ratio = log_ratio.exp()
         a = _normalized(advantages)
         policy_loss = -torch.minimum(ratio * a, ratio.clamp(1.0 - o.clip, 1.0 + o.clip) * a).mean(1)
         value_loss = (self.critic(states).squeeze(2) - returns).square().mean(1)
-        entropy = -(log_policy.exp() * log_policy).sum(2).mean(1)
+        entropy = entropies.mean(1)
         losses = policy_loss + o.value_coefficient * value_loss - o.entropy_coefficient * entropy
-        self.actor_adam.zero_grad()
-        self.critic_adam.zero_grad()
+        for adam in self.adams:
+            adam.zero_grad()
         losses.sum().backward()
-        self.actor_adam.step()
-        self.critic_adam.step()
+        for adam in self.adams:
+            adam.step()
         with torch.no_grad():
             return torch.stack([policy_loss, value_loss, entropy, -log_ratio.mean(1)])
 
     @torch.no_grad()
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return actions (S, B) for observations (S, B, obs), as the option `validation` says.
+    def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Return actions (S, B, ...) for observations (S, B, obs), as the option `validation` says.
 
         Drawn actions come from one stream per seed and epoch, in the order of the calls since the epoch ended.
         """
-        logits = self.actor(torch.from_numpy(observations).to(self.device))
-        if self.draws:
-            if not self._validation:
-                self._validation = [s.numpy("validation actions", self.epoch) for s in self.streams]
-            noise = [g.gumbel(size=logits.shape[1:]) for g in self._validation]
-            logits = logits + torch.from_numpy(np.stack(noise).astype(np.float32)).to(self.device)
-        result: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
-        return result
+        outputs = self.actor(torch.from_numpy(observations).to(self.device))
+        if not self.draws:
+            return self.policy.lanes(self.policy.best(outputs))
+        if not self._validation:
+            self._validation = [s.numpy("validation actions", self.epoch) for s in self.streams]
+        noise = [self.policy.noise(g, outputs.shape[1]) for g in self._validation]
+        drawn = torch.from_numpy(np.stack(noise).astype(np.float32)).to(self.device)
+        return self.policy.lanes(self.policy.draw(outputs, drawn))
 
     def policy_state(self) -> dict[str, Tensor]:
-        """Return the actor's parameters and buffers."""
-        return dict(self.actor.state_dict())
+        """Return the actor's parameters and buffers, and the spreads of continuous actions."""
+        return {**self.actor.state_dict(), **self._spreads("ppo")}
+
+    def _spreads(self, prefix: str) -> dict[str, Tensor]:
+        """Return the spreads of continuous actions under a prefix; nothing where actions are choices."""
+        return prefixed(**{prefix: self.policy.state_dict()}) if isinstance(self.policy, Gaussian) else {}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return networks, optimizers, current observations and the epoch, seed-first."""
@@ -329,6 +457,12 @@ class PPO:
                 critic=self.critic.state_dict(),
                 actor_adam=self.actor_adam.state_dict(),
                 critic_adam=self.critic_adam.state_dict(),
+            ),
+            **self._spreads("spread"),
+            **(
+                prefixed(spread_adam=self.spread_adam.state_dict())
+                if isinstance(self.policy, Gaussian)
+                else {}
             ),
             "observations": self.observations,
             "epoch": torch.full((self.S,), self.epoch, dtype=torch.int64),
@@ -340,6 +474,9 @@ class PPO:
         self.critic.load_state_dict(part(state, "critic"))
         self.actor_adam.load_state_dict(part(state, "actor_adam"))
         self.critic_adam.load_state_dict(part(state, "critic_adam"))
+        if isinstance(self.policy, Gaussian):
+            self.policy.load_state_dict(part(state, "spread"))
+            self.spread_adam.load_state_dict(part(state, "spread_adam"))
         self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])
         self._validation = []

@@ -104,7 +104,7 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
     others = [each for each in known.names(specs.AlgorithmSpec)
               if kind in registry.get(specs.AlgorithmSpec, each).actions]  # fmt: skip
     advice = (
-        f"take {' or '.join(others)}: qrlsuite run '{others[0]} {entry.model.name}'"
+        f"take one of {', '.join(others)}: qrlsuite run '{others[0]} {entry.model.name}'"
         if others
         else "none does"
     )
@@ -219,16 +219,12 @@ def informed(policy: Policy) -> Callable[[NDArray[np.float32], NDArray[np.bool_]
 
 
 def asks_for_more(function: Callable[..., Any]) -> bool:
-    """Tell whether a policy takes observations, begins and infos, and not observations alone."""
+    """Tell whether a policy takes `begins` and `infos` too, and not observations alone."""
     try:
-        given = list(inspect.signature(function).parameters.values())
+        given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # of another language
         return False
-    kinds = [each.kind for each in given]
-    places = sum(
-        kind in (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD) for kind in kinds
-    )
-    return places >= 3 or inspect.Parameter.VAR_POSITIONAL in kinds
+    return any(each.name == "begins" or each.kind is inspect.Parameter.VAR_POSITIONAL for each in given)
 
 
 def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from qrlsuite import registry, specs
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
+from qrlsuite.testing.group import Toy
 from qrlsuite.training.trainer import Trainer
 from tests.algorithms.worlds import Contexts, Group
 from tests.conftest import results
@@ -22,12 +23,15 @@ COUNTED = {
     "ddqn": ((), 1, (387, 0), (17, 12)),  # its target network is a copy
     "ppo": ((), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
     "reinforce": ((), 1, (387, 0), (17, 12)),
+    "sac": ((), 3, (387 * 3, 0), (17 + 2 * 17, 12 * 3)),
     "reinforce with a value network": (("baseline=value",), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
 }
 """Networks, and classical and quantum parameters: 3 inputs, 3 outputs or 1, width 16 and depth 2; 2 qubits, 1 layer."""
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
     "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
+    "sac": [{"buffer": 50, "batch": 7, "warm_up": 12}],
+    "td3": [{"buffer": 50, "batch": 7, "warm_up": 12, "updates": 2}],
     "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 4), ("mean", 90), ("value", 12))],
 }
 CASES = [
@@ -52,7 +56,12 @@ def test_parameters_are_those_of_all_trained_networks(case: str, tiny_task: str)
 
 
 def group(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) -> Group:
-    return Group(name, seeds, Contexts(len(seeds) * E), **more, **case)
+    """An algorithm on the discrete bandit if it takes discrete actions, else on the toy of the first that it does."""
+    kinds = registry.get(specs.AlgorithmSpec, name).actions
+    lanes = len(seeds) * E
+    return Group(
+        name, seeds, Contexts(lanes) if "discrete" in kinds else Toy(lanes, kinds[0]), **more, **case
+    )
 
 
 def trained(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) -> dict[str, NDArray[Any]]:
@@ -71,9 +80,9 @@ def trained(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) 
     return {**made.save(), **result}
 
 
-def actions(made: Group) -> NDArray[np.int64]:
+def actions(made: Group) -> NDArray[Any]:
     observations = [s.numpy("test").random((11, 4)).astype(np.float32) for s in made.streams]
-    chosen: NDArray[np.int64] = made.algorithm.act(np.stack(observations))
+    chosen: NDArray[Any] = made.algorithm.act(np.stack(observations))
     return chosen
 
 
@@ -108,6 +117,24 @@ def test_a_hundred_seeds_do_not_change_one(name: str, case: dict[str, Any]) -> N
         assert_same(trained(name, members, case, **more), members, whole)
 
 
+PENDULUM = """
+extends = "pendulum"
+name = "short-pendulum"
+summary = "A few steps of it"
+
+[environment.options]
+max_episode_steps = 10
+
+[protocol]
+environments = 2
+interactions = 20
+validation_episodes = 3
+
+[ranking]
+horizons = [40]
+"""
+
+
 @every_algorithm
 def test_stored_results_do_not_depend_on_groups(
     name: str, case: dict[str, Any], tiny_task: str, tmp_path: Path
@@ -120,6 +147,9 @@ def test_stored_results_do_not_depend_on_groups(
 
     settings = {"qubits": 2, "layers": 1, **{f"algorithm.{k}": v for k, v in case.items()}}
     words = [parse_setting(f"{k}={v}") for k, v in settings.items()]
+    if "discrete" not in registry.get(specs.AlgorithmSpec, name).actions:
+        tiny_task = str(tmp_path / "task.toml")
+        Path(tiny_task).write_text(PENDULUM, encoding="utf-8")
     entry = resolve(tiny_task, "vqc-native", name, words)
     plans = {"together": [([0, 1, 2], 3)], "apart": [([1], 1), ([0, 2], 2), ([1], 2), ([2, 1, 0], 3)]}
     folders = []

@@ -112,7 +112,7 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
     old = now + 0.4 * torch.randn((2, B), generator=generator)
     advantages, returns = (5 * torch.randn((2, B), generator=generator) for _ in range(2))
     actors, critics = ([Perceptron(m, s) for s in range(2)] for m in (made.actor, made.critic))
-    measured = made._learn(states, actions, old, advantages, returns).numpy()
+    measured = made._learn(states, actions[..., None], old, advantages, returns).numpy()
     rows = np.arange(B)
     for s in range(2):
         x, a = states[s].numpy(), actions[s].numpy()
@@ -154,9 +154,11 @@ def test_advantages_are_normalized_within_the_minibatch() -> None:
         advantages = torch.randn((1, 16), generator=generator)
         old = torch.full((1, 16), -1.1)
         actions = torch.arange(16)[None] % 3
-        results.append(made._learn(states, actions, old, advantages * scale + shift, torch.zeros(1, 16)))
+        results.append(
+            made._learn(states, actions[..., None], old, advantages * scale + shift, torch.zeros(1, 16))
+        )
     torch.testing.assert_close(results[0], results[1], rtol=1e-3, atol=1e-5)
-    assert torch.isfinite(ppo([0])._learn(states[:, :1], actions[:, :1], *[torch.ones(1, 1)] * 3)).all()
+    assert torch.isfinite(ppo([0])._learn(states[:, :1], actions[:, :1, None], *[torch.ones(1, 1)] * 3)).all()
 
 
 def collect(cut: bool) -> tuple[PPO, Rollout]:
@@ -197,7 +199,7 @@ def test_the_critic_stands_in_for_what_is_cut_off(cut: bool) -> None:
 def test_log_probabilities_are_those_of_the_policy_that_acted() -> None:
     made, rollout = collect(False)
     logs = log_softmax(Perceptron(made.actor)(rollout.states[0].numpy()))
-    expected = logs[np.arange(8), rollout.actions[0].numpy()]
+    expected = logs[np.arange(8), rollout.actions[0, :, 0].numpy()]
     np.testing.assert_allclose(rollout.log_probs[0].numpy(), expected, rtol=1e-5)
 
 
@@ -214,7 +216,7 @@ def with_known_policy(**settings: Any) -> PPO:
 def test_training_samples_from_the_policy() -> None:
     made = with_known_policy()
     actions = made._collect(100).actions.numpy()
-    for chosen in actions:
+    for chosen in actions[..., 0]:
         np.testing.assert_allclose(np.bincount(chosen, minlength=3) / 10_000, [0.7, 0.2, 0.1], atol=0.02)
     assert not np.array_equal(actions[0], actions[1])
     made.epoch = 1

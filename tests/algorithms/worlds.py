@@ -126,13 +126,11 @@ class Group:
             torch.device("cpu"),
         )
 
-    def _build(self, out_dim: int) -> nn.Module:
-        build, inputs = (
-            specs.resolve(self.model.build),
-            int(np.prod(self.envs.single_observation_space.shape)),
-        )
+    def _build(self, outputs: int, inputs: int | None = None, role: str = "network") -> nn.Module:
+        build = specs.resolve(self.model.build)
+        given = int(np.prod(self.envs.single_observation_space.shape)) if inputs is None else inputs
         agents = [
-            build(inputs, out_dim, self.model_options, streams.torch("init", len(self.modules)))
+            build(given, outputs, self.model_options, streams.torch("init", len(self.modules)))
             for streams in self.streams
         ]
         if self.model.population is None:

@@ -19,7 +19,8 @@ FOLDERS = {
 }
 TOP = {
     "actions", "algorithm", "cells", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
-    "notation", "options", "own", "population", "registry", "seeding", "shortforms", "specs",
+    "notation", "options", "own", "population", "registry", "replay", "seeding", "shortforms",
+    "specs",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""
 

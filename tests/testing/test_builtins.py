@@ -52,7 +52,9 @@ WHERE_OFFERED = {
     ("rules", "times-skewed"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
     **{("models", name): ["memory"] for name in ("fourier", "mlp", "vqc-native", "vqc-pennylane")},
-    **{("algorithms", item.name): ["memory"] for item in EVERYTHING if item.kind.kinds == "algorithms"},
+    **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
+    ("algorithms", "ppo"): ["memory", "box actions", "multi-discrete actions", "multi-binary actions"],
+    ("algorithms", "sac"): ["memory", "discrete actions"],
 }
 """Rules about what a thing need not have."""
 

@@ -1,0 +1,71 @@
+"""Replay: the last transitions of S seeds, and batches drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+
+class Replay:
+    """A ring of rows for each of S seeds, all filled alike: what an off-policy algorithm learns from.
+
+    Parameters
+    ----------
+    seeds, capacity:
+        S, and the rows that each seed holds at most.
+    device:
+        Where they are.
+    columns:
+        How many numbers of a row each quantity takes, by name: `observation=3, action=1, reward=1`.
+
+    Attributes
+    ----------
+    rows:
+        (S, capacity, numbers) float32; 0 where nothing was stored yet.
+    stored:
+        Rows ever stored, per seed.
+    """
+
+    def __init__(self, seeds: int, capacity: int, device: torch.device, **columns: int) -> None:
+        self.columns = columns
+        self.rows = torch.zeros((seeds, capacity, sum(columns.values())), device=device)
+        self.stored = 0
+
+    @property
+    def filled(self) -> int:
+        """Rows that each seed holds now."""
+        return min(self.stored, self.rows.shape[1])
+
+    def add(self, **values: Tensor) -> None:
+        """Store E rows of every seed, over the oldest ones: each quantity (S, E, numbers), or (S, E)."""
+        parts = [values[name].to(torch.float32) for name in self.columns]
+        new = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
+        places = (self.stored + torch.arange(new.shape[1])) % self.rows.shape[1]
+        self.rows[:, places] = new
+        self.stored += new.shape[1]
+
+    def batch(self, draws: Tensor) -> dict[str, Tensor]:
+        """Return rows of every seed, each quantity (S, B, numbers), contiguous.
+
+        Parameters
+        ----------
+        draws:
+            (S, B) float64, uniform in [0, 1): with replacement from what is held.
+        """
+        seeds, capacity, numbers = self.rows.shape
+        picked = (draws * self.filled).to(torch.int64)
+        offset = torch.arange(seeds, device=self.rows.device)[:, None] * capacity
+        found = self.rows.view(-1, numbers)[(picked + offset).reshape(-1)].view(seeds, -1, numbers)
+        parts = torch.split(found, list(self.columns.values()), dim=2)
+        return {name: part.contiguous() for name, part in zip(self.columns, parts)}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return rows and counts, seed-first."""
+        return {"rows": self.rows, "stored": torch.full((len(self.rows),), self.stored, dtype=torch.int64)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self.rows.copy_(state["rows"])
+        self.stored = int(state["stored"][0])
