@@ -98,7 +98,7 @@ def recognized(module: ModuleType) -> list[Any]:
 
 def _is_part(cls: type[Any]) -> bool:
     try:
-        _signature(cls, ("inputs", "outputs"))
+        _signature(cls, ("inputs", "outputs"), optional=_ASKED)
     except PluginError:
         return True
     return False
