@@ -33,6 +33,7 @@ import pyarrow
 import pyarrow.parquet
 from numpy.typing import NDArray
 
+from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
@@ -707,7 +708,10 @@ class EntryStore:
             )
         record = self.record()
         try:
-            return from_record(record, str(self.path / "entry.json"))
+            entry = from_record(record, str(self.path / "entry.json"))
+            if isinstance(ansatz := getattr(entry.model_options, "ansatz", None), str):
+                registry.load().get(specs.AnsatzSpec, ansatz)
+            return entry
         except UnknownNameError as error:
             raise UnknownNameError(f"{error}{copies_of_plugins(self, record)}") from None
 
