@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import read_study as read_study
     from qrlsuite.api import register as register
     from qrlsuite.api import run_study as run_study
+    from qrlsuite.api import table as table
     from qrlsuite.api import train as train
     from qrlsuite.api import tune as tune
     from qrlsuite.circuit.layer import layer as layer
@@ -37,7 +38,7 @@ __version__ = "0.1.1"
 
 __all__ = [
     "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load", "new_study",
-    "plot", "read_study", "register", "register_environments", "run_study", "train", "tune",
+    "plot", "read_study", "register", "register_environments", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}

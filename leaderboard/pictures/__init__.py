@@ -57,6 +57,7 @@ KINDS: dict[str, Picture] = {
     "bars": Picture("sample complexity per cell, with percentile whiskers", f"{_HERE}.bars"),
     "costs": Picture("sample complexity in steps, circuit executions and shots", f"{_HERE}.costs"),
     "scaling": Picture("sample complexity against width, qubits, degree, ...", f"{_HERE}.scaling"),
+    "fields": Picture("any field against any other: options, scores, costs", f"{_HERE}.fields"),
     "tiers": Picture("who outperforms whom by the paper's rule, in tiers", f"{_HERE}.tiers"),
     "few-runs": Picture("how 5 seeds mislead: two entries, or one against itself", f"{_HERE}.few_runs"),
     "histogram": Picture(

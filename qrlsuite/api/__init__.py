@@ -22,12 +22,13 @@ from qrlsuite.api.entries import board, compare, load, plot
 from qrlsuite.api.external import import_curves
 from qrlsuite.api.own import register
 from qrlsuite.api.studies import new_study, read_study, run_study
+from qrlsuite.api.tables import table
 from qrlsuite.api.training import evaluate, train, tune
 from qrlsuite.engine.terminal import show_figures_in_notebook
 
 __all__ = [
     "board", "compare", "evaluate", "import_curves", "load", "new_study", "plot", "read_study", "register", "run_study",
-    "train", "tune",
+    "table", "train", "tune",
 ]  # fmt: skip
 
 show_figures_in_notebook()

@@ -245,7 +245,9 @@ def _plain(text: str, further: str = "`|") -> str:
 
 
 def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
-    """Write rows of equal columns; lists are separated by semicolons."""
+    """Write rows of equal columns; lists are separated by semicolons. No rows are nothing."""
+    if not rows:
+        return ""
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
     writer.writeheader()

@@ -29,7 +29,7 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryResults]:
         return [next(entry for entry in found if name in entry.label)]
 
     monkeypatch.setattr(collect, "collect", lambda runs, task=None, published=False, only=None: (found, []))
-    monkeypatch.setattr(collect, "_read_copies", read)
+    monkeypatch.setattr(collect, "read_copies", read)
     return found
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
-from qrlsuite.engine.status import survey
+from qrlsuite.engine.sheet import csv_rows
+from qrlsuite.engine.status import EntryStatus, survey
 from qrlsuite.engine.terminal import printable
 from qrlsuite.engine.where import Queues
 from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.shelf import collect, fields
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import entries
@@ -28,6 +31,12 @@ def runs(
     context: typer.Context,
     task: TaskOption = None,
     runs: RunsOption = Path("runs"),
+    format_: Annotated[
+        Literal["table", "csv"],
+        typer.Option(
+            "--format", help="csv: a row for each entry, with its scores, its costs and every option."
+        ),
+    ] = "table",
     json_output: JsonOption = False,
 ) -> None:
     """List the results folder: task, entry, seeds by status, epochs, size on disk, last activity.
@@ -46,6 +55,9 @@ def runs(
                 )
         return
     statuses = survey(runs, task)
+    if format_ == "csv":
+        typer.echo(csv_rows(_flat(runs, statuses)), nl=False)
+        return
     if json_output:
         typer.echo(json.dumps([status.as_dict() for status in statuses]))
         return
@@ -99,6 +111,30 @@ def delete_entries(
     """
     lookup.check_tasks(runs, task)
     _delete(runs, task, names, yes, json_output)
+
+
+def _flat(runs: Path, statuses: Sequence[EntryStatus]) -> list[dict[str, Any]]:
+    """Return a row of values for each entry: how far it is, and what `qrlsuite.api.table` says of it."""
+    results = {}
+    if statuses:
+        found, _ = collect.collect(runs, {status.entry.task for status in statuses})
+        results = {(row["task"], row["name"]): row for row in fields.table(found, "entries").to_pylist()}
+    rows = []
+    for status in statuses:
+        entry = status.entry
+        known = results.get(
+            (entry.task, entry.name), {"task": entry.task, "entry": entry.label, "name": entry.name}
+        )
+        low, high = entry.epochs or (0, 0)
+        far = {
+            "epochs_least": low,
+            "epochs_most": high,
+            "bytes": entry.size,
+            "last_activity": entry.last_activity,
+        }
+        rows.append({**{f"seeds_{each}": entry.seeds.get(each, 0) for each in STATUSES}, **far, **known})
+    names = dict.fromkeys(name for row in [*results.values(), *rows] for name in row)
+    return [{name: row.get(name) for name in names} for row in rows]
 
 
 def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:

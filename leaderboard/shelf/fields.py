@@ -1,0 +1,305 @@
+"""Results as tables: a row for each entry, each seed or each epoch, with every option as a column.
+
+Columns of options come from the entries' own records: `model.width`, `algorithm.lr`, `environment.degree`. Nobody lists
+them, so those of a plugin are there as those of the suite are. They cannot collide with the other columns, which have
+no dot in their names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow
+from numpy.typing import NDArray
+
+from qrlsuite.engine.terminal import printable
+from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
+from qrlsuite.leaderboard.boards.ranked import learning_curves
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.statistics import areas, final_scores
+from qrlsuite.statistics.times import times_below
+
+Rows = Literal["entries", "seeds", "epochs"]
+"""What a row of a table is."""
+
+SIDES = ("model", "algorithm", "environment")
+"""What has options; their columns are called `SIDE.NAME`."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A column that every table of some rows has.
+
+    Attributes
+    ----------
+    type:
+        Of Arrow.
+    meaning:
+        What it is, for those who read tables.
+    unit:
+        What its numbers count; empty for names, counts of what the name says, and scores.
+    """
+
+    name: str
+    type: pyarrow.DataType
+    meaning: str
+    unit: str = ""
+
+
+_TEXT, _WHOLE, _REAL, _TRUTH = pyarrow.string(), pyarrow.int64(), pyarrow.float64(), pyarrow.bool_()
+_STEPS = "environment steps"
+
+NAMES = (
+    Field("task", _TEXT, "the task"),
+    Field("entry", _TEXT, "the entry's label"),
+    Field("name", _TEXT, "the entry's name, which ends with digits of its hash"),
+    Field("algorithm", _TEXT, "`external` for curves that another program made"),
+    Field("model", _TEXT, "the model"),
+    Field("source", _TEXT, "where it was read: `runs` or `published`"),
+    Field("external", _TRUTH, "whether another program made the curves"),
+)
+SCORES = (
+    Field("steps_below_threshold", _REAL, "mean over the task's thresholds; what boards rank by", _STEPS),
+    Field("final_score", _REAL, "mean score of the last tenth of the epochs"),
+    Field("area", _REAL, "mean score of all epochs"),
+    Field("core_hours", _REAL, "of training and validation", "core-hours"),
+    Field("executions", _WHOLE, "circuit executions"),
+)
+FIELDS: dict[Rows, tuple[Field, ...]] = {
+    "entries": (
+        *NAMES,
+        Field("preset", _TEXT, "the preset that supplied defaults"),
+        Field("tuned", _TRUTH, "whether its settings are known to come from tuning"),
+        Field("seeds", _WHOLE, "complete seeds, over which scores are means and costs are sums"),
+        Field("epochs", _WHOLE, "epochs of each"),
+        Field("steps", _WHOLE, "environment steps of each seed", _STEPS),
+        Field("parameters", _WHOLE, "trained numbers of an agent; null where they are not known"),
+        Field("parameters_quantum", _WHOLE, "those of them that belong to circuits"),
+        Field("parameters_fixed", _WHOLE, "numbers of an agent that stay as they were drawn"),
+        *SCORES,
+    ),
+    "seeds": (
+        *NAMES,
+        Field("seed", _WHOLE, "the seed"),
+        Field("epochs", _WHOLE, "epochs that it has finished"),
+        Field("finished", _TRUTH, "whether these are all that were asked for"),
+        Field("diverged", _WHOLE, "first epoch after which numbers of its agent were not finite; else null"),
+        *SCORES,
+    ),
+    "epochs": (
+        *NAMES,
+        Field("seed", _WHOLE, "the seed"),
+        Field("epoch", _WHOLE, "the epoch, from 1"),
+        Field("steps", _WHOLE, "environment steps at its end", _STEPS),
+        Field("score", _REAL, "mean score of the validation after it"),
+    ),
+}
+"""Columns by what a row is; options follow them."""
+
+
+def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
+    """Return entries as a table.
+
+    Parameters
+    ----------
+    rows:
+        What a row is.
+
+    Returns
+    -------
+    pyarrow.Table
+        With the columns of `FIELDS[rows]`, and one for each option that an entry has, null where another has it not.
+        A column of whole and other numbers has float64, one of numbers and texts has texts; lists are JSON.
+    """
+    make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {
+        "entries": _of_entry,
+        "seeds": _of_seeds,
+        "epochs": _of_epochs,
+    }
+    options = _option_columns(entries)
+    fields = FIELDS[rows]
+    schema = pyarrow.schema(
+        [
+            pyarrow.field(each.name, each.type, metadata={"meaning": each.meaning, "unit": each.unit})
+            for each in fields
+        ]
+        + [pyarrow.field(name, column.type) for name, column in options.items()]
+    )
+    parts = []
+    for place, entry in enumerate(entries):
+        own = make[rows](entry)
+        count = max(map(len, own.values()))
+        named = {name: pyarrow.repeat(pyarrow.scalar(value), count) for name, value in _names(entry).items()}
+        columns = [
+            named[each.name] if each.name in named else pyarrow.array(own[each.name], each.type)
+            for each in fields
+        ]
+        columns += [pyarrow.repeat(column[place], count) for column in options.values()]
+        parts.append(pyarrow.table(columns, schema=schema))
+    return pyarrow.concat_tables(parts) if parts else schema.empty_table()
+
+
+def facts(entry: EntryResults) -> dict[str, Any]:
+    """Return the one row of an entry, as plain values."""
+    [row] = table([entry], "entries").to_pylist()
+    return dict(row)
+
+
+def options_of(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every option that an entry's identity states, by the name of its column."""
+    task = identity.get("task")
+    tables = {
+        "model": identity.get("model_options"),
+        "algorithm": identity.get("algorithm_options"),
+        "environment": task.get("environment_options") if isinstance(task, Mapping) else None,
+    }
+    found: dict[str, Any] = {}
+    for side in SIDES:
+        _flatten(side, tables[side], found)
+    return found
+
+
+def _flatten(prefix: str, values: object, found: dict[str, Any]) -> None:
+    for name, value in values.items() if isinstance(values, Mapping) else ():
+        if isinstance(value, Mapping):
+            _flatten(f"{prefix}.{name}", value, found)
+        else:
+            found[printable(f"{prefix}.{name}")] = value
+
+
+def _option_columns(entries: Sequence[EntryResults]) -> dict[str, pyarrow.Array]:
+    """Return a column for each option, with a value for each entry."""
+    each = [options_of(entry.identity) for entry in entries]
+    names = sorted(
+        {name for own in each for name in own}, key=lambda name: (SIDES.index(name.partition(".")[0]), name)
+    )
+    return {name: column([own.get(name) for own in each]) for name in names}
+
+
+def column(values: Sequence[Any]) -> pyarrow.Array:
+    """Return plain values of any types as a column of one."""
+    kinds = {type(value) for value in values if value is not None}
+    if kinds == {bool}:
+        return pyarrow.array(values, _TRUTH)
+    if kinds <= {int, float} and all(value is None or abs(value) < 2**63 for value in values):
+        return pyarrow.array(values, _REAL if float in kinds else _WHOLE)
+    texts = [
+        None if value is None else printable(value) if isinstance(value, str) else json.dumps(value)
+        for value in values
+    ]
+    return pyarrow.array(texts, _TEXT)
+
+
+def _names(entry: EntryResults) -> dict[str, Any]:
+    return {
+        "task": printable(entry.task),
+        "entry": printable(entry.label),
+        "name": printable(entry.name),
+        "algorithm": printable(entry.algorithm),
+        "model": printable(entry.model),
+        "source": entry.source,
+        "external": entry.external,
+    }
+
+
+def _scores(entry: EntryResults) -> dict[str, NDArray[np.float64]]:
+    """Return the scores of each seed, (N,)."""
+    curves, grid = learning_curves(entry), entry.task_file.ranking.grid
+    return {
+        "steps_below_threshold": times_below(entry.curves, grid, entry.steps_per_epoch).mean(axis=1),
+        "final_score": final_scores(curves),
+        "area": areas(curves),
+    }
+
+
+def _of_entry(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
+    classical, quantum = entry.parameters
+    known = entry.parameters_text() != "-"
+    epochs = int(entry.curves.shape[1])
+    row = {
+        "preset": None if entry.preset is None else printable(entry.preset),
+        "tuned": entry.tuning is not None,
+        "seeds": len(entry.seeds),
+        "epochs": epochs,
+        "steps": epochs * entry.steps_per_epoch,
+        "parameters": classical + quantum if known else None,
+        "parameters_quantum": quantum if known else None,
+        "parameters_fixed": entry.fixed if known else None,
+        "core_hours": _cost(entry, entry.hours),
+        "executions": _cost(entry, entry.executions),
+        **{name: float(values.mean()) for name, values in _scores(entry).items()},
+    }
+    return {name: [value] for name, value in row.items()}
+
+
+def _cost(entry: EntryResults, value: Any) -> Any:
+    """Return a cost, None where the entry's record cannot say it."""
+    return None if entry.external and not value else value
+
+
+def _of_seeds(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
+    """Return the complete seeds, and those left out, which have no scores."""
+    seeds = [*entry.seeds, *entry.left_out]
+    records = [entry.records.get(seed, {}) for seed in seeds]
+    lacking = [None] * len(entry.left_out)
+    return {
+        "seed": seeds,
+        "epochs": [record.get("epochs") for record in records],
+        "finished": [record.get("finished") for record in records],
+        "diverged": [record.get("diverged") for record in records],
+        "core_hours": [_cost(entry, record.get("hours")) for record in records],
+        "executions": [_cost(entry, record.get("executions")) for record in records],
+        **{name: [*values.tolist(), *lacking] for name, values in _scores(entry).items()},
+    }
+
+
+def _of_epochs(entry: EntryResults) -> dict[str, Sequence[Any] | NDArray[Any]]:
+    count, epochs = entry.curves.shape
+    epoch = np.tile(np.arange(1, epochs + 1), count)
+    return {
+        "seed": np.repeat(np.array(entry.seeds, np.int64), epochs),
+        "epoch": epoch,
+        "steps": epoch * entry.steps_per_epoch,
+        "score": entry.curves.ravel(),
+    }
+
+
+def find(name: str, names: Iterable[str]) -> str:
+    """Return the column of a name: itself, or of an option without its side, `width` for `model.width`.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none.
+    OptionError
+        If several sides have such an option.
+    """
+    known = list(dict.fromkeys(names))
+    if name in known:
+        return name
+    found = [each for each in known if "." in each and each.partition(".")[2] == name]
+    if len(found) > 1:
+        raise OptionError(f"field '{name}': write {' or '.join(found)}")
+    if not found:
+        raise UnknownNameError(f"no field '{name}' here{nearest(name, known)}; fields: {listed(known, 100)}")
+    return found[0]
+
+
+def of_epochs(name: str) -> bool:
+    """Return whether a field is one that only epochs have."""
+    coarser = {each.name for each in (*FIELDS["entries"], *FIELDS["seeds"])}
+    return name in {each.name for each in FIELDS["epochs"]} - coarser
+
+
+def same(value: Any, wanted: Any) -> bool:
+    """Return whether a cell has a value that was typed."""
+    if isinstance(value, float) and isinstance(wanted, int | float) and not isinstance(wanted, bool):
+        return math.isclose(value, wanted, rel_tol=1e-9)
+    if isinstance(value, str) and not isinstance(wanted, str):
+        return value == json.dumps(wanted)
+    return bool(value == wanted) and isinstance(value, bool) == isinstance(wanted, bool)

@@ -1,0 +1,89 @@
+"""Results as Arrow tables, from Python."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import pyarrow
+
+from qrlsuite.api.arguments import several
+from qrlsuite.errors import OptionError
+from qrlsuite.leaderboard.shelf import collect, fields
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+
+
+def table(
+    rows: fields.Rows = "entries",
+    tasks: str | Sequence[str] | None = None,
+    *,
+    entries: Sequence[str | EntryResults] = (),
+    horizon: int | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+) -> pyarrow.Table:
+    """Return results as an Arrow table, with every option as a column.
+
+    `table().to_pandas()` where pandas is installed; `polars.from_arrow(table())`.
+
+    Parameters
+    ----------
+    rows:
+        What a row is: one of `entries`, of their `seeds`, or of the `epochs` of these, which are the learning curves.
+    tasks:
+        The entries of these; None means all.
+    entries:
+        These only: what `load` accepts, or what it returns.
+    horizon:
+        Environment steps to which all are cut; shorter ones are left out, and a warning names them. None cuts nothing:
+        compare scores only where `steps` are equal.
+    runs, published:
+        As for `load`.
+
+    Returns
+    -------
+    pyarrow.Table
+        In all: `task`, `entry` (the label), `name`, `algorithm`, `model`, `source` (`runs` or `published`), `external`.
+
+        Of entries: `preset`, `tuned`, `seeds`, `epochs`, `steps` (environment steps of each seed), `parameters`
+        (trained numbers of an agent), `parameters_quantum`, `parameters_fixed`; means over seeds:
+        `steps_below_threshold` (environment steps, mean over the task's thresholds), `final_score` (of the last tenth
+        of the epochs) and `area` (of all epochs), in the unit of the task's scores; sums over seeds: `core_hours`,
+        `executions` (of circuits).
+
+        Of seeds: `seed`, `epochs`, `finished`, `diverged` (the first epoch after which numbers of its agent were not
+        finite), and these scores and costs of each. Seeds that are not complete have no scores.
+
+        Of epochs: `seed`, `epoch` (from 1), `steps` (environment steps at its end), `score` (mean of the validation
+        after it).
+
+        At last every option, such as `model.width`, `algorithm.lr` and `environment.degree`: null where an entry does
+        not have it, or has the default of an option that came later; JSON where it is a list. The schema's metadata say
+        what columns mean.
+
+    Raises
+    ------
+    UnknownNameError
+        If a task or an entry is unknown, or no entry is left.
+    OptionError
+        If there are no such rows, or the horizon is no whole number of epochs.
+    StoreError
+        If there is no results folder, and `published` is false.
+
+    Examples
+    --------
+    >>> names = ["mlp width=64", "mlp width=16"]
+    >>> found = table("entries", "beam6g", entries=names, runs="none-yet", published=True)
+    >>> found.select(["model.width", "parameters", "seeds"]).to_pylist()[1]
+    {'model.width': 16, 'parameters': 387, 'seeds': 100}
+    """
+    if rows not in fields.FIELDS:
+        raise OptionError(f"rows = {rows!r}: a row is one of the entries, seeds or epochs")
+    folder, names = Path(runs), several(tasks)
+    collect.check_tasks(folder, names, published)
+    found, left_out = collect.select(folder, names, entries, published, horizon)
+    for line in left_out:
+        warnings.warn(f"left out: {line}", stacklevel=2)
+    return fields.table(found, rows)

@@ -1,0 +1,228 @@
+"""Results as tables, and pictures of any of their fields."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from qrlsuite import api
+from qrlsuite.cli.app import build
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard.boards.ranked import learning_curves
+from qrlsuite.leaderboard.pictures.fields import draw
+from qrlsuite.leaderboard.shelf import fields
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.statistics import final_scores
+from qrlsuite.statistics.times import mean_time
+
+NAMES = ["mlp width=16", "mlp width=64", "vqc-native qubits=6"]
+
+
+@pytest.fixture(scope="module")
+def published() -> list[EntryResults]:
+    return [api.load(name, task="beam6g", runs="none", published=True) for name in NAMES]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """External entries: two seeds of three epochs at each of two widths, and an option of another type."""
+    folder = tmp_path_factory.mktemp("runs")
+    curves = {
+        "net width=4 lr=1": ([0, 1], [[0, 2, 4], [2, 4, 6]]),
+        "net width=8 lr=0.5": ([0, 1], [[4, 6, 8], [6, 8, 10]]),
+        "tree width=wide lr=[1,2]": ([0], [[1, 1, 1]]),
+    }
+    api.import_curves(curves, steps=[10, 20, 30], maximum=10, runs=folder)
+    return folder
+
+
+def test_an_entry_is_a_row_whose_numbers_are_those_of_boards(published: list[EntryResults]) -> None:
+    found = api.table(entries=published)
+    assert found.num_rows == 3
+    rows = found.to_pylist()
+    for row, entry in zip(rows, published):
+        curves = learning_curves(entry)
+        assert row["steps_below_threshold"] == mean_time(curves, entry.task_file.ranking.grid).mean
+        assert row["final_score"] == final_scores(curves).mean()
+        assert row["area"] == pytest.approx(entry.curves.mean())
+        assert (row["entry"], row["name"], row["source"]) == (entry.label, entry.name, "published")
+        assert row["parameters"] == sum(entry.parameters)
+        assert row["core_hours"] == entry.hours
+        assert row["executions"] == entry.executions
+    assert [row["model.width"] for row in rows] == [16, 64, None]
+    assert [row["model.qubits"] for row in rows] == [None, None, 6]
+    assert rows[0]["environment.degree"] == 3
+    assert rows[0]["algorithm.lr"] == 5e-4
+    assert rows[0]["steps"] == 200_000  # the entry's, beside the option environment.steps
+    assert rows[0]["environment.steps"] == 200
+
+
+def test_every_option_of_the_record_is_a_column(published: list[EntryResults]) -> None:
+    names = set(api.table(entries=published).column_names)
+    for entry in published:
+        for side in ("model", "algorithm"):
+            for name, value in entry.identity[f"{side}_options"].items():
+                assert f"{side}.{name}" in names or value == {}
+    assert not {name for name in names if "." not in name} & {name for name in names if "." in name}
+
+
+def test_seeds_and_epochs_are_rows(published: list[EntryResults]) -> None:
+    entry = published[0]
+    seeds = api.table("seeds", entries=[entry])
+    assert seeds["seed"].to_pylist() == list(entry.seeds)
+    assert np.mean(seeds["final_score"].to_pylist()) == pytest.approx(
+        final_scores(learning_curves(entry)).mean()
+    )
+    assert sum(seeds["core_hours"].to_pylist()) == pytest.approx(entry.hours)
+    epochs = api.table("epochs", entries=[entry])
+    own = entry.to_table()
+    for name in ("seed", "epoch", "steps", "score"):
+        assert epochs[name].to_pylist() == own[name].to_pylist()
+    assert set(epochs["model.width"].to_pylist()) == {16}
+
+
+def test_columns_say_what_they_are() -> None:
+    found = fields.table([], "entries")
+    assert found.num_rows == 0
+    assert found.schema.field("steps").metadata == {
+        b"meaning": b"environment steps of each seed",
+        b"unit": b"environment steps",
+    }
+    documented = api.table.__doc__ or ""
+    for rows in fields.FIELDS.values():
+        for each in rows:
+            assert f"`{each.name}`" in documented, each.name
+
+
+def test_values_of_several_types_and_what_is_unknown(runs: Path) -> None:
+    found = api.table(runs=runs)
+    assert found["model.width"].to_pylist() == ["4", "8", "wide"]
+    assert found["model.lr"].to_pylist() == [
+        1.0,
+        0.5,
+        None,
+    ]  # what is no number or text is no option of a name
+    assert found["parameters"].to_pylist() == [None] * 3
+    assert found["core_hours"].to_pylist() == [None] * 3
+    assert found["external"].to_pylist() == [True] * 3
+    assert fields.column([1, 2.5, None]).to_pylist() == [1.0, 2.5, None]
+    assert fields.column([True, 1]).to_pylist() == ["true", "1"]
+    assert fields.column([[1, 2], "a"]).to_pylist() == ["[1, 2]", "a"]
+    assert fields.column([2**70]).to_pylist() == [str(2**70)]
+
+
+def test_seeds_that_are_not_complete_have_no_scores(tmp_path: Path) -> None:
+    path = tmp_path / "curves.csv"
+    rows = [(seed, step) for seed, last in ((0, 30), (1, 30), (2, 20)) for step in range(10, last + 1, 10)]
+    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
+    found = api.table("seeds", runs=tmp_path / "runs").to_pylist()
+    assert [(row["seed"], row["epochs"], row["area"]) for row in found] == [
+        (0, 3, 20),
+        (1, 3, 21),
+        (2, 2, None),
+    ]
+
+
+def test_a_horizon_cuts_all(published: list[EntryResults]) -> None:
+    assert set(api.table(entries=published, horizon=100_000)["steps"].to_pylist()) == {100_000}
+    with pytest.raises(OptionError, match="rows = 'runs': a row is one of the entries, seeds or epochs"):
+        api.table("runs")  # type: ignore[arg-type]
+
+
+def test_fields_are_found_by_their_names() -> None:
+    names = ["steps", "model.width", "model.lr", "algorithm.lr", "environment.steps"]
+    assert fields.find("width", names) == "model.width"
+    assert fields.find("steps", names) == "steps"
+    assert fields.find("environment.steps", names) == "environment.steps"
+    with pytest.raises(OptionError, match=r"field 'lr': write model\.lr or algorithm\.lr"):
+        fields.find("lr", names)
+    with pytest.raises(UnknownNameError, match=r"did you mean 'model\.width'"):
+        fields.find("model.widht", names)
+
+
+def points(figure: Any) -> dict[str, list[tuple[float, float]]]:
+    """Return the points of each line that connects means, by the color that it has."""
+    [axes] = figure.axes
+    lines = [line for line in axes.lines if line.get_linestyle() != "None" and len(line.get_xdata())]
+    return {line.get_color(): [(float(x), float(y)) for x, y in line.get_xydata()] for line in lines[:1]}
+
+
+def test_a_picture_shows_means_of_the_rows_at_each_value(runs: Path) -> None:
+    own = [api.load(name, runs=runs) for name in ("net width=4", "net width=8")]
+    [line] = points(draw(own, x="width", y="area")).values()
+    assert line == [(4, pytest.approx(0.3)), (8, pytest.approx(0.7))]
+    [line] = points(draw(own, x="steps", y="score", where="model=net width=8")).values()
+    assert line == [(10, pytest.approx(0.5)), (20, pytest.approx(0.7)), (30, pytest.approx(0.9))]
+    [line] = points(draw(own, x="external", y="area")).values()
+    assert line == [(0, pytest.approx(0.5))]
+    figure = draw(own, x="external", y="area")
+    assert "1 of 1 point from several entries" in figure.get_supxlabel()
+    three = draw([*own, api.load("tree", runs=runs)], x="lr", y="area")
+    assert "without 1 entry without one of these fields" in three.get_supxlabel()
+
+
+def test_lines_are_by_the_fields_asked_for(published: list[EntryResults]) -> None:
+    figure = draw(published, x="parameters", y="final_score")
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["mlp", "vqc-native"]
+    figure = draw(published, x="parameters", y="final_score", by=["algorithm", "width"])
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "ddqn, width=16",
+        "ddqn, width=64",
+        "ddqn, width=none",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"x": "wdith"}, "no field 'wdith' here"),
+        ({"y": "model"}, "y = model is 'mlp': choose a field of numbers"),
+        (
+            {"x": "width", "where": "model=vqc-native"},
+            "nothing has model.width, steps_below_threshold and model=vqc",
+        ),
+        ({"where": "model"}, "where: model: write name=value"),
+        ({"by": "nothing"}, "no field 'nothing' here"),
+    ],
+)
+def test_bad_settings(settings: dict[str, Any], message: str, published: list[EntryResults]) -> None:
+    with pytest.raises((OptionError, UnknownNameError), match=message):
+        draw(published, **settings)
+
+
+def test_from_the_command_line(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> Any:
+        return CliRunner().invoke(build(), [*words, "--runs", str(runs)])
+
+    drawn = run(
+        "plot", "fields", "--set", "x=width", "--set", "y=area", "--set", "where=model=net", "--out", "a.png"
+    )
+    assert drawn.output == "wrote a.png\n", drawn.exception
+    rows = list(csv.DictReader(io.StringIO(run("runs", "--format", "csv").stdout)))
+    assert [(row["entry"], row["model.width"], row["seeds_finished"]) for row in rows] == [
+        ("external net width=4 lr=1", "4", "2"),
+        ("external net width=8 lr=0.5", "8", "2"),
+        ("external tree width=wide lr=[1,2]", "wide", "1"),
+    ]
+    assert float(rows[0]["area"]) == pytest.approx(0.3)
+    assert run("runs", "--format", "csv", "--task", "beam6g").stdout == ""
+
+
+def test_an_entry_without_a_finished_epoch_is_in_the_csv(train: Callable[..., Path]) -> None:
+    folder = train("runs", [0], 1)
+    (folder / "seed-0000" / "epochs.parquet").unlink()
+    result = CliRunner().invoke(build(), ["runs", "--format", "csv", "--runs", str(folder.parents[1])])
+    [row] = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert (row["name"], row["seeds_finished"]) == (folder.name, "1")
