@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import import_curves as import_curves
     from qrlsuite.api import load as load
     from qrlsuite.api import new_study as new_study
+    from qrlsuite.api import play as play
     from qrlsuite.api import plot as plot
     from qrlsuite.api import read_study as read_study
     from qrlsuite.api import register as register
@@ -38,7 +39,7 @@ __version__ = "0.1.1"
 
 __all__ = [
     "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load", "new_study",
-    "plot", "read_study", "register", "register_environments", "run_study", "table", "train", "tune",
+    "play", "plot", "read_study", "register", "register_environments", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}

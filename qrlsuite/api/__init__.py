@@ -9,6 +9,7 @@
     api.board("beam6g", by="executions", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
+    api.play("mlp width=16").save("episode.gif")
     api.run_study("width.toml")
 
 Results show themselves as tables: printed, at a Python prompt, and in a notebook, which shows figures, too. Errors are
@@ -21,14 +22,15 @@ from __future__ import annotations
 from qrlsuite.api.entries import board, compare, load, plot
 from qrlsuite.api.external import import_curves
 from qrlsuite.api.own import register
+from qrlsuite.api.playing import play
 from qrlsuite.api.studies import new_study, read_study, run_study
 from qrlsuite.api.tables import table
 from qrlsuite.api.training import evaluate, train, tune
 from qrlsuite.engine.terminal import show_figures_in_notebook
 
 __all__ = [
-    "board", "compare", "evaluate", "import_curves", "load", "new_study", "plot", "read_study", "register", "run_study",
-    "table", "train", "tune",
+    "board", "compare", "evaluate", "import_curves", "load", "new_study", "play", "plot", "read_study", "register",
+    "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 show_figures_in_notebook()

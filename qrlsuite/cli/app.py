@@ -60,6 +60,7 @@ BUILT_IN = {
         LazyCommand(
             "evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"
         ),
+        LazyCommand("play", "Show an episode of a trained agent.", f"{_ROOM}.play:play"),
         LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
         LazyCommand("import", "Take over seeds trained elsewhere.", f"{_ROOM}.import_:import_entries"),
         LazyCommand(

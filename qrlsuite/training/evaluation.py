@@ -463,6 +463,11 @@ def play(
         returns[:, columns], scores[:, columns] = played.returns, played.scores
         steps += played.steps
     report(name, episodes * agents, episodes * agents)
-    section = entry.task.file.score
-    known = section.source == "info" or section.max_return is not None
+    known = knows_scores(entry)
     return returns[:, :episodes].copy(), scores[:, :episodes].copy() if known else None, steps
+
+
+def knows_scores(entry: Entry) -> bool:
+    """Return whether the entry's task scores episodes relative to a maximum."""
+    section = entry.task.file.score
+    return section.source == "info" or section.max_return is not None

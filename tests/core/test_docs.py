@@ -160,7 +160,8 @@ def test_published_entries_in_examples_exist(place: str, line: str) -> None:
     named = (
         [values.get(key) for key in ("first", "second")] if line.split()[1] in ("compare", "power") else []
     )
-    for name in [*filter(None, named), *(values.get("entry") or ())]:
+    written = values.get("entry") or ()
+    for name in [*filter(None, named), *([written] if isinstance(written, str) else written)]:
         if name.isupper():
             continue  # compare FIRST SECOND
         assert collect.find(Path("none"), name, published=True, tasks=tasks)

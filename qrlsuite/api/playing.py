@@ -1,0 +1,68 @@
+"""How a trained agent plays, seen."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from qrlsuite.errors import OptionError
+
+if TYPE_CHECKING:
+    from qrlsuite.api.episode import Episode
+
+
+def play(
+    entry: str,
+    *,
+    task: str | None = None,
+    episode: int = 0,
+    seed: int = 0,
+    published: bool = False,
+    runs: str | PathLike[str] = "runs",
+) -> Episode:
+    """Play an episode with an entry's best trained agent, and draw it.
+
+    The best is that with the highest last validation score, and the episode one of those of `evaluate`.
+
+    Parameters
+    ----------
+    entry:
+        Its name, label, the beginning of one of them, or folder.
+    task:
+        The task that is played, as for `evaluate`; None plays the entry's own.
+    episode:
+        Its number among the evaluation's, from 0.
+    seed:
+        Seed of the evaluation.
+    published:
+        Look among the published entries that come with the suite, too.
+    runs:
+        The results folder.
+
+    Returns
+    -------
+    Episode
+        Which a notebook shows; `save("episode.gif")` writes it.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have the name.
+    OptionError
+        If the environment draws no frames, a number cannot be used, or the agents cannot play the task.
+    StoreError
+        If the entry has no trained agent.
+    EnvironmentFailure
+        If the environment fails, or its single form plays another episode than its lanes.
+
+    Examples
+    --------
+    >>> play("vqc-native qubits=6", task="beam6g", published=True).save("episode.gif")  # doctest: +SKIP
+    """
+    for name, value in (("episode", episode), ("seed", seed)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise OptionError(f"{name} = {value!r}: give a whole number, 0 or more")
+    from qrlsuite.api import episode as episodes  # torch, which all other functions do without
+
+    return episodes.record(Path(runs), entry, task, episode, seed, published)
