@@ -12,12 +12,13 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from qrlsuite.options import per_agent
 
@@ -111,6 +112,30 @@ class _FixedOrderLinear(nn.Linear):
         return linear(input[None], self.weight[None], bias[None])[0]
 
 
+class _FixedOrderConv2d(nn.Conv2d):
+    """A convolution as a linear layer of its patches, which is exact in any stack, see `linear`; S = 1 under vmap."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map (..., channels, height, width) to (..., out channels, new height, new width)."""
+        images = input if input.dim() == 4 else input[None]
+        kernel, stride, dilation = self.kernel_size, self.stride, self.dilation
+        padding = cast("tuple[int, int]", self.padding)
+        patches = functional.unfold(images, kernel, dilation, padding, stride).transpose(
+            1, 2
+        )  # (B, places, in)
+        height, width = (
+            (images.shape[2 + i] + 2 * padding[i] - dilation[i] * (kernel[i] - 1) - 1) // stride[i] + 1
+            for i in range(2)
+        )
+        weight, more = self.weight.flatten(1), -patches.shape[2] % NARROW
+        weight, patches = (functional.pad(each, (0, more)) for each in (weight, patches))
+        bias = self.bias if self.bias is not None else torch.zeros_like(weight[:, 0])
+        values = linear(patches.reshape(1, -1, patches.shape[2]), weight[None], bias[None])[0]
+        result = values.view(len(images), height * width, -1).transpose(1, 2)
+        result = result.reshape(len(images), -1, height, width)
+        return result if input.dim() == 4 else result[0]
+
+
 class StackedPopulation(nn.Module):
     """S ordinary modules (B, in) -> (B, out) with their parameters stacked, run by `torch.vmap`.
 
@@ -189,10 +214,13 @@ _NOT_VMAPPABLE = re.compile(
 
 
 def _exact(module: nn.Module) -> nn.Module:
-    """Make every `nn.Linear` of a module exact in any stack; a second name for the same layer stays one."""
+    """Make the linear layers and convolutions of a module exact in any stack; a second name for a layer stays one."""
     for part in module.modules():
         if type(part) is nn.Linear:
             part.__class__ = _FixedOrderLinear
+        plain = type(part) is nn.Conv2d and part.groups == 1 and part.padding_mode == "zeros"
+        if plain and not isinstance(part.padding, str):
+            part.__class__ = _FixedOrderConv2d
     return module
 
 

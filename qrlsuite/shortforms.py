@@ -244,7 +244,11 @@ def _algorithm(cls: type[Any], name: str, summary: str, holder: _Holder) -> spec
         return call(options=chosen, envs=envs, build_model=build_model, streams=streams, device=device)
 
     return specs.AlgorithmSpec(
-        name, summary, options=holder.put("options", options), factory=holder.put("factory", factory)
+        name,
+        summary,
+        options=holder.put("options", options),
+        factory=holder.put("factory", factory),
+        actions=tuple(getattr(cls, "actions", ("discrete",))),
     )
 
 

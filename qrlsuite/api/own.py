@@ -171,13 +171,18 @@ def _picture(spec: specs.Spec) -> str:
         return f"{SIZE[0]} qubits, {SIZE[1]} layers:\n{draw_text(drawn)}"
     if isinstance(spec, specs.ModelSpec):
         import torch
+        from gymnasium.spaces import Box
 
         from qrlsuite.training.fences import seeded
+        from qrlsuite.training.trainer import build_agent
 
+        build = specs.resolve(spec.build)
+        if "space" in inspect.signature(build).parameters:  # of images, say: no size suits them all
+            return ""
         try:
             with seeded(0):
-                options = specs.resolve(spec.options)()
-                module = specs.resolve(spec.build)(*SHAPE, options, torch.Generator().manual_seed(0))
+                options, drawn_from = specs.resolve(spec.options)(), torch.Generator().manual_seed(0)
+                module = build_agent(build, *SHAPE, options, drawn_from, Box(-1.0, 1.0, SHAPE[:1]))
         except QrlSuiteError:
             raise
         except Exception as error:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from qrlsuite.errors import PluginError
 from qrlsuite.scaffold import Kind
 from qrlsuite.specs import AlgorithmSpec
-from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, template
+from qrlsuite.testing import algorithm
+from qrlsuite.testing.common import Subject
+from tests.testing.broken import Edit, assert_all_good, assert_breaks, edit, ids, module, own_rules, template
 
 GOOD = template(Kind.algorithm)
 INIT, ACT = "self.observations = torch.zeros(0)", "logits.argmax(2).cpu().numpy()"
@@ -16,7 +21,27 @@ PER_AGENT = (
     "from torch import", "from qrlsuite.options import Tuned\nfrom torch import",
     'Field(gt=0, description="learning rate")', "Tuned(0.01, 0.1, per_agent=True)",
 )  # fmt: skip
+REMEMBER = """    def remember(self, observations, begins, best):
+        before = self.seen if self.seen is not None and self.seen.shape == begins.shape else 0
+        self.seen = np.where(begins, 0, before) + observations[..., 0]
+        return (best + (self.seen * 3).astype(np.int64)) % self.actions
+
+    def tensor(self, lanes"""
+KEPT = (
+    "def act(self, observations: NDArray[np.float32])", "def act(self, observations, begins, infos)",
+    INIT, f"{INIT}; self.seen = None",
+    ACT, f"self.remember(observations, begins, {ACT})",
+    "    def tensor(self, lanes", REMEMBER,
+)  # fmt: skip
+"""An algorithm whose actions depend on what it saw in an episode."""
 EDITS = [
+    edit("memory of episodes", r"where all episodes begin, act chooses by what it saw in earlier ones: a validation",
+         *KEPT, "np.where(begins, 0, before)", "before", also=["acts"]),
+    edit("memory of episodes", r"where an episode begins in one lane, act forgets what it saw in others",
+         *KEPT, "np.where(begins, 0, before)", "(0 if begins.any() else before)"),
+    edit("memory of episodes", r"policy 'seen' has shape \(5, 3\) with 2 lanes and \(5, 1\) with one: .* no part of a",
+         *KEPT, POLICY, "{**dict(self.policy.state_dict()), "
+         "'seen': torch.zeros(self.S, 1) if self.seen is None else torch.from_numpy(self.seen)}"),
     edit("builds", r"called with \[2\] outputs, and there are 3 actions: take envs.single",
          "int(envs.single_action_space.n)", "2"),
     edit("builds", r"TypeError: .*; the factory takes \(envs, build_model, options, streams,",
@@ -90,5 +115,24 @@ def test_one_rule_is_broken(edit: Edit) -> None:
 
 
 def test_every_rule_has_an_algorithm_that_breaks_it() -> None:
-    per_agent = spec(edit("", "", *PER_AGENT))
+    per_agent = spec(edit("", "", *PER_AGENT, *KEPT))
     assert assert_all_good(per_agent) == {edit.rule for edit in EDITS}
+    assert "memory of episodes" not in assert_all_good(spec())
+
+
+def test_a_kind_of_actions_that_is_promised_and_not_taken_is_named() -> None:
+    """The template takes discrete actions; a spec that promises more is told for which space it fails."""
+    promised = replace(spec(), actions=("discrete", "box"))
+    findings = {finding.rule: finding for finding in own_rules(promised)}
+    assert not findings["box actions"].ok
+    assert "the spec says that it takes box actions: build it for Box(" in findings["box actions"].message
+    assert all(finding.ok for rule, finding in findings.items() if rule != "box actions")
+    with pytest.raises(PluginError, match=r"must name some of discrete, .*, box, in a tuple"):
+        replace(spec(), actions=("continuous",))
+
+
+def test_a_tasks_environment_takes_the_place_of_the_toys() -> None:
+    findings = algorithm.check(Subject(spec(), None, (), {}), task="planted")
+    assert all(finding.ok for finding in findings), findings
+    broken = algorithm.check(Subject(spec(), None, (), {}), task="pendulum")
+    assert "'Box' object has no attribute 'n'" in broken[0].message
