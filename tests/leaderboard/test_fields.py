@@ -164,9 +164,9 @@ def test_a_picture_shows_means_of_the_rows_at_each_value(runs: Path) -> None:
     [line] = points(draw(own, x="external", y="area")).values()
     assert line == [(0, pytest.approx(0.5))]
     figure = draw(own, x="external", y="area")
-    assert "1 of 1 point from several entries" in figure.get_supxlabel()
+    assert "1 of 1 point from several entries" in " ".join(figure.get_supxlabel().split())
     three = draw([*own, api.load("tree", runs=runs)], x="lr", y="area")
-    assert "without 1 entry without one of these fields" in three.get_supxlabel()
+    assert "without 1 entry without one of these fields" in " ".join(three.get_supxlabel().split())
 
 
 def test_lines_are_by_the_fields_asked_for(published: list[EntryResults]) -> None:
