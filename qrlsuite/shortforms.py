@@ -37,11 +37,11 @@ EPISODE_STEPS = 1000
 _ALGORITHM = ("start", "train_epoch", "act", "state_dict", "load_state_dict", "policy_state")
 """The methods by which an algorithm is known."""
 
-_HANDED = ("envs", "build_model", "streams", "device")
+HANDED = ("envs", "build_model", "streams", "device")
 """What an algorithm's class is built with, beside options."""
 
 
-_ASKED = ("generator", "space", "role")
+ASKED = ("generator", "space", "role")
 """What a model's class is built with where it has such a parameter, see `qrlsuite.specs.ModelSpec`."""
 
 
@@ -98,7 +98,7 @@ def recognized(module: ModuleType) -> list[Any]:
 
 def _is_part(cls: type[Any]) -> bool:
     try:
-        _signature(cls, ("inputs", "outputs"), optional=_ASKED)
+        _signature(cls, ("inputs", "outputs"), optional=ASKED)
     except PluginError:
         return True
     return False
@@ -190,13 +190,13 @@ def _ansatz(function: Callable[..., Any], name: str, summary: str, holder: _Hold
 
 
 def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
-    options, call = _signature(cls, ("inputs", "outputs"), optional=_ASKED)
+    options, call = _signature(cls, ("inputs", "outputs"), optional=ASKED)
 
     def build(obs_dim: int, out_dim: int, chosen: Any, generator: Any, **more: Any) -> Any:
         return call(obs_dim, out_dim, options=chosen, generator=generator, **more)
 
     given = inspect.signature(build)
-    asked = [each for each in inspect.signature(cls).parameters if each in _ASKED[1:]]
+    asked = [each for each in inspect.signature(cls).parameters if each in ASKED[1:]]
     build.__signature__ = given.replace(  # type: ignore[attr-defined]
         parameters=[
             *list(given.parameters.values())[:-1],
@@ -238,7 +238,7 @@ def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> sp
 
 
 def _algorithm(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Spec:
-    options, call = _signature(cls, (), named=_HANDED)
+    options, call = _signature(cls, (), named=HANDED)
 
     def factory(envs: Any, build_model: Any, chosen: Any, streams: Any, device: Any) -> Any:
         return call(options=chosen, envs=envs, build_model=build_model, streams=streams, device=device)

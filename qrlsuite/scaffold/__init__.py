@@ -13,11 +13,17 @@ import re
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, QrlSuiteError
+
+if TYPE_CHECKING:
+    import jinja2
 
 TEMPLATES = Path(__file__).parent / "templates"
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -141,13 +147,15 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
     ScaffoldError
         If a package cannot have the name, or something is installed or registered under it.
     """
-    import jinja2
-
-    module, thing = _names(name, kind)
+    kinds: tuple[type[specs.Spec], ...] = (
+        specs.kind(kind),
+        *([specs.TaskSpec] if kind is Kind.environment else []),
+    )
+    module, thing = names_of(name, kinds)
     template_words = _WORDS[kind]
-    # with the kind: the distribution has the same name
-    kinds = (Kind.environment, Kind.task) if kind is Kind.environment else (kind,)
-    checks = [f"qrlsuite check {singular}:{thing}" for singular in kinds]
+    checks = [
+        f"qrlsuite check {each.kind}:{thing}" for each in kinds
+    ]  # with the kind: the distribution has the same name
     commands = tuple(line.format(thing=thing) for line in ("pytest", *checks, *template_words.commands))
     source = f"src/{module}"
     contents = {
@@ -166,25 +174,48 @@ def package(name: str, kind: Kind, scores: tuple[float, float] | None = None) ->
         "commands": commands,
         "contents": list(contents.items()),
         "files": any(file.endswith(".toml") for file in template_words.files),
-        "versions": compatible_versions(),
         **_ranking(kind, scores),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        undefined=jinja2.StrictUndefined,
-        keep_trailing_newline=True,
-        autoescape=False,  # Python and TOML, of names that `_names` has checked
-    )
 
     def render(template: str) -> str:
-        return environment.get_template(template).render(values)
+        return _templates().get_template(template).render(values)
 
-    files = {name: render(f"common/{name}.jinja") for name in ("pyproject.toml", "README.md")}
+    files = rendered(values)
     for path in contents:
         template = "test.py" if path.startswith("tests/") else Path(path).name
         files[path] = render(f"{kind}/{template}.jinja")
     files[f"{source}/py.typed"] = ""
     return Package(name, module, thing, commands, files)
+
+
+def rendered(values: Mapping[str, object]) -> dict[str, str]:
+    """Return the files of every package, with values in the places that their templates have for them."""
+    return {
+        name: _templates()
+        .get_template(f"common/{name}.jinja")
+        .render({**values, "versions": compatible_versions()})
+        for name in ("pyproject.toml", "README.md")
+    }
+
+
+def commands_of(kind: str, thing: str) -> tuple[str, ...]:
+    """Return what to type with a thing once it is installed; nothing where its kind has no template."""
+    return (
+        tuple(line.format(thing=thing) for line in _WORDS[Kind(kind)].commands)
+        if kind in Kind.__members__
+        else ()
+    )
+
+
+def _templates() -> jinja2.Environment:
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        autoescape=False,  # Python and TOML, of names that `names_of` has checked
+    )
 
 
 def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object]:
@@ -215,10 +246,14 @@ def _ranking(kind: Kind, scores: tuple[float, float] | None) -> dict[str, object
     }
 
 
-def _names(name: str, kind: Kind) -> tuple[str, str]:
-    """Check a distribution's name; returns the module's name and the registered name."""
-    from qrlsuite import registry, specs
+def names_of(name: str, kinds: Sequence[type[specs.Spec]]) -> tuple[str, str]:
+    """Check a distribution's name; returns the module's name and the registered name.
 
+    Parameters
+    ----------
+    kinds:
+        Kinds of which nothing may have the registered name.
+    """
     if not NAME.fullmatch(name) or len(name) > LONGEST:
         usable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")[:LONGEST].rstrip("-")
         raise ScaffoldError(
@@ -232,10 +267,6 @@ def _names(name: str, kind: Kind) -> tuple[str, str]:
         raise ScaffoldError(
             f"a module '{module}' is installed already: choose another name, for example acme-{name}"
         )
-    kinds: list[type[specs.Spec]] = [
-        specs.kind(kind),
-        *([specs.TaskSpec] if kind is Kind.environment else []),
-    ]
     for each in kinds:
         if thing in registry.load().of(each):
             article = "an" if each.kind[0] in "ae" else "a"

@@ -20,6 +20,7 @@ from qrlsuite.scaffold import Kind
 from tests import commands
 from tests.commands import Command, start
 from tests.conftest import HANGS, install_from_source, installed
+from tests.core.test_own import ALL, RING
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,6 +59,74 @@ def test_new_packages_pass_their_own_tests(packages: Path) -> None:
     out, _ = tests.communicate()
     assert tests.returncode == 0, out
     assert "9 passed" in out
+
+
+def test_a_package_of_a_file_registers_what_the_file_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its circuits, options and classes are those of the file; hooks and specs stay as they are written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(ALL)
+    (tmp_path / "ring.py").write_text(
+        "from qrlsuite import register, specs\n" + RING + "\n\nregister(ring)\n"
+    )
+    hooks = """
+from qrlsuite import hookimpl, specs
+from qrlsuite.circuit import Circuit
+
+@hookimpl
+def register_ansatzes(register):
+    options = "qrlsuite.plugins.circuits.ansatz:NoOptions"
+    register(specs.AnsatzSpec("hooked", "By a hook", options, "hooked:build"))
+
+def build(qubits, layers, options):
+    return Circuit(qubits)
+"""
+    (tmp_path / "hooked.py").write_text(hooks)
+    for words in (["--from", "mine.py"], ["acme-ring", "--from", "ring.py"], ["--from", "hooked.py"]):
+        code, out, err = qrlsuite(capsys, "new", "plugin", *words)
+        assert code == 0, err
+    assert "  qrlsuite run --task beam6g --model vqc-native --set ansatz=hooked --quick" in out
+    assert (tmp_path / "hooked" / "src" / "hooked" / "__init__.py").read_text() == hooks
+    written = (tmp_path / "acme-ring" / "src" / "ring" / "ring.py").read_text()
+    assert "register(" not in written
+    assert written.startswith("import typing\n\nimport pydantic\nfrom qrlsuite import specs\n")
+    names = ("mine", "acme-ring", "hooked")
+    for name in names:
+        assert tomllib.loads((tmp_path / name / "pyproject.toml").read_text())["project"]["name"] == name
+    install_from_source(tmp_path / "site", *(tmp_path / name for name in names))
+    environment = installed(tmp_path / "site")
+    rows = json.loads(start("list", "--json", env=environment).communicate()[0])
+    assert sorted((row["distribution"], row["name"]) for row in rows if row["distribution"] in names) == [
+        ("acme-ring", "ring"),
+        ("hooked", "hooked"),
+        *(("mine", name) for name in ("http-net2", "line-walk", "quantum", "slow", "two-rings")),
+    ]
+    checked = start("check", "ansatz:ring", env=environment, cwd=tmp_path / "site").communicate()[0]
+    assert "all 14 rules hold" in checked, checked
+    words = ["run", "slow http-net2 lr=0.1", "--task", "line-walk", "--seeds", "1", "--epochs", "1"]
+    trained = start(*words, env=environment, cwd=tmp_path)
+    assert trained.communicate()[0] is not None
+    assert trained.returncode == 0
+
+
+def test_a_file_says_what_its_package_adds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ring.py").write_text(RING)
+    (tmp_path / "part.py").write_text("from ring import *\n\nclass Net(Base): ...\n")
+    for words, expected in (
+        (["--from", "ring.py", "--kind", "ansatz"], "leave --kind and --range out"),
+        (["--from", "none.py"], "there is no plugin none.py"),
+        (["--from", "ring.py", "Ring"], "'Ring' cannot be the name of a package"),
+        (["acme-ring"], "name the package and what it adds, for example acme-ring --kind ansatz"),
+        (["--from", "part.py"], "ring.py is another plugin: name it before this one"),
+    ):
+        code, _, err = qrlsuite(capsys, "new", "plugin", *words)
+        assert (code, len(err.strip().splitlines())) == (2, 1)
+        assert expected in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["part.py", "ring.py"]
 
 
 def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> None:

@@ -11,7 +11,8 @@ import typer
 
 from qrlsuite import scaffold
 from qrlsuite.cli.arguments import JsonOption
-from qrlsuite.scaffold import Kind
+from qrlsuite.errors import OptionError
+from qrlsuite.scaffold import Kind, from_file
 
 app = typer.Typer(
     help="Write a new plugin package.\n\nExample: qrlsuite new plugin acme-ring --kind ansatz",
@@ -31,10 +32,17 @@ def new() -> None:
 @app.command("plugin")
 def plugin(
     name: Annotated[
-        str,
-        typer.Argument(metavar="NAME", help="The package's name, also that of what it registers: acme-ring."),
-    ],
-    kind: Annotated[Kind, typer.Option("--kind", help="What it adds.")],
+        str | None,
+        typer.Argument(
+            metavar="[NAME]",
+            help="The package's name, also that of what it registers: acme-ring. Of a file: its own.",
+        ),
+    ] = None,
+    kind: Annotated[Kind | None, typer.Option("--kind", help="What it adds.")] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="PATH", help="Make the package of a plugin that lies there: ring.py."),
+    ] = None,
     scores: Annotated[
         tuple[float, float] | None,
         typer.Option(
@@ -52,9 +60,18 @@ def plugin(
     Nothing is overwritten. What is in it can be installed (`pip install -e .`), passes `qrlsuite check`, and can be
     run; edit it from there.
 
-    Example: qrlsuite new plugin acme-ring --kind ansatz
+    Examples: qrlsuite new plugin acme-ring --kind ansatz; qrlsuite new plugin --from ring.py
     """
-    files = scaffold.package(name, kind, scores)
+    if source is not None and (kind is not None or scores is not None):
+        raise OptionError("--from PATH says what the package adds: leave --kind and --range out")
+    if source is not None:
+        files = from_file.package(source, name)
+    elif name is None or kind is None:
+        raise OptionError(
+            "name the package and what it adds, for example acme-ring --kind ansatz; or a file, --from ring.py"
+        )
+    else:
+        files = scaffold.package(name, kind, scores)
     folder = scaffold.write(files, out)
     if json_output:
         content = {"folder": str(folder), "files": sorted(files.files), "next": list(files.commands)}
