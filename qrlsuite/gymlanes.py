@@ -434,7 +434,7 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     derived = [0.0]
     if solved is not None:
         derived = sorted({float(solved - abs(solved) * part) for part in (1, 0.5, 0.25, 0)})
-    lowest, highest = _random_returns(env_id, options.get("max_episode_steps"))
+    lowest, highest = random_returns(env_id, options.get("max_episode_steps"))
     thresholds = [level for level in derived if level > lowest]
     what = f"{env_id} of Gymnasium" if name is None else f"environment '{name}'"
     summary = f"{what}, with settings for a quick look"
@@ -481,7 +481,7 @@ def _algorithm(kind: str) -> str:
 
 
 @functools.cache
-def _random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
+def random_returns(env_id: str, limit: int | None) -> tuple[float, float]:
     """Return the lowest and the highest return of 10 episodes of random actions, always the same ones.
 
     Minus infinity where an episode does not end within 1000 steps or fails: nothing is known then.

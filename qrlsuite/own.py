@@ -468,6 +468,12 @@ def _leave(own: _Own, known: Registry, each: Loaded) -> None:
     known.remove(each.source.name)
     known.plugins.remove(each.plugin)
     del own.loaded[each.source.name]
+    gymnasium, lanes = sys.modules.get("gymnasium"), sys.modules.get("qrlsuite.gymlanes")
+    for spec in (one.spec for one in each.registered if isinstance(one.spec, specs.EnvironmentSpec)):
+        if gymnasium is not None and spec.entry_point is not None:
+            gymnasium.registry.pop(spec.gymnasium_id, None)
+        if lanes is not None:
+            lanes.random_returns.cache_clear()
     _sources.pop(each.source.module, None)
 
 

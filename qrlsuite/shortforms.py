@@ -204,10 +204,22 @@ def _model(cls: type[Any], name: str, summary: str, holder: _Holder) -> specs.Sp
         ]
     )
 
+    if not hasattr(cls, "quantum_parameters") and _uses_circuits(cls):
+        cls.quantum_parameters = circuit_parameters
     family: Any = getattr(cls, "family", None) or ("quantum" if _uses_circuits(cls) else "classical")
     return specs.ModelSpec(
         name, summary, family=family, options=holder.put("options", options), build=holder.put("build", build)
     )
+
+
+def circuit_parameters(module: Any) -> set[str]:
+    """Return the names of a module's parameters that are those of `qrlsuite.layer`: its `quantum_parameters`."""
+    return {
+        f"{place}.{name}" if place else name
+        for place, part in module.named_modules()
+        if type(part).__module__.startswith("qrlsuite.circuit")
+        for name, _ in part.named_parameters()
+    }
 
 
 def _uses_circuits(cls: type[Any]) -> bool:
@@ -232,7 +244,7 @@ def _environment(cls: type[Any], name: str, summary: str, holder: _Holder) -> sp
         name,
         summary,
         options=holder.put("options", options),
-        gymnasium_id=f"own/{cls.__name__}-v0",
+        gymnasium_id=f"{holder.module.__name__}/{cls.__name__}-v0",
         entry_point=holder.put("make", make),
     )
 

@@ -22,8 +22,7 @@ from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.studies.looks import FILE, LOG, Run, StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome, in_folder
-from qrlsuite.studies.study import Study, dumps
-from qrlsuite.studies.study import load as load_file
+from qrlsuite.studies.study import Study, dumps, load_kept
 
 PUBLISHED = Path(__file__).parents[1] / "plans"
 """The studies with looks that come with the suite."""
@@ -91,7 +90,7 @@ def folder_of(name: str) -> Path | None:
 
 def load(folder: Path) -> Study:
     """Read the study that a folder holds, without its results."""
-    study = load_file(str(folder / FILE))
+    study = load_kept(folder / FILE)
     return replace(study, source=str(folder / FILE))
 
 

@@ -26,6 +26,8 @@ class _Short:
     whole: str
     """The name of the options class, where the form has one of its own."""
     asked: Sequence[str]
+    circuits: bool = False
+    """Whether a model leaves its quantum parameters to be found."""
 
     @property
     def options(self) -> str:
@@ -112,7 +114,7 @@ def _short(spec: specs.Spec, tree: ast.Module, source: own.Source) -> _Short | N
         return None
     found = re.search(rf":{_PRIVATE}(.+)_(options|build|make|factory)$", str(references[0]))
     name = found[1] if found is not None else ""
-    node = next((n for n in tree.body if getattr(n, "name", None) == name), None)
+    owner = node = next((n for n in tree.body if getattr(n, "name", None) == name), None)
     if isinstance(node, ast.ClassDef):
         node = next((n for n in node.body if getattr(n, "name", None) == "__init__"), None)
     if not isinstance(node, ast.FunctionDef):
@@ -136,7 +138,11 @@ def _short(spec: specs.Spec, tree: ast.Module, source: own.Source) -> _Short | N
     rest = [(a, d) for a, d in pairs[first:] if a.arg not in (*handed, *asked)]
     reference = str(getattr(spec, "options", ""))
     whole = "" if _PRIVATE in reference else reference.partition(":")[2]
-    return _Short(spec, name, [(a, d) for a, d in rest if d is not None and not whole], whole, asked)
+    found_here = [n.name for n in getattr(owner, "body", []) if isinstance(n, ast.FunctionDef)]
+    circuits = isinstance(spec, specs.ModelSpec) and "quantum_parameters" not in found_here
+    return _Short(
+        spec, name, [(a, d) for a, d in rest if d is not None and not whole], whole, asked, circuits
+    )
 
 
 def _with_specs(text: str, tree: ast.Module, shorts: Sequence[_Short]) -> str:
@@ -198,6 +204,11 @@ def _pieces(short: _Short) -> Iterator[str]:
         yield f"{head}{said}    return {name}({', '.join(['qubits', 'layers', *given])})\n"
     elif isinstance(spec, specs.ModelSpec):
         head = f"def {short.made}(\n    obs_dim: int, out_dim: int, options: {short.options}, "
+        if spec.family == "quantum" and short.circuits:
+            yield (
+                "from qrlsuite.shortforms import circuit_parameters  # noqa: E402\n\n"
+                f"{name}.quantum_parameters = circuit_parameters\n"
+            )
         head += f"generator: typing.Any{more}\n) -> typing.Any:\n{said}"
         yield f"{head}    return {name}({', '.join(['obs_dim', 'out_dim', *given])})\n"
     elif isinstance(spec, specs.EnvironmentSpec):
@@ -263,8 +274,6 @@ def _call(spec: specs.Spec, short: _Short | None, module: str, inner: str) -> st
                 whole = short.whole and isinstance(spec, specs.AnsatzSpec) and each.name == "build"
                 word = short.options if each.name == "options" else short.name if whole else short.made
             value = f"{module}.{inner}:{word}"
-        if each.name == "gymnasium_id" and short is not None:
-            value = value.replace("own/", f"{module}/")
         if not value and each.default_factory is not dataclasses.MISSING:
             continue
         written = (

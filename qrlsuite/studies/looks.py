@@ -42,7 +42,7 @@ from qrlsuite.studies.study import (
     Study,
     StudyFile,
     dumps,
-    load,
+    load_kept,
     question_of,
     setting,
 )
@@ -214,7 +214,7 @@ class StudyWithLooks:
                     f"with looks needs seeds that nobody has seen; with first_seed = {self._next_block()} it has others"
                 )
             return False
-        kept = StudyWithLooks(load(str(self.folder / FILE)), self.runs)
+        kept = StudyWithLooks(load_kept(self.folder / FILE), self.runs)
         if kept.hash != self.hash:
             before, after = _content(kept.file), _content(self.file)
             changes = [

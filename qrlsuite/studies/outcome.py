@@ -25,7 +25,7 @@ from qrlsuite.statistics.sequential import Decided, PairDecision
 from qrlsuite.statistics.times import MeanTime, mean_time
 from qrlsuite.studies import looks
 from qrlsuite.studies.looks import StudyState, StudyWithLooks
-from qrlsuite.studies.study import load
+from qrlsuite.studies.study import load_kept
 
 Pair = TypeVar("Pair")
 """What is known of a pair: its decision, or more."""
@@ -278,7 +278,7 @@ def in_folder(runs: Path, tasks: Sequence[str] = ()) -> tuple[list[StudyOutcome]
     outcomes, refused = [], []
     for path in sorted((runs / looks.FOLDER).glob(f"*/{looks.FILE}")):
         try:
-            study = StudyWithLooks(load(str(path)), runs)
+            study = StudyWithLooks(load_kept(path), runs)
             if study.begun and (not tasks or study.task in tasks):
                 outcomes.append(StudyOutcome(study, study.read()))
         except QrlSuiteError as error:

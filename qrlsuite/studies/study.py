@@ -401,6 +401,11 @@ def dumps(file: StudyFile) -> str:
 
 
 def load(name: str) -> Study:
-    """Load a registered study by name, or a study file by path (anything that ends in `.toml`)."""
+    """Load a registered study by name, or a study file by path (anything that ends in `.toml`), with its plugins."""
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.StudySpec, name).path)
     return parse(files.read(path, "study file"), path.name, path.parent)
+
+
+def load_kept(path: Path) -> Study:
+    """Load the file of a study that lies with its results; these may be a stranger's, so it loads no plugin."""
+    return parse(files.read(path, "study file"), path.name)

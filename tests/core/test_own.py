@@ -16,6 +16,9 @@ from qrlsuite import api, circuit, options, own, registry, shortforms, specs
 from qrlsuite.errors import FileError, PluginError, UnknownNameError
 from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
+from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.studies.looks import FILE, FOLDER
+from qrlsuite.studies.outcome import in_folder
 from qrlsuite.training.remote_task import pack, unpack, work_on
 from qrlsuite.training.trainer import first_network
 
@@ -186,6 +189,10 @@ def test_names_are_in_kebab_case() -> None:
 def test_an_environment_has_a_task_of_its_name_for_a_quick_look() -> None:
     own.load(write("all_of_it.py", ALL))
     quick = task.load("line-walk")
+    before = quick.file.ranking.thresholds
+    own.load(write("all_of_it.py", ALL.replace("float(done) - 0.01", "float(done) + 1")))
+    assert task.load("line-walk").file.ranking.thresholds != before, "random actions reach more"
+    own.load(write("all_of_it.py", ALL))
     assert (quick.name, quick.environment.name) == ("line-walk", "line-walk")
     assert quick.with_environment({"size": 5}).environment_options.size == 5
     entry = resolve("line-walk", "slow http-net2 lr=0.1 scale=2")
@@ -388,6 +395,18 @@ def test_a_file_beside_results_imports_nothing(tiny_task: str) -> None:
     write("evil.py", RING)
     own.load("evil.py")
     assert task.load(named).name == "tiny", "what is loaded already is not loaded again"
+
+
+def test_a_published_study_imports_nothing() -> None:
+    """It may have been published before its first seed, so that no entry lies there."""
+    write("theirs/evil.py", "raise SystemExit('it runs')\n")
+    write(f"theirs/{FILE}", 'plugins = ["evil.py"]\nformat_version = 1\nname = "theirs"\n')
+    with pytest.raises(FileError, match=r"what lies beside results is not imported"):
+        published_studies.load(Path("theirs"))
+    write(f"runs/{FOLDER}/theirs/{FILE}", Path(f"theirs/{FILE}").read_text())
+    outcomes, (line,) = in_folder(Path("runs"))
+    assert not outcomes
+    assert "what lies beside results is not imported" in line
 
 
 def test_a_task_of_a_remote_worker_brings_its_plugins() -> None:

@@ -1,4 +1,4 @@
-"""Python on the pages runs, and the README's plugin is a package that installs and conforms."""
+"""Python on the pages runs, and the plugins by path conform."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from typing import Any
 
 import pytest
 
-from qrlsuite.specs import AnsatzSpec
 from tests.commands import qrlsuite
-from tests.conftest import install_from_source, installed
 
 pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
@@ -23,7 +21,7 @@ ELSEWHERE = {
     "statistics.md": "tests/statistics/test_docs.py",
 }
 """Pages whose blocks other tests run."""
-OWN_FILE = "# my_ansatz.py\n"
+OWN_FILE = "# ring.py\n"
 
 
 def blocks() -> list[Any]:
@@ -79,24 +77,25 @@ def test_the_readmes_plugin_is_what_its_summary_says() -> None:
     (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
     space: dict[str, Any] = {}
     exec(compile(code, "README.md", "exec"), space)
-    specs: list[AnsatzSpec] = []
-    space["register_ansatzes"](specs.append)
-    assert specs[0].summary == "RX re-uploading, RY weights and a ring of CZs"
-    circuit = space["ry_ring"](4, 1, None)
+    assert space["ry_ring"].__doc__ == "RX re-uploading, RY weights and a ring of CZs."
+    circuit = space["ry_ring"](4, 1)
     gates = [(step.gate, step.wires) for step in circuit.operations]
     assert gates[:2] == [("RX", (0,)), ("RY", (0,))]
     assert [qubits for name, qubits in gates if name == "CZ"] == [(0, 1), (1, 2), (2, 3), (3, 0)]
 
 
-def test_the_readmes_plugin_is_a_package(tmp_path: Path) -> None:
+def test_the_readmes_plugin_is_a_file(tmp_path: Path) -> None:
     text = (ROOT / "README.md").read_text()
     (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
-    (project,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", text, re.DOTALL)
-    assert len([line for line in code.splitlines() if line.strip()]) <= 22, "twenty lines, give or take"
-    (tmp_path / "runs").mkdir()  # of commands that were typed here
-    (tmp_path / "my_ansatz.py").write_text(code)
-    (tmp_path / "pyproject.toml").write_text(project)
-    site = tmp_path / "site"
-    install_from_source(site, tmp_path)
-    checked = qrlsuite("check", "ansatz:ry-ring", env=installed(site), cwd=tmp_path)
+    (tmp_path / "ring.py").write_text(code)
+    checked = qrlsuite("check", "ansatz:ry-ring", "--plugin", "ring.py", cwd=tmp_path)
     assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_the_plugins_by_path_conform(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text()
+    (code,) = re.findall(r"```python\n# mine.py\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "mine.py").write_text(code)
+    checked = qrlsuite("check", "mine.py", "--plugin", "mine.py", cwd=tmp_path)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    assert checked.stderr == "mine.py: ansatz chain, model hybrid\n"
