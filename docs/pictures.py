@@ -89,7 +89,7 @@ PICTURES: dict[str, Picture] = {
     "study-shots-costs.png": Unpublished("study run shots --seeds 20 --epochs 30"),
     "study-shots-curves.png": Unpublished("study run shots --seeds 20 --epochs 30"),
     "study-ablation-layers.png": Plot(
-        "study draw ablation --published --seeds 20 --only layers",
+        "study draw ablation layers --published --seeds 20",
         ("entries/beam6g/ddqn-vqc-native-*", "unranked/beam6g/ddqn-vqc-native-*"),
     ),
     "study-antennas-scaling.png": Plot(
@@ -99,7 +99,7 @@ PICTURES: dict[str, Picture] = {
         "study draw degree --published --seeds 20", ("entries/beam6g/*", "entries/beam6g-degree[456]/*")
     ),
     "study-fidelity-text.png": Plot(
-        "study draw fidelity --published --only text",
+        "study draw fidelity text --published",
         ("unranked/beam6g/*",),
     ),
     "study-fig1-surface.png": Plot("study draw fig1 --published --seeds 30", ("entries/beam6g/*",)),
@@ -144,7 +144,7 @@ def gallery() -> str:
     """Return docs/gallery.md: every picture below the command that makes it."""
     text = (
         "# Gallery\n\nEvery picture of these pages, with the command that makes it. Without `--published` a command "
-        "shows your own\nruns. `qrlsuite plot KIND --settings` lists what you can change.\n"
+        "shows your own\nruns. `qrlsuite show picture KIND` lists what you can change.\n"
     )
     for name, caption in CAPTIONS.items():
         picture = PICTURES[name]

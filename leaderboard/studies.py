@@ -14,10 +14,10 @@ from qrlsuite.experiment.entry import Entry
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import rank_by_time
-from qrlsuite.leaderboard.pictures import cells, style
 from qrlsuite.leaderboard.shelf import collect, published, published_studies
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore, write_atomically
+from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
 from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
@@ -59,6 +59,20 @@ class Drawn:
     figure: Figure | None = None
     problem: str = ""
     path: Path | None = None
+
+    def lines(self) -> list[str]:
+        """Say where it was written and on how many seeds each point rests; nothing where nothing is trained yet."""
+        if self.path is None:
+            return [] if self.problem == NOTHING else [f"no picture '{self.name}': {self.problem}"]
+        several = len({task for task, _, _ in self.seeds}) > 1
+        epochs = {(task, label): count for task, label, count in self.short}
+        labels: dict[str, list[str]] = {}
+        for task, label, count in sorted(self.seeds, key=lambda point: -point[2]):
+            begun = epochs.get((task, label))
+            state = f"left out, at epoch {begun}" if begun else "nothing yet"
+            state = counted(count, "seed") if count else state
+            labels.setdefault(state, []).append(f"{task} {label}" if several else label)
+        return [f"wrote {self.path}", *(f"  {state}: {', '.join(names)}" for state, names in labels.items())]
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -185,7 +199,6 @@ def select(
     tasks: Collection[str] = (),
     with_published: bool = False,
     horizon: int | None = None,
-    min_seeds: int = 1,
 ) -> tuple[list[EntryResults], list[str]]:
     """Read a study's entries for a board of that study alone.
 
@@ -193,7 +206,7 @@ def select(
     ----------
     name:
         A study, or a study file's path.
-    tasks, with_published, horizon, min_seeds:
+    tasks, with_published, horizon:
         As for `collect.select`.
 
     Returns
@@ -211,7 +224,7 @@ def select(
     if not keys:
         place = f" of task {' or '.join(tasks)}" if tasks else ""
         raise OptionError(f"study '{name}' has no entry{place}")
-    selected, left_out = collect.select(runs, tasks, (), with_published, horizon, min_seeds, keys)
+    selected, left_out = collect.select(runs, tasks, (), with_published, horizon, keys)
     if not selected:
         searched = f"{runs} and the published entries hold" if with_published else f"{runs} holds"
         more = "" if with_published else "; --published shows those that come with the suite"
@@ -364,6 +377,8 @@ def _attempt(
 def _episodes(picture: PictureSection, entries: Sequence[EntryResults], report: Report | None) -> Figure:
     """Play the episodes that a picture shows: the entries' best runs, then the reference policies."""
     assert picture.evaluation is not None  # `check` saw to it
+    from qrlsuite.leaderboard.pictures import cells  # matplotlib, which is needed for drawing alone
+
     cells.one_task(entries, picture.kind)
     from qrlsuite.training import evaluation  # torch, which most pictures do without
 
@@ -391,6 +406,8 @@ def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: 
     """
     assert picture.evaluation is not None  # `check` saw to it, and to the next
     assert picture.evaluation.deployed is not None
+    from qrlsuite.leaderboard.pictures import cells  # matplotlib, which is needed for drawing alone
+
     cells.one_task(entries, picture.kind)
     from qrlsuite.leaderboard.pictures import deployed as drawing  # matplotlib
     from qrlsuite.training import evaluation  # torch, which most pictures do without
@@ -413,6 +430,8 @@ def _deployed(picture: PictureSection, entries: Sequence[EntryResults], report: 
                     )
                 elsewhere.append(deployment.play(episodes, 0, **more))
         lines.append(drawing.Line(trained, tuple(elsewhere)))
+    from qrlsuite.leaderboard.pictures import style
+
     settings = {"title": style.heading(entries), "axis": where.vary, **picture.settings}
     return drawing.draw(
         lines, [f"{value:,}" if type(value) is int else f"{value}" for value in where.values], **settings

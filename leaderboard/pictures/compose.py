@@ -46,7 +46,6 @@ def compose(
     entries: Sequence[str | EntryResults] = (),
     *,
     horizon: int | None = None,
-    min_seeds: int = 1,
     seeds: int | str | Iterable[int] | None = None,
     runs: Path,
     published: bool = False,
@@ -59,7 +58,7 @@ def compose(
     ----------
     kind:
         A name of `summaries`.
-    tasks, entries, horizon, min_seeds, runs, published:
+    tasks, entries, horizon, runs, published:
         As for `qrlsuite.leaderboard.shelf.collect.select`.
     seeds:
         Draw these alone, of every entry, see `EntryResults.with_seeds`; None means all.
@@ -78,7 +77,7 @@ def compose(
         If a plugin's picture returns no figure.
     """
     spec = find(kind, tasks)
-    selection = {"--entry": entries, "--horizon": horizon, "--min-seeds": min_seeds > 1, "--seeds": seeds}
+    selection = {"--entry": entries, "--horizon": horizon, "--seeds": seeds}
     if spec is None:
         selection["--task"] = tasks
     if (spec is not None or pictures.KINDS[kind].data is None) and any(selection.values()):
@@ -87,9 +86,7 @@ def compose(
     if spec is not None:
         return Composed(_of_environment(kind, spec, tasks, settings, environment), tasks=tuple(tasks))
     if environment:
-        raise OptionError(
-            f"--set environment.{next(iter(environment))}: picture '{kind}' shows what was trained"
-        )
+        raise OptionError(f"environment.{next(iter(environment))}: picture '{kind}' shows what was trained")
     data = pictures.KINDS[kind].data
     if data == "episodes":
         raise OptionError(f"picture '{kind}' is drawn by: qrlsuite evaluate ENTRY --out {kind}.png")
@@ -100,7 +97,7 @@ def compose(
     cuts = "horizon" in options.field_names(specs.resolve(pictures.KINDS[kind].options))
     own = {"horizon": horizon} if cuts and horizon is not None else {}
     collect.check_tasks(runs, tasks, published)
-    selected, left_out = collect.select(runs, tasks, entries, published, horizon, min_seeds)
+    selected, left_out = collect.select(runs, tasks, entries, published, horizon)
     if seeds is not None:
         wanted = read_seeds(seeds)
         lacking = [entry for entry in selected if not entries and set(wanted) - set(entry.seeds)]
@@ -128,10 +125,25 @@ def compose(
     return Composed(figure, tuple(selected), tuple(dict.fromkeys(e.task for e in selected)), tuple(left_out))
 
 
-def settings_of(kind: str, tasks: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Return the settings of a picture: name, default, accepted values and description."""
-    spec = find(kind, tasks)
-    return options.describe(specs.resolve(pictures.KINDS[kind].options if spec is None else spec.options))
+def describe(kind: str) -> dict[str, Any]:
+    """Describe a picture and its settings, as plain values; one of environments for each of them.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no picture of that name.
+    """
+    lines = summaries()
+    if kind not in lines:
+        raise UnknownNameError(f"unknown picture '{kind}'{nearest(kind, lines)}")
+    owners = {} if kind in pictures.KINDS else _environment_pictures()[kind]
+    references = [each.options for each in owners.values()] or [pictures.KINDS[kind].options]
+    change = {"set_with": f"qrlsuite plot {kind} NAME=VALUE"}
+    tables = [{"options": options.describe(specs.resolve(each))} | change for each in references]
+    content = {"kind": "picture", "name": kind, "summary": lines[kind]}
+    if len(tables) == 1:
+        return content | tables[0]
+    return content | {f"tasks of {name}": table for name, table in zip(owners, tables)}
 
 
 def summaries() -> dict[str, str]:

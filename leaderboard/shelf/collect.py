@@ -112,7 +112,6 @@ def select(
     names: Iterable[str | EntryResults] = (),
     published: bool = False,
     horizon: int | None = None,
-    min_seeds: int = 1,
     only: Collection[Key] | None = None,
 ) -> tuple[list[EntryResults], list[str]]:
     """Read the entries for a board or a picture.
@@ -125,8 +124,6 @@ def select(
         As for `collect`.
     horizon:
         Environment steps: longer curves are cut to it, shorter entries left out. None cuts nothing.
-    min_seeds:
-        Entries with fewer seeds are left out.
 
     Returns
     -------
@@ -167,9 +164,6 @@ def select(
             left_out.append(
                 f"{entry.label}: ends at {entry.longest * entry.steps_per_epoch} of {horizon} steps"
             )
-        elif len(reached.seeds) < min_seeds:
-            count = len(reached.seeds)
-            left_out.append(f"{entry.label}: {count} seed{'s' * (count != 1)}, fewer than {min_seeds}")
         else:
             kept.append(reached)
     if n_read and not kept:

@@ -22,6 +22,7 @@ from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures.compose import compose
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.store import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +82,6 @@ def board(
     horizon: int | None = None,
     entries: Sequence[str | EntryResults] = (),
     study: str | None = None,
-    min_seeds: int = 1,
 ) -> Leaderboard:
     """Rank entries by significant outperformance: on a task, on each task, or over several tasks together.
 
@@ -111,8 +111,6 @@ def board(
         budget.
     study:
         Rank the entries of this study only: its name, or a study file's path.
-    min_seeds:
-        Show no entries with fewer seeds.
 
     Returns
     -------
@@ -148,18 +146,18 @@ def board(
         other = "several tasks" if together else f"by = '{by}'"
         raise OptionError(f"--rule {rule} judges cells of one task in environment steps: not {other}")
 
-    def select(names: Sequence[str], chosen: Sequence[str | EntryResults], least: int) -> Selected:
-        return _selected(folder, names, chosen, study, published, horizon, least)
+    def select(names: Sequence[str], chosen: Sequence[str | EntryResults]) -> Selected:
+        return _selected(folder, names, chosen, study, published, horizon)
 
     if together:
-        found, left_out = across.collected(together, lambda task: select([task], entries, min_seeds))
+        found, left_out = across.collected(together, lambda task: select([task], entries))
         return boards.build(found, left_out, None, horizon, alpha, by=by, together=together)
-    shown, left_out = select(task_names, entries, min_seeds)
+    shown, left_out = select(task_names, entries)
     keys = {(entry.task_hash, entry.name) for entry in shown}
     family = shown
     read = any(isinstance(entry, EntryResults) for entry in entries)
-    if (entries or min_seeds > 1) and not read and by not in UNITS:
-        family = _family(shown, select(task_names, (), 1)[0])
+    if entries and not read and by not in UNITS:
+        family = _family(shown, select(task_names, ())[0])
     return boards.build(
         family,
         left_out,
@@ -169,6 +167,48 @@ def board(
         lambda entry: (entry.task_hash, entry.name) in keys,
         by,
     )
+
+
+def write_page(
+    out: Path | None,
+    tasks: Sequence[str],
+    by: str,
+    runs: Path,
+    published: bool,
+    study: str | None,
+    **asked: Any,
+) -> tuple[Path | None, list[str]]:
+    """Write boards as a page, with the studies with looks of their tasks.
+
+    Parameters
+    ----------
+    out:
+        None writes leaderboard.html in the results folder.
+    tasks, by, runs, published, study, asked:
+        As for `board`.
+
+    Returns
+    -------
+    tuple
+        The file, None where there is nothing to show; and one line for each entry or study that was left out and why.
+    """
+    from qrlsuite.leaderboard import report
+    from qrlsuite.leaderboard.shelf import published_studies
+
+    asked |= {"runs": runs, "published": published, "study": study}
+    beside = None if len(tasks) < 2 and by == "steps" else board(tasks, by=by, **asked)
+    shown = [board(names, **asked) for names in [[task] for task in tasks] or [[]]]
+    sections = tuple(section for one in shown for section in one.sections)
+    held = tasks or (sorted({section.task for section in sections}) if study is not None else [])
+    outcomes, unreadable = published_studies.collected(runs, held, published)
+    every = (*shown, *([beside] if beside else []))
+    refused = list(dict.fromkeys(line for one in every for line in one.refused)) + list(unreadable)
+    if not sections and not outcomes:
+        return None, refused
+    path = out or runs / "leaderboard.html"
+    page = replace(shown[0], sections=sections, refused=tuple(refused))
+    write_atomically(path, report.render(page, studies=outcomes, beside=beside).encode())
+    return path, refused
 
 
 def compare(
@@ -233,7 +273,6 @@ def plot(
     tasks: str | Sequence[str] | None = None,
     entries: Sequence[str | EntryResults] = (),
     horizon: int | None = None,
-    min_seeds: int = 1,
     seeds: Seeds | None = None,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
@@ -249,14 +288,15 @@ def plot(
     ----------
     kind:
         What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
-    tasks, entries, horizon, min_seeds, runs, published:
+    tasks, entries, horizon, runs, published:
         As for `board`. Without `entries` all of the task are drawn, the smallest model first.
     seeds:
-        Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; None means all.
+        Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; entries that lack one are
+        left out. None means all.
     environment:
         For a picture of an environment: options that replace the task's.
     settings:
-        The picture's own settings: `qrlsuite plot KIND --settings` lists them.
+        The picture's own settings: `qrlsuite show picture KIND` lists them.
 
     Returns
     -------
@@ -283,7 +323,6 @@ def plot(
         several(tasks),
         entries,
         horizon=horizon,
-        min_seeds=min_seeds,
         seeds=seeds,
         runs=Path(runs),
         published=published,
@@ -302,14 +341,13 @@ def _selected(
     study: str | None,
     published: bool,
     horizon: int | None,
-    min_seeds: int,
 ) -> tuple[list[EntryResults], list[str]]:
     """Return the entries of a board, those named or those of a study, and a line for each that was left out."""
     if study is None:
-        return collect.select(runs, tasks, entries, published, horizon, min_seeds)
+        return collect.select(runs, tasks, entries, published, horizon)
     if entries:
         raise OptionError(f"--study {study} names the entries: leave --entry out")
-    return studies.select(study, runs, tasks, published, horizon, min_seeds)
+    return studies.select(study, runs, tasks, published, horizon)
 
 
 def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
-from qrlsuite.api.arguments import Seeds, check_positive, where_of
+from qrlsuite import registry, specs
+from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import budget as budgets
 from qrlsuite.engine import missing
-from qrlsuite.engine.terminal import Shown
+from qrlsuite.engine.terminal import Shown, again, command
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards.times import ALPHA
+from qrlsuite.leaderboard.pictures import FORMATS
 from qrlsuite.leaderboard.studies import Drawn
 from qrlsuite.options import from_mapping
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import read_seeds
 from qrlsuite.results.store import write_atomically
+from qrlsuite.results.text import counted
 from qrlsuite.studies import looks as with_looks
 from qrlsuite.studies import runner as study_runner
 from qrlsuite.studies import study as study_files
 from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.runner import PendingEntry
+from qrlsuite.studies.study import Member, Study
+
+ALL = "all"
+"""In the place of a study's name: every registered one."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,12 +70,10 @@ class StudyRun(Shown):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Show the overview, and where the pictures are."""
+        """Show the overview, where the pictures are, and what was handed to a queue."""
         yield self.overview
-        for picture in self.pictures:
-            yield (
-                f"wrote {picture.path}" if picture.path else f"no picture '{picture.name}': {picture.problem}"
-            )
+        for line in (*(line for picture in self.pictures for line in picture.lines()), *self.submitted):
+            yield Text(line)
 
 
 def new_study(
@@ -227,42 +234,198 @@ def run_study(
     --------
     >>> run_study("fig6", seeds=20, budget="30min")  # doctest: +SKIP
     """
-    if format not in ("png", "pdf", "svg"):
-        raise OptionError(f"format = {format!r}{nearest(format, ['png', 'pdf', 'svg'])}")
+    check_format(format)
     check_positive("epochs", epochs)
     where = where_of(engine, workers, device, fresh, same)
-    limit = budgets.seconds(budget, where.workers)
-    seed_numbers = None if seeds is None else read_seeds(seeds)
     study = studies.find(name)
-    names = [only] if isinstance(only, str) else only
-    folder = Path(runs)
+    chosen = {"options": options, "models": models, "only": only, "--seeds": seeds, "--epochs": epochs}
     if study.file.looks is not None:
-        chosen = {
-            "options": options,
-            "models": models,
-            "only": names,
-            "seeds": seeds,
-            "epochs": epochs,
-            "fresh": fresh,
-        }
-        if given := [option for option, value in chosen.items() if value]:
-            raise OptionError(
-                f"study '{name}' has looks, which fix what is trained: leave {', '.join(given)} out"
-            )
-        subject = StudyWithLooks(study, folder)
-        known = speed.known(subject.folder, folder)
-        return study_runner.take_looks(
-            subject, study_runner.Session(subject.folder, where, known, limit, not progress, "call")
+        require_unchanged(name, chosen | {"--fresh": fresh})
+        return take_looks(study, where, budget, runs, progress)
+    work = find_work(name, options, models, several(only), seeds, epochs, budget, where, runs)
+    [done] = work.train(format, progress)
+    return done
+
+
+def draw_study(
+    name: str,
+    *,
+    options: Mapping[str, Any] | None = None,
+    models: Mapping[str, str] | None = None,
+    only: str | Sequence[str] = (),
+    seeds: str | None = None,
+    format: str = "png",
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+) -> tuple[Study, list[Drawn]]:
+    """Draw a study's pictures from finished seeds, into the results folder.
+
+    Parameters
+    ----------
+    name, options, models, only, format, runs:
+        As for `run_study`.
+    seeds:
+        Of every entry these alone; None takes all that are finished.
+    published:
+        Draw the published entries, too.
+
+    Raises
+    ------
+    OptionError
+        If there is no picture yet; the message says why.
+    """
+    check_format(format)
+    study, folder = studies.find(name), Path(runs)
+    if study.file.looks is not None:
+        require_unchanged(name, {"options": options, "models": models, "only": only, "--seeds": seeds})
+        pictures = studies.draw_outcome(studies.read_outcome(name, folder))
+    else:
+        members = study_runner.select(study, from_mapping(options), models, several(only))
+        pictures = studies.draw(study, members, folder, with_published=published, seeds=seeds)
+    drawn = studies.write(study.name, pictures, folder, format)
+    if not any(each.path for each in drawn):
+        reasons = sorted({each.problem for each in drawn})
+        more = "" if published else "; --published draws the entries that come with the suite"
+        raise OptionError(
+            f"study '{study.name}' has no picture yet: {'; '.join(reasons)}: qrlsuite study run {name}{more}"
         )
-    members = study_runner.select(study, from_mapping(options), models, names)
-    speeds = speed.known(folder)
-    missing.require_same_code(folder, [member.entry for member in members], where)
-    items = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
+    return study, drawn
+
+
+def end_study(name: str, *, runs: str | PathLike[str] = "runs") -> None:
+    """End a study with looks before all is decided: open pairs stay open, and it cannot go on."""
+    StudyWithLooks(studies.find(name), Path(runs)).end()
+
+
+@dataclass(frozen=True)
+class StudyWork:
+    """What is missing of a study, or of all that are registered.
+
+    Attributes
+    ----------
+    chosen:
+        Studies with those of their entries that are wanted, the one that lacks least first.
+    left_out:
+        One line for each of all studies that has not what is wanted.
+    limit:
+        Seconds for all of it; None for no limit.
+    """
+
+    chosen: Sequence[tuple[Study, list[Member]]]
+    left_out: Sequence[str]
+    runs: Path
+    where: Where
+    speeds: speed.Speeds
+    seeds: Sequence[int] | None
+    epochs: int | None
+    limit: float | None
+
+    def items(self, members: Sequence[Member] | None = None) -> list[PendingEntry]:
+        """Look at entries, each once; None takes those of every study."""
+        every = [member for _, each in self.chosen for member in each] if members is None else members
+        return study_runner.find_pending(every, self.runs, self.where, self.speeds, self.seeds, self.epochs)
+
+    def steps(self) -> list[dict[str, Any]]:
+        """Return what would be trained, as plain values."""
+        return study_runner.dry_run(self.items(), self.limit, self.where.workers)
+
+    def train(self, format: str, progress: bool) -> Iterator[StudyRun]:
+        """Train study after study, and draw what is there of each; after Ctrl-C, too.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            When the study that was interrupted has been returned.
+        QrlSuiteError
+            If training failed; finished epochs are kept.
+        """
+        console = Console(stderr=True, quiet=not progress, highlight=False, soft_wrap=True, markup=False)
+        entries = [member.entry for _, members in self.chosen for member in members]
+        missing.require_same_code(self.runs, entries, self.where, quiet=not progress)
+        session = study_runner.Session(self.runs, self.where, self.speeds, self.limit, not progress)
+        for study, members in self.chosen:
+            if len(self.chosen) > 1:
+                console.print(f"\nstudy {study.name}: {study.file.summary}")
+            trained, submitted, interrupt = session.trained, len(session.submitted), None
+            try:
+                session.run(self.items(members))
+            except KeyboardInterrupt as stopped:
+                interrupt = stopped
+            drawn = studies.write(study.name, studies.draw(study, members, self.runs), self.runs, format)
+            overview = study_runner.Overview(study, self.items(members), self.where.workers)
+            handed = tuple(session.submitted[submitted:])
+            yield StudyRun(overview, tuple(drawn), session.trained - trained, handed)
+            if interrupt is not None:
+                raise interrupt
+        left_over = study_runner.cheapest_first(self.items()) if self.limit is not None else []
+        if left_over and not session.submitted:
+            names = ", ".join(
+                f"{item.missing.entry.label} ({counted(len(item.missing.todo), 'seed')})"
+                for item in left_over[:4]
+            )
+            more = f" and {len(left_over) - 4} more entries" if len(left_over) > 4 else ""
+            console.print(f"the budget is used up; left: {names}{more}. The same {again()} continues.")
+
+
+def find_work(
+    name: str,
+    options: Mapping[str, Any] | None,
+    models: Mapping[str, str] | None,
+    only: Sequence[str],
+    seeds: Seeds | None,
+    epochs: int | None,
+    budget: str | None,
+    where: Where,
+    runs: str | PathLike[str],
+) -> StudyWork:
+    """Find what of a study is missing, or of `all` that are registered; the arguments are those of `run_study`.
+
+    Raises
+    ------
+    QrlSuiteError
+        If there is no such study or entry, one of all studies is broken by itself, or the budget holds not even one
+        seed.
+    """
+    limit, changes = budgets.seconds(budget, where.workers), from_mapping(options)
+    chosen, refusals = list[tuple[Study, list[Member]]](), list[OptionError]()
+    for study in map(studies.find, registry.load().names(specs.StudySpec) if name == ALL else [name]):
+        try:
+            chosen.append((study, study_runner.select(study, changes, models, only)))
+        except OptionError as error:
+            refusals.append(error)
+    if not chosen:
+        raise refusals[0]
+    folder = Path(runs)
+    seed_numbers = None if seeds is None else read_seeds(seeds)
+    lines = [str(error) for error in refusals]
+    work = StudyWork(chosen, lines, folder, where, speed.known(folder), seed_numbers, epochs, limit)
+    if len(chosen) > 1:
+        chosen.sort(key=lambda pair: study_runner.work_left(work.items(pair[1])))
     if limit is not None:
-        study_runner.check_budget(items, limit, where.workers)
-    session = study_runner.Session(folder, where, speeds, limit, not progress, "call")
-    session.run(items)
-    drawn = studies.write(study.name, studies.draw(study, members, folder), folder, format)
-    after = study_runner.find_pending(members, folder, where, speeds, seed_numbers, epochs)
-    overview = study_runner.Overview(study, after, where.workers)
-    return StudyRun(overview, tuple(drawn), session.trained, tuple(session.submitted))
+        study_runner.check_budget(work.items(), limit, where.workers)
+    return work
+
+
+def take_looks(
+    study: Study, where: Where, budget: str | None, runs: str | PathLike[str], progress: bool
+) -> StudyOutcome:
+    """Train a study with looks until all is decided, saying what every look decides."""
+    subject = StudyWithLooks(study, Path(runs))
+    limit, known = budgets.seconds(budget, where.workers), speed.known(subject.folder, Path(runs))
+    session = study_runner.Session(subject.folder, where, known, limit, not progress)
+    return study_runner.take_looks(subject, session)
+
+
+def require_unchanged(name: str, given: Mapping[str, object]) -> None:
+    """Refuse arguments that would change what a study with looks has fixed."""
+    if words := [word for word, value in given.items() if value]:
+        raise OptionError(
+            f"study '{name}' has looks, which fix what is trained: leave {', '.join(words)} out; "
+            f"{command('show', name)} says what it needs"
+        )
+
+
+def check_format(format: str) -> None:
+    """Refuse a picture format that does not exist."""
+    if format not in FORMATS:
+        raise OptionError(f"--format {format}{nearest(format, FORMATS)}")

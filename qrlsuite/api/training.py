@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import missing
-from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.where import Where
-from qrlsuite.errors import OptionError
-from qrlsuite.experiment.entry import resolve
+from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.options import from_mapping
+from qrlsuite.notation import Written
+from qrlsuite.options import Setting, from_mapping
 from qrlsuite.results.seeds import read_seeds
+from qrlsuite.results.store import plugins_in
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning.display import TuneDisplay
@@ -107,17 +110,61 @@ def train(
     >>> entry.curves.shape  # doctest: +SKIP
     (2, 1)
     """
-    entry = resolve(task, model, algorithm, from_mapping(options), preset)
-    watching = [track] if isinstance(track, str) else list(track)
+    entry = resolve_entry(task, model, algorithm, from_mapping(options), preset, runs)
+    where = where_of(engine, workers, device, fresh, same)
+    done = train_entry(entry, where, seeds, epochs, budget, track, runs, progress)
+    if done.submitted is not None and progress:
+        print(done.submitted, file=sys.stderr)
+    return collect.read(done.work.store)
+
+
+def resolve_entry(
+    task: str,
+    model: str | Written,
+    algorithm: str | None = None,
+    settings: Sequence[Setting] = (),
+    preset: str | None = None,
+    runs: str | PathLike[str] = "runs",
+) -> Entry:
+    """Return the entry that is to be trained.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown name; the message says where the results folder has a copy of its plugin.
+    OptionError, FileError
+        For an option or a file that cannot be used.
+    """
+    try:
+        return resolve(task, model, algorithm, settings, preset)
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{error}{plugins_in(Path(runs), str(error))}") from None
+
+
+def train_entry(
+    entry: Entry,
+    where: Where,
+    seeds: Seeds | None,
+    epochs: int | None,
+    budget: str | None,
+    track: str | Sequence[str],
+    runs: str | PathLike[str],
+    progress: bool,
+    confirmed: bool = True,
+) -> missing.Training:
+    """Train the missing seeds of an entry: `train`, and the command `run`.
+
+    Parameters
+    ----------
+    confirmed:
+        Whether to go on, on a terminal, where the first measurement says that it will take more than a day.
+    """
     seed_numbers = None if seeds is None else read_seeds(seeds)
     check_positive("epochs", epochs)
-    where = where_of(engine, workers, device, fresh, same)
-    missing.check_budget(budget, where)
-    missing.require_same_code(Path(runs), [entry], where)
-    work = missing.find(Path(runs), entry, where, seed_numbers, epochs)
-    with trackers.asking(watching):
-        missing.train(work, where, RunDisplay(work, where.workers, not progress, "call"), budget)
-    return collect.read(work.store)
+    with trackers.asking([track] if isinstance(track, str) else list(track)):
+        return missing.run(
+            Path(runs), entry, where, seed_numbers, epochs, budget, confirmed, quiet=not progress
+        )
 
 
 def tune(
@@ -191,17 +238,59 @@ def tune(
     >>> small, circuit = tune("beam6g", ["mlp width=16", "vqc-native qubits=6"])  # doctest: +SKIP
     >>> entry = train("beam6g", f"mlp preset={small.written}")  # doctest: +SKIP
     """
+    where = where_of(engine, workers, device, fresh, same)
+    tuning = plan_tuning(
+        task, several(entries), vary, sampler, seeds, epochs, objective, budget, out, where, runs, progress
+    )
+    tuning.run()
+    return tuning.searches
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Searches that are about to run, and whose size and cost were shown.
+
+    Attributes
+    ----------
+    out:
+        The preset file of the one search; None takes one below `runs` for each.
+    """
+
+    searches: list[Search]
+    runs: Path
+    where: Where
+    display: TuneDisplay
+    out: Path | None
+
+    def run(self) -> bool:
+        """Run the trials and write presets; returns whether all trials are over, see `qrlsuite.tuning.runner.run`."""
+        return tuning_runner.run(self.searches, self.runs, self.where, self.display, self.out)
+
+
+def plan_tuning(
+    task: str,
+    entries: Sequence[str],
+    vary: str | Sequence[str] | Mapping[str, Any] | None,
+    sampler: str | None,
+    seeds: Seeds,
+    epochs: int | None,
+    objective: Literal["time", "cell", "area"],
+    budget: str | None,
+    out: str | PathLike[str] | None,
+    where: Where,
+    runs: str | PathLike[str],
+    progress: bool,
+) -> Tuning:
+    """Build the searches that `tune` and the command run, and show them; the arguments are those of `tune`."""
     check_positive("epochs", epochs)
-    where, folder = where_of(engine, workers, device, fresh, same), Path(runs)
     requests = read_requests(
-        task, several(entries), vary or (), sampler, tuning_seeds(seeds), epochs, objective, budget
+        task, entries, vary or (), sampler, tuning_seeds(seeds), epochs, objective, budget
     )
     path = preset_path(out, requests)
-    searches = tuning_runner.build(requests, folder)
-    display = TuneDisplay(searches, where, not progress, "call")
+    searches = tuning_runner.build(requests, Path(runs))
+    display = TuneDisplay(searches, where, not progress)
     display.begin()
-    tuning_runner.run(searches, folder, where, display, path)
-    return searches
+    return Tuning(searches, Path(runs), where, display, path)
 
 
 def evaluate(

@@ -14,6 +14,7 @@ from typer.main import get_command
 import qrlsuite
 from qrlsuite import registry
 from qrlsuite.cli.extensions import add_commands
+from qrlsuite.engine.terminal import as_command
 from qrlsuite.errors import OptionError
 from qrlsuite.specs import resolve
 
@@ -100,6 +101,12 @@ RENAMED = {
 
 _ENTRY = "write it into the entry, [ALGORITHM] MODEL NAME=VALUE ... preset=FILE, as in"
 _ENGINE = "--engine 'slurm partition=gpu time=2:00:00'"
+_AFTER = "write it after the name, as in"
+_STUDY = {
+    "--set": f"{_AFTER} `qrlsuite study run fig6 qubits=6`",
+    "--model-map": f"{_AFTER} `qrlsuite study run fig6 vqc-native=vqc-pennylane`",
+    "--only": f"{_AFTER} `qrlsuite study run fig6 mlp`",
+}
 RENAMED_OPTIONS = {
     "run": {"--algorithm": f"{_ENTRY} `qrlsuite run ppo mlp`", "--preset": f"{_ENTRY} `qrlsuite run mlp preset=FILE`"},
     "tune": {
@@ -108,9 +115,32 @@ RENAMED_OPTIONS = {
         **dict.fromkeys(("--trials", "--sampler-seed"), "--sampler 'random trials=50 seed=1'"),
         "--core-hours": "--budget 2core-hours",
     },
-    "leaderboard": {"--across": "--task A --task B"},
-    "export": {"--across": "--rliable FILE --task A --task B"},
-    "study new": dict.fromkeys(("--algorithm", "--preset"), f"{_ENTRY} 'ppo mlp preset=FILE'"),
+    "leaderboard": {
+        "--across": "--task A --task B",
+        "--min-seeds": "--entry chooses what is shown, --horizon leaves out shorter runs",
+    },
+    "plot": {
+        "--set": f"{_AFTER} `qrlsuite plot surface style=3d`",
+        "--settings": "qrlsuite show picture KIND",
+        "--min-seeds": "--seeds 20 leaves out entries that lack one of these seeds",
+    },
+    "check": {"--set": f"{_AFTER} `qrlsuite check my-model width=4`"},
+    "show": {
+        **dict.fromkeys(("--qubits", "--layers", "--set"), f"{_AFTER} `qrlsuite show ansatz iqp qubits=4 layers=2`"),
+        "--figure": "--out FILE",
+    },
+    "export": {
+        **dict.fromkeys(("--across", "--rliable"), "qrlsuite export --task A --task B --out FILE.npz"),
+        "--all": "qrlsuite export all",
+    },
+    "study run": {**_STUDY, "--format": "qrlsuite study draw STUDY --format pdf"},
+    "study draw": _STUDY,
+    "study new": {
+        **dict.fromkeys(("--algorithm", "--preset"), f"{_ENTRY} 'ppo mlp preset=FILE'"),
+        **dict.fromkeys(("--alpha", "--margin", "--spending", "--first-seed", "--reason"),
+                        "--looks '20,40,60 alpha=.01 margin=.1 first_seed=10000', as the file's table [looks] has it"),
+    },
+    "verify": {"--choice": "--rerun '2 choice=31'"},
     "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'"},
     "": {
         "--minutes": "--budget 30min",
@@ -191,6 +221,14 @@ class LazyGroup(TyperGroup):
                 raise OptionError(f"`qrlsuite {words}` is now `{RENAMED[words]}`")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load(BUILT_IN[name]) if name in BUILT_IN else command, rest
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; after Ctrl-C, when it has saved and said so, the exit code is 130."""
+        try:
+            with as_command():
+                return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
 
 
 def build() -> typer.Typer:

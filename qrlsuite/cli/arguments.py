@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +19,15 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
         return [name for name in registry.load().names(specs.kind(kind)) if name.startswith(incomplete)]
 
     return complete
+
+
+def split_settings(words: Sequence[str] | None) -> tuple[list[str], dict[str, Any]]:
+    """Divide words into names and settings: `NAME=VALUE` is a setting, `mlp width=16` in one word is a name."""
+    from qrlsuite.options import parse_setting
+
+    names = [word for word in words or () if not re.match(r"[^\s=]+=", word)]
+    settings = [parse_setting(word, "") for word in words or () if word not in names]
+    return names, {setting.full_name: setting.value for setting in settings}
 
 
 TaskOption = Annotated[
@@ -50,9 +60,6 @@ HorizonOption = Annotated[
         min=1,
         help="Cut all entries to their first STEPS environment steps; leave out those that are shorter.",
     ),
-]
-MinSeedsOption = Annotated[
-    int, typer.Option("--min-seeds", metavar="N", min=1, help="Leave out entries with fewer seeds.")
 ]
 RunsOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="The results folder.", envvar="QRLSUITE_RUNS")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated
 
 import typer
-
-from qrlsuite.engine.where import Where
 
 WorkersOption = Annotated[
     int | None,
@@ -57,14 +54,3 @@ SameOption = Annotated[
         help="Where the code has changed: your word that nothing changed in effect; the seeds are continued.",
     ),
 ]
-
-
-def where_of(
-    engine: str,
-    workers: int | None,
-    device: str = "cpu",
-    fresh: bool = False,
-    same: str | None = None,
-) -> Where:
-    """Build the engine that a command's options name; the errors are those of `Where.create`."""
-    return replace(Where.create(engine, workers, device), fresh=fresh, same=same)

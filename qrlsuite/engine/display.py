@@ -6,16 +6,17 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from html import escape as escape_html
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn
 
 from qrlsuite import registry, specs
-from qrlsuite.engine.terminal import command
+from qrlsuite.engine.terminal import again, command, printable
 from qrlsuite.engine.work import Missing
 from qrlsuite.results.seeds import SeedGroup
+from qrlsuite.results.survey import GroupStatus
 from qrlsuite.results.text import counted, duration
 
 PLAIN_SECONDS = 20.0
@@ -218,17 +219,9 @@ class RunDisplay:
     ----------
     workers:
         Groups that are trained at a time.
-    again:
-        What continues the training once it has stopped: the command, or the call of a function.
     """
 
-    def __init__(
-        self,
-        missing: Missing,
-        workers: int,
-        quiet: bool = False,
-        again: Literal["command", "call"] = "command",
-    ) -> None:
+    def __init__(self, missing: Missing, workers: int, quiet: bool = False) -> None:
         self.missing, self.entry, self.epochs, self.groups = (
             missing,
             missing.entry,
@@ -238,7 +231,7 @@ class RunDisplay:
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.estimate = CostEstimate(missing.groups, missing.epochs, workers)
         self.workers = min(workers, max(1, len(missing.groups)))
-        self.again = again
+        self.again = again()
         self.new_folder = not missing.runs.exists()
         self.bar = Bar(self.console)
         self.deadline: float | None = None
@@ -406,9 +399,13 @@ class RunDisplay:
             soft_wrap=True,
         )
 
-    def finished(self, summary: dict[str, Any]) -> None:
-        """Sum the run up, and say what to type next."""
+    def finished(self, summary: dict[str, Any], at_work: Sequence[GroupStatus] = ()) -> None:
+        """Sum the run up with the groups that others train, and say what to type next."""
         self.close()
+        for group in at_work:
+            self.console.print(printable(group.text), markup=False, soft_wrap=True)
+        if at_work and not summary["seeds"]:
+            return
         score = summary["median_score"]
         score_text = (
             f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""

@@ -10,10 +10,12 @@ import shutil
 import socket
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from qrlsuite.engine import remote
 from qrlsuite.engine.budget import Budget, seconds
@@ -29,6 +31,7 @@ from qrlsuite.results.claims import certain, living
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup, plan_groups
 from qrlsuite.results.store import EntryStore
+from qrlsuite.results.survey import groups
 from qrlsuite.results.text import duration_range
 from qrlsuite.statistics.curves import reached
 from qrlsuite.training import device as devices
@@ -66,15 +69,71 @@ def find(
     return Missing(runs, entry, store, requested, last, frozenset(busy), missing)
 
 
-def require_same_code(runs: Path, entries: Sequence[Entry], where: Where) -> list[str]:
+@dataclass(frozen=True)
+class Training:
+    """What a training came to.
+
+    Attributes
+    ----------
+    work:
+        What was missing when it began.
+    submitted:
+        One line about what was handed to a queue; None where it was trained.
+    """
+
+    work: Missing
+    submitted: str | None
+
+    def summary(self) -> dict[str, Any]:
+        """Return what there is by now, as plain values."""
+        return summarize(self.work)
+
+
+def run(
+    runs: Path,
+    entry: Entry,
+    where: Where,
+    seeds: Sequence[int] | None = None,
+    epochs: int | None = None,
+    budget: str | None = None,
+    confirmed: bool = True,
+    quiet: bool = False,
+) -> Training:
+    """Train what of an entry is missing, and say what it came to.
+
+    Parameters
+    ----------
+    seeds, epochs:
+        As for `find`.
+    budget, confirmed:
+        As for `train`.
+    quiet:
+        Whether to show nothing.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, when every worker has saved and ended.
+    QrlSuiteError
+        If the entry, the budget or the code cannot be used, or training failed; finished epochs are kept.
+    """
+    check_budget(budget, where)
+    require_same_code(runs, [entry], where, quiet)
+    work = find(runs, entry, where, seeds, epochs)
+    display = RunDisplay(work, where.workers, quiet)
+    display.expected = None if quiet else expected(work, where)
+    outcome = train(work, where, display, budget, confirmed)
+    if outcome.submitted is None and not quiet and display.again == "command":
+        at_work = [group for group in groups(work.store) if group.state in ("running", "submitted")]
+        display.finished(summarize(work), [group for group in at_work if {*group.seeds} & work.busy])
+    return Training(work, outcome.submitted)
+
+
+def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet: bool = False) -> None:
     """Refuse entries of which another code has begun seeds: before they are planned, and anything is trained.
 
-    With `where.fresh`, such seeds are set aside; with `where.same`, the codes are declared to be the same.
-
-    Returns
-    -------
-    list of str
-        What was moved, one line each.
+    With `where.fresh`, such seeds are set aside, which is said unless `quiet`; with `where.same`, the codes are
+    declared to be the same.
 
     Raises
     ------
@@ -87,18 +146,19 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where) -> lis
         raise OptionError(
             "--fresh and --same: the old seeds are either set aside or continued; give one of them"
         )
-    moved: list[str] = []
+    console = Console(stderr=True, quiet=quiet, highlight=False)
     for entry in entries:
         store, code = EntryStore.find(runs, entry), identity.of(entry)
         if where.same is not None:
             codes.declare_same(store, code, where.same)
         elif where.fresh:
             old, earlier = codes.set_aside(runs, store, code, where.engine.queued(store))
-            moved += [] if old is None else [f"the seeds of another code are now in {old}"]
+            moved = [] if old is None else [f"the seeds of another code are now in {old}"]
             moved += [] if earlier is None else [f"{earlier} has seeds of this code: they are continued"]
+            for line in moved:
+                console.print(line, markup=False, soft_wrap=True)
         else:
             codes.require(store, code)
-    return moved
 
 
 class _TimeIsUp(Exception):

@@ -21,6 +21,8 @@ from qrlsuite.engine.terminal import printable
 
 WIDE = 165
 """Characters per line of a table that is written into a pipe or a file."""
+FOLDED = 24
+"""Characters to which a column of words may be folded, for others to have room."""
 BAR = (4, 20)
 """Least and most characters of a bar."""
 NOTES = 3
@@ -60,8 +62,8 @@ class Column:
 
     @property
     def least(self) -> int:
-        """Characters that it needs with its bars."""
-        return self.width + (BAR[0] + 1) * bool(self.bars)
+        """Characters that it needs: with its bars, and with its words folded."""
+        return min(self.width, FOLDED) if self.words else self.width + (BAR[0] + 1) * bool(self.bars)
 
 
 @dataclass(frozen=True)
@@ -148,9 +150,13 @@ class Sheet:
         )
         for column in shown:
             room = max(column.width, column.least + spare if column.bars else 0)
-            head = "\n".join(textwrap.wrap(column.head, room, break_long_words=False))
+            lines = (
+                [column.head] if column.words else textwrap.wrap(column.head, room, break_long_words=False)
+            )
             justify: Literal["left", "right"] = "left" if column.words or column.bars else "right"
-            table.add_column(Text(head), justify=justify, overflow="fold", no_wrap=not column.words)
+            table.add_column(
+                Text("\n".join(lines)), justify=justify, overflow="fold", no_wrap=not column.words
+            )
         for place in range(len(shown[0].cells)):
             texts = (_with_bar(column, place, BAR[0] + spare) for column in shown)
             plain = "" if encoding.lower().startswith("utf") else _PLAIN

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import io
 import os
 import shlex
@@ -10,11 +12,28 @@ import sys
 from collections.abc import Iterable, Iterator
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+_AGAIN: contextvars.ContextVar[Literal["command", "call"]] = contextvars.ContextVar("again", default="call")
+
+
+def again() -> Literal["command", "call"]:
+    """Return what continues work that has stopped, for messages: the same command, or the same call of a function."""
+    return _AGAIN.get()
+
+
+@contextlib.contextmanager
+def as_command() -> Iterator[None]:
+    """Let messages speak to somebody who typed a command."""
+    token = _AGAIN.set("command")
+    try:
+        yield
+    finally:
+        _AGAIN.reset(token)
 
 
 class Shown:

@@ -15,7 +15,9 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire, living, move_away
 from qrlsuite.results.progress import read_progress
+from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.store import EntryStore, entries, parameters_of, read_json, read_lines, write_json
+from qrlsuite.results.text import duration
 
 STATUSES = ("finished", "running", "interrupted", "submitted", "damaged")
 """What a seed can be. `submitted`: handed to a queue and not begun, as far as our own files or the queue know."""
@@ -232,6 +234,25 @@ class GroupStatus:
         if not all(isinstance(value, int | float) for value in (pace, epoch, epochs)):
             return None
         return float(max(0.0, (epochs - epoch) * pace))  # type: ignore[operator]
+
+    @property
+    def text(self) -> str:
+        """One line: state, seeds, how far it is, and who has it."""
+        epoch, epochs, phase, score, error = (
+            self.progress.get(name) for name in ("epoch", "epochs", "phase", "median_score", "error")
+        )
+        running = self.state == "running"
+        parts = [f"{self.state:<9}"]
+        parts += [f"seeds {format_seeds(self.seeds)}"] if self.seeds else []
+        parts += [f"epoch {epoch}/{epochs}"] if epochs else []
+        parts += [str(phase)] if phase and running else []
+        parts += [f"median score {score:.3f}"] if isinstance(score, int | float) else []
+        if running and self.seconds_left is not None:
+            parts.append(f"{duration(self.seconds_left)} left")
+        parts += [self.where] if self.where != "nobody" else []
+        parts += ["continued by the same `qrlsuite run`"] if self.state == "stopped" else []
+        parts += [str(error)] if error else []
+        return "  ".join(parts)
 
 
 def groups(store: EntryStore, queued: Collection[int] | None = None) -> list[GroupStatus]:

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
 from rich.text import Text
 
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import speed
@@ -192,7 +191,7 @@ class StudyOutcome(Shown):
         """Show `parts`."""
         yield from self.parts()
 
-    def parts(self) -> Iterator[Text | Table]:
+    def parts(self) -> Iterator[Text | Sheet]:
         """Return what a screen shows: what is asked; the design while it can be changed, then pairs and needs; cost."""
         study, state, facts = self.study, self.state, self.as_dict()
         yield Text(f"{study.name}: {study.file.summary}", style="bold")
@@ -201,7 +200,7 @@ class StudyOutcome(Shown):
         for asked, pairs in by_question(study, list(zip(self.pairs, facts["pairs"]))):
             if asked:
                 yield Text(asked, style="bold")
-            yield _table(self, pairs)
+            yield _sheet(self, pairs)
         if any(pair.p for pair in self.pairs):
             yield Text(
                 "B against A: how many more steps B needs, on average over the thresholds (+52% = B is slower), with "
@@ -209,7 +208,7 @@ class StudyOutcome(Shown):
                 "for all pairs together). Each threshold is tested separately: where this interval contains 0, the "
                 "threshold that decided follows with its own. An early stop overstates the difference."
             )
-            yield _entries_table(facts["entries"])
+            yield _entries_sheet(facts["entries"])
             yield Text(
                 "steps below threshold: of a run of the entry, mean over seeds and thresholds, at its last look"
             )
@@ -361,12 +360,11 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _table(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs"):
-        table.add_column(column, overflow="fold")
-    for pair, facts in pairs:
-        cells = (
+def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[str, Any]]]) -> Sheet:
+    """Return the table of some pairs."""
+    heads = ("pair: A / B", "verdict", "seeds", "B against A", "interval", "p", "needs")
+    rows = [
+        (
             versus(pair),
             pair.verdict,
             str(pair.n_runs),
@@ -374,19 +372,19 @@ def _table(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[st
             f"{pair.p[-1]:.2g}" if pair.p else "",
             needs_text(outcome, facts["needs"]),
         )
-        table.add_row(*(Text(cell) for cell in cells))
-    return table
+        for pair, facts in pairs
+    ]
+    return Sheet.of("", heads, rows, words=(heads[0], "verdict", "B against A", "interval", "needs"))
 
 
-def _entries_table(entries: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in ("entry", "seeds", "steps below threshold (95%)", "core-hours"):
-        table.add_column(column, overflow="fold")
+def _entries_sheet(entries: Sequence[Mapping[str, Any]]) -> Sheet:
+    """Return the table of the entries."""
+    rows = []
     for facts in entries:
         time = ""
         if facts["mean_time"] is not None:
             low, high = map(steps_text, facts["mean_time_interval"])
             time = f"{steps_text(facts['mean_time'])} ({low} to {high})"
-        cells = (facts["name"], str(facts["seeds"]), time, hours_text(facts["core_hours"]))
-        table.add_row(*(Text(cell) for cell in cells))
-    return table
+        rows.append((facts["name"], str(facts["seeds"]), time, hours_text(facts["core_hours"])))
+    heads = ("entry", "seeds", "steps below threshold (95%)", "core-hours")
+    return Sheet.of("", heads, rows, words=("entry",))

@@ -6,16 +6,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
 from rich.text import Text
 
 from qrlsuite import registry, specs
 from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.missing import find, require_same_code, train
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import EngineOutcome, Missing
@@ -23,8 +22,9 @@ from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting
 from qrlsuite.results.speed import BASES, Estimate, Speeds
 from qrlsuite.results.text import counted, duration, duration_range, hours_range
+from qrlsuite.statistics.sequential import Decision
 from qrlsuite.studies.looks import StudyWithLooks
-from qrlsuite.studies.outcome import StudyOutcome
+from qrlsuite.studies.outcome import StudyOutcome, versus
 from qrlsuite.studies.study import Member, Study
 
 
@@ -135,7 +135,7 @@ class Overview(Shown):
             yield Text(file.source)
         if file.reports:
             yield Text(f"Reported there: {file.reports}")
-        yield self._table() if self.items else Text("nothing to train")
+        yield self._sheet() if self.items else Text("nothing to train")
         lacking = [item for item in self.items if item.missing.groups]
         if self.items and not lacking:
             yield Text("everything is there")
@@ -152,12 +152,10 @@ class Overview(Shown):
             yield Text(f"the paper's software needed about {file.core_hours:,.0f} core-hours for all of it")
         yield Text(f"pictures: {', '.join(f'{p.name} ({p.kind})' for p in file.pictures)}")
 
-    def _table(self) -> Table:
-        table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    def _sheet(self) -> Sheet:
         with_published = ("published",) if self.published is not None else ()
-        for column in ("task", "entry", "seeds", *with_published, "epochs", "core time left", "because"):
-            number = column in ("seeds", "published", "epochs")
-            table.add_column(column, justify="right" if number else "left", overflow="fold")
+        heads = ("task", "entry", "seeds", *with_published, "epochs", "core time left", "because")
+        rows = []
         for item in self.items:
             cost = item.seconds
             busy = f" (+{len(item.missing.busy)} at work)" if item.missing.busy else ""
@@ -170,8 +168,8 @@ class Overview(Shown):
                 "-" if cost == 0 else "?" if item.range is None else duration_range(*item.range),
                 "" if cost == 0 else item.estimate.basis,
             )
-            table.add_row(*map(Text, cells))
-        return table
+            rows.append(cells)
+        return Sheet.of("", heads, rows, words=("task", "entry", "core time left", "because"))
 
 
 def _total(items: Sequence[PendingEntry]) -> tuple[float, float]:
@@ -218,7 +216,7 @@ def select(
         return members
     kept = [member for member in members if any(_mentions(member, word) for word in only)]
     if not kept:
-        raise OptionError(f"--only {' --only '.join(only)}: study '{study.name}' has no such entry")
+        raise OptionError(f"{' or '.join(only)}: study '{study.name}' has no such entry")
     return kept
 
 
@@ -349,7 +347,6 @@ class Session:
     speeds: Speeds
     budget: float | None = None
     quiet: bool = False
-    again: Literal["command", "call"] = "command"
     submitted: list[str] = field(default_factory=list)
     trained: int = 0
     clock: Callable[[], float] = time.monotonic
@@ -390,7 +387,7 @@ class Session:
         work = item.missing
         complete = sorted(set(work.seeds) - set(work.todo) - set(work.busy))
         part = find(self.runs, work.entry, self.where, sorted([*complete, *chosen]), work.epochs)
-        display = RunDisplay(part, self.where.workers, self.quiet, self.again)
+        display = RunDisplay(part, self.where.workers, self.quiet)
         display.console.print(f"\n[bold]{title}[/bold]", end="  ")
         outcome = train(part, self.where, display)
         return self._after(item, part, outcome)
@@ -415,17 +412,13 @@ class Session:
         return PendingEntry(rest, item.groups, self.speeds.estimate(work.entry, rest.together))
 
 
-def take_looks(
-    study: StudyWithLooks, session: Session, looked: Callable[[StudyOutcome], None] | None = None
-) -> StudyOutcome:
+def take_looks(study: StudyWithLooks, session: Session) -> StudyOutcome:
     """Train what each look needs and take it, until every pair is closed, or others have the seeds it needs.
 
     Parameters
     ----------
     session:
-        In the study's folder.
-    looked:
-        Called after each look.
+        In the study's folder. Unless it is quiet, it says what every look decides.
 
     Raises
     ------
@@ -434,7 +427,7 @@ def take_looks(
     QrlSuiteError
         If the study cannot be used or go on, or training failed; finished epochs are kept.
     """
-    require_same_code(study.folder, list(study.entries.values()), session.where)
+    require_same_code(study.folder, list(study.entries.values()), session.where, session.quiet)
     study.begin()
     state = study.look()
     while wanted := state.decision.wanted:
@@ -447,6 +440,20 @@ def take_looks(
         state = study.look()
         if state.missing and state.decision.wanted == wanted:
             break  # a queue or another process has the seeds, or the budget is used up
-        if looked is not None:
-            looked(StudyOutcome(study, state))
+        _say_look(state.decision, Console(stderr=True, quiet=session.quiet, highlight=False))
     return StudyOutcome(study, state, tuple(session.submitted))
+
+
+def _say_look(decision: Decision, console: Console) -> None:
+    """Say what the newest look decided, while more is trained."""
+    looks = max((len(pair.p) for pair in decision.pairs), default=0)
+    if not looks:
+        return
+    console.print(f"\n[bold]look at {decision.design.looks[looks - 1]} seeds[/bold]")
+    for pair in decision.pairs:
+        if len(pair.p) == looks:
+            console.print(
+                f"{versus(pair)}: {pair.verdict} (p = {pair.p[-1]:.2g}, level {pair.levels[-1]:.2g})",
+                markup=False,
+                soft_wrap=True,
+            )

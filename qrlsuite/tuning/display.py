@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 
 from qrlsuite.engine.display import Bar, Clock
+from qrlsuite.engine.terminal import again
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import Missing
 from qrlsuite.results import speed
@@ -23,21 +24,11 @@ from qrlsuite.tuning.space import text
 class TuneDisplay:
     """Shows searches: a live bar on a terminal or in a notebook, a line per trial, nothing when quiet.
 
-    Parameters
-    ----------
-    again:
-        What continues a search once it has stopped: the command, or the call of a function, which shows no line per
-        trial beside a bar.
+    A call of a function shows no line per trial beside a bar.
     """
 
-    def __init__(
-        self,
-        searches: Sequence[Search],
-        where: Where,
-        quiet: bool = False,
-        again: Literal["command", "call"] = "command",
-    ) -> None:
-        self.searches, self.where, self.again = searches, where, again
+    def __init__(self, searches: Sequence[Search], where: Where, quiet: bool = False) -> None:
+        self.searches, self.where, self.again = searches, where, again()
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
         self.bar = Bar(self.console)
         self._works: Sequence[Missing] = ()

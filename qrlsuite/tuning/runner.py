@@ -97,8 +97,7 @@ def _run(
 
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
-        for line in missing.require_same_code(runs / FOLDER, entries, where):
-            display.console.print(line, markup=False, soft_wrap=True)
+        missing.require_same_code(runs / FOLDER, entries, where, display.console.quiet)
         works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
         for work in works:
             missing.check_memory(work, where)

@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
-from rich.text import Text
 
 from qrlsuite import notation, options, registry
 from qrlsuite.engine.budget import Budget
+from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment import preset
@@ -411,6 +409,40 @@ class Search(Shown):
             "space": {dimension.name: dimension.plain() for dimension in self.space},
         }
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values: trials from best to worst."""
+        return {
+            "task": self.base.task.name,
+            "algorithm": self.base.algorithm.name,
+            "model": self.base.model.name,
+            "objective": cell_text(self.base.task.file.ranking, self.request.objective),
+            "sampler": self.request.sampler,
+            "space": {dimension.name: dimension.plain() for dimension in self.space},
+            "planned": self.planned,
+            "pending": len(self.pending),
+            "runs": self.runs_done,
+            "epochs": self.epochs,
+            "core_hours": self.core_seconds / 3600,
+            "preset": None if self.written is None else str(self.written),
+            "trials": [
+                {
+                    "number": trial.number,
+                    "settings": trial.point,
+                    "entry": trial.entry.name,
+                    "rung": trial.rung,
+                    "seeds": format_seeds(trial.seeds),
+                    "value": trial.merit.value,
+                    "mean_time": trial.merit.time,
+                    "sample_complexity": trial.merit.cell,
+                    "unsettled": trial.merit.unsettled,
+                    "area": trial.merit.area,
+                    "mean_score": trial.merit.score,
+                    "core_hours": trial.core_seconds / 3600,
+                }
+                for trial in self.ordered
+            ],
+        }
+
     def write(self, path: Path) -> None:
         """Write the best settings to a preset file, atomically."""
         best_preset = self.preset()
@@ -430,37 +462,30 @@ class Search(Shown):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show the best trials, a row each."""
         ranking = self.base.task.file.ranking
-        table = Table(
-            title=Text(
-                f"{self.base.label} on {self.base.task.name}: the best of {len(self.trials)} trials, "
-                f"{self.runs_done} runs x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours"
-            ),
-            title_justify="left",
-            header_style="bold",
-            box=box.SIMPLE_HEAD,
-            caption=Text(
-                f"minimized: {cell_text(ranking, self.request.objective)}; ties by the area, then by the mean score "
-                f"over all epochs. {self._warning}"
-            ),
-            caption_justify="left",
-            pad_edge=False,
-        )
-        for name in ("trial", "settings", "seeds", "M", "S_hat", "area", "mean score", "core-hours"):
-            table.add_column(Text(name), justify="left" if name == "settings" else "right", overflow="fold")
-        for trial in self.ordered[:SHOWN]:
-            merit = trial.merit
-            row = [
+        rows = [
+            (
                 str(trial.number),
                 space.text(trial.point),
                 self._seeds_text(trial),
-                steps_text(merit.time),
-                f"{'>= ' * merit.unsettled}{steps_text(merit.cell)}",
-                steps_text(merit.area),
-                f"{merit.score:.4f}",
+                steps_text(trial.merit.time),
+                f"{'>= ' * trial.merit.unsettled}{steps_text(trial.merit.cell)}",
+                steps_text(trial.merit.area),
+                f"{trial.merit.score:.4f}",
                 hours_text(trial.core_seconds / 3600),
-            ]
-            table.add_row(*(Text(cell) for cell in row))
-        yield table
+            )
+            for trial in self.ordered[:SHOWN]
+        ]
+        yield Sheet.of(
+            f"{self.base.label} on {self.base.task.name}: the best of {len(self.trials)} trials, "
+            f"{self.runs_done} runs x {self.epochs} epochs, {hours_text(self.core_seconds / 3600)} core-hours",
+            ("trial", "settings", "seeds", "M", "S_hat", "area", "mean score", "core-hours"),
+            rows,
+            notes=(
+                f"minimized: {cell_text(ranking, self.request.objective)}; ties by the area, then by the mean score "
+                f"over all epochs. {self._warning}",
+            ),
+            words=("settings",),
+        )
 
     @property
     def _warning(self) -> str:
@@ -478,37 +503,3 @@ def merit_text(trial: Trial) -> str:
         f"M {steps_text(merit.time)}, S_hat {sign}{steps_text(merit.cell)}, area {steps_text(merit.area)}, "
         f"mean score {merit.score:.4f}"
     )
-
-
-def as_dict(search: Search) -> dict[str, Any]:
-    """Return a search as plain values, for JSON: trials from best to worst."""
-    return {
-        "task": search.base.task.name,
-        "algorithm": search.base.algorithm.name,
-        "model": search.base.model.name,
-        "objective": cell_text(search.base.task.file.ranking, search.request.objective),
-        "sampler": search.request.sampler,
-        "space": {dimension.name: dimension.plain() for dimension in search.space},
-        "planned": search.planned,
-        "pending": len(search.pending),
-        "runs": search.runs_done,
-        "epochs": search.epochs,
-        "core_hours": search.core_seconds / 3600,
-        "trials": [
-            {
-                "number": trial.number,
-                "settings": trial.point,
-                "entry": trial.entry.name,
-                "rung": trial.rung,
-                "seeds": format_seeds(trial.seeds),
-                "value": trial.merit.value,
-                "mean_time": trial.merit.time,
-                "sample_complexity": trial.merit.cell,
-                "unsettled": trial.merit.unsettled,
-                "area": trial.merit.area,
-                "mean_score": trial.merit.score,
-                "core_hours": trial.core_seconds / 3600,
-            }
-            for trial in search.ordered
-        ],
-    }

@@ -101,7 +101,7 @@ def test_a_small_circuit_by_hand() -> None:
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_command_prints_nothing_but_the_text(format: str) -> None:
-    result = CliRunner().invoke(build(), ["show", "ansatz", "iqp", "--qubits", "3", "--format", format])
+    result = CliRunner().invoke(build(), ["show", "ansatz", "iqp", "qubits=3", "--format", format])
     assert result.stdout == export(ansatz("iqp", 3, 2), format)
 
 

@@ -114,12 +114,12 @@ def test_by_name_every_rule_is_shown(check: Command) -> None:
 
 
 def test_settings_are_checked_and_a_broken_rule_is_exit_code_1(check: Command) -> None:
-    assert check("tidy-too", "--set", "slots=3")[0] == 0
-    code, out, _ = check("tidy-too", "--set", "slots=0")
+    assert check("tidy-too", "slots=3")[0] == 0
+    code, out, _ = check("tidy-too", "slots=0")
     assert code == 1
     assert "  ✗ workers: workers(None) returned 0, and must return how many groups" in out
     assert out.splitlines()[-1] == "1 of 10 rules broken"
-    code, out, _ = check("tidy-too", "--set", "slot=3")
+    code, out, _ = check("tidy-too", "slot=3")
     assert code == 1
     assert "did you mean 'slots'" in out
 
@@ -136,7 +136,7 @@ def test_an_environment_is_checked_as_a_task_has_it(
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(testing, "check", lambda *words, **more: [asked.append((*words, more))][1:])
     given = load(tiny_task).file.environment.options
-    assert check("environment:beam6g", "--task", tiny_task, "--set", "degree=5", "--deterministic")[0] == 0
+    assert check("environment:beam6g", "--task", tiny_task, "degree=5", "--deterministic")[0] == 0
     assert asked == [("environment", "beam6g", {**given, "degree": 5}, {"deterministic": True})]
     assert (
         "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
@@ -145,11 +145,11 @@ def test_an_environment_is_checked_as_a_task_has_it(
 
 
 def test_ppo_that_draws_in_validation_keeps_the_rules(check: Command) -> None:
-    assert check("algorithm:ppo", "--set", "validation=sampled")[0] == 0
+    assert check("algorithm:ppo", "validation=sampled")[0] == 0
 
 
 def test_json_is_one_row_per_rule(check: Command) -> None:
-    code, out, err = check("tidy-too", "--set", "slots=0", "--json")
+    code, out, err = check("tidy-too", "slots=0", "--json")
     rows = json.loads(out)
     assert (code, err) == (1, "")
     assert {(row["kind"], row["name"]) for row in rows} == {("engine", "tidy-too")}
@@ -165,9 +165,9 @@ def test_a_distribution_stands_for_all_that_it_registers(check: Command) -> None
     assert {row["name"] for row in json.loads(check("some-more", "--json")[1])} == {"more"}, (
         "as pip spells it"
     )
-    code, _, err = check("tidy", "--set", "slots=3")
+    code, _, err = check("tidy", "slots=3")
     assert code == 2
-    assert "--set is for one thing" in err
+    assert "options are for one thing" in err
 
 
 def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check: Command) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -98,6 +99,8 @@ def test_seeds_that_another_process_trains_are_left_to_it(task: str, tmp_path: P
     assert f" on {socket.gethostname()}; repeat this command" in other.stderr
     same = qrlsuite(*words, "--seeds", "0:2")
     assert (same.returncode, "nothing is left to do here" in same.stderr) == (0, True), same.stderr
+    assert re.search(r"running +seeds 0:2  epoch \d/3  .*process", same.stderr), same.stderr
+    assert "0 seeds complete" not in same.stderr
     hold.release()
     assert first.wait(HANGS) == 0
 
@@ -229,7 +232,7 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
             ["run", "--task", "beam6g", "--model", "vqc-native", "--set", "ansatz=ipq"],
             "unknown ansatz 'ipq'; did you mean 'iqp'",
         ),
-        (["show", "ansatz", "iqp", "--qubits", "21"], "qubits = 21: a circuit has 1 to 20 qubits"),
+        (["show", "ansatz", "iqp", "qubits=21"], "qubits = 21: a circuit has 1 to 20 qubits"),
         (
             ["run", "--task", "beam6g", "--model", "mlp", "--set", "lr=inf"],
             "lr = inf: infinite numbers cannot",
@@ -238,7 +241,7 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         (["run", "--task", "beam6g", "--model", "mlp", "--sedes", "3"], "--seeds"),
         (["run", "--task", "beam6g", "--model", "mlp", "--epochs", "0"], "--epochs"),
         (["rnu"], "Did you mean 'run'"),
-        (["show", "ansatz", "iqp", "--figure", "iqp.jpeg2"], "must be .png, .pdf or .svg"),
+        (["show", "ansatz", "iqp", "--out", "iqp.jpeg2"], "must be .png, .pdf or .svg"),
         (["list", "modles"], "did you mean 'models'"),
         (["show", "mpl"], "did you mean 'mlp'"),
         (["leaderboard", "--runs", "nowhere"], "there is no results folder nowhere"),
@@ -260,14 +263,21 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
             ["evaluate", "mlp", "--backend-set", "shots=3"],
             "--backend-set is gone: --backend 'qiskit shots=1000'",
         ),
+        (
+            ["study", "run", "fig6", "--set", "qubits=6"],
+            "--set is gone: write it after the name, as in `qrlsuite study run",
+        ),
+        (["plot", "bars", "--settings"], "--settings is gone: qrlsuite show picture KIND"),
+        (["show", "ansatz", "iqp", "--qubits", "4"], "--qubits is gone: write it after the name"),
+        (["verify", "--choice", "3"], "--choice is gone: --rerun '2 choice=31'"),
         (["status"], "`qrlsuite status` is now `qrlsuite runs`"),
         (["leaderboard", "verify", "."], "`qrlsuite leaderboard verify` is now `qrlsuite verify`"),
         (["calibrate"], "`qrlsuite calibrate` is now `python benchmarks/calibration.py`"),
         (["plot", "estimator", "--task", "beam6g"], "picture 'estimator' shows no results: leave --task out"),
         (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),
         (
-            ["show", "mlp", "--set", "width=4"],
-            "model 'mlp': --qubits, --layers, --set, --figure and --format draw an ansatz",
+            ["show", "mlp", "width=4"],
+            "model 'mlp': NAME=VALUE, --out and --format draw an ansatz",
         ),
         (["leaderboard", "--format", "markdwn"], "'markdwn' is not one of"),
         (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),
@@ -313,8 +323,8 @@ def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
     assert "units of each hidden layer" in shown
     protocol = json.loads(qrlsuite("show", "task", "beam6g", "--json").stdout)["protocol"]
     assert protocol["interactions"] == 2000
-    ansatz = ("show", "ansatz", "cx", "--qubits", "3", "--set", "gate=u3")
-    found = json.loads(qrlsuite(*ansatz, "--figure", str(tmp_path / "cx.svg"), "--json").stdout)
+    ansatz = ("show", "ansatz", "cx", "qubits=3", "gate=u3")
+    found = json.loads(qrlsuite(*ansatz, "--out", str(tmp_path / "cx.svg"), "--json").stdout)
     assert found["resources"]["gates"] == {"H": 3, "U3": 6, "CNOT": 3}
     assert "q_2: ┤ H ├┤ U3 ├" in found["drawing"]
     assert "two_qubit_depth: 3" in qrlsuite(*ansatz).stdout

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
-from typing import Literal
 
 import pytest
 from typer.testing import CliRunner
@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from qrlsuite.cli.app import build
 from qrlsuite.engine.display import CostEstimate, RunDisplay
 from qrlsuite.engine.missing import summarize
+from qrlsuite.engine.terminal import as_command
 from qrlsuite.engine.work import Missing
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
@@ -61,14 +62,15 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
 
 @pytest.mark.parametrize(("again", "limit"), [("command", "--budget"), ("call", "`budget`")])
 def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
-    again: Literal["command", "call"],
+    again: str,
     limit: str,
     entry: Entry,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     plan = Missing(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
-    RunDisplay(plan, 1, again=again).out_of_time("90s")
+    with as_command() if again == "command" else contextlib.nullcontext():
+        RunDisplay(plan, 1).out_of_time("90s")
     message = capsys.readouterr().err
     assert "stopped after 90s, at epoch 0 of 3" in message
     assert f"The same {again} continues from there, and without {limit} to the end." in message

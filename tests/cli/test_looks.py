@@ -270,7 +270,7 @@ def test_python_compares_as_the_command_does() -> None:
     assert found.pairs == read.pairs
     assert json.loads(json.dumps(found.as_dict())) == answer("show", "widths.toml")
     assert "mlp width=16 needs fewer" in found._repr_html_()
-    with pytest.raises(OptionError, match="has looks, which fix what is trained: leave seeds out"):
+    with pytest.raises(OptionError, match="has looks, which fix what is trained: leave --seeds out"):
         api.run_study("widths.toml", seeds=3)
     with pytest.raises(OptionError, match=r"widths.toml is there already"):
         api.new_study("widths.toml", ["mlp", "mlp width=8"], task="tiny.toml")
@@ -278,7 +278,7 @@ def test_python_compares_as_the_command_does() -> None:
 
 def test_a_killed_worker_changes_no_byte(hold: Hold) -> None:
     Path("tiny.toml").write_text(TINY)
-    write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2", "--reason", "a test")
+    write("mlp width=4", "mlp width=2", "--epochs", "2", "--looks", "2 reason=test")
     words = ("study", "run", "widths.toml", "--workers", "1", "--json", "--runs")
     process = start(*words, "killed", env=hold.environment)
     hold.wait(process)
@@ -456,13 +456,15 @@ TWO = (*NEW, "mlp width=16", "mlp width=4")
             (*NEW, "mlp", "ppo mlp"),
             "different horizons: 'ddqn mlp width=64' at 1200 steps, 'ppo mlp width=64' at 1800",
         ),
-        ((*TWO, "--alpha", "1"), "alpha = 1.0 is outside (0, 1)"),
+        ((*TWO, "--looks", "alpha=1"), "alpha = 1.0 is outside (0, 1)"),
         ((*TWO, "--looks", "20,40,40"), "each must be at more runs than the one before"),
         ((*TWO, "--looks", "10,20"), "the first is below 20 runs"),
         ((*TWO, "--looks", "20;40"), "--looks 20;40: write numbers of seeds"),
-        ((*TWO, "--margin", "0"), "margin = 0.0 is not a positive number"),
-        ((*TWO, "--first-seed", "50"), "seeds 0:100 are the protocol's"),
-        ((*TWO, "--first-seed", "999950"), "seeds from 1000000 up are those of tuning"),
+        ((*TWO, "--looks", "20,40 margin=0"), "margin = 0.0 is not a positive number"),
+        ((*TWO, "--looks", "first_seed=50"), "seeds 0:100 are the protocol's"),
+        ((*TWO, "--looks", "first_seed=999950"), "seeds from 1000000 up are those of tuning"),
+        ((*TWO, "--looks", "20 margn=1"), "--looks: unknown option 'margn'; did you mean 'margin'"),
+        ((*TWO, "--margin", "0"), "--margin is gone: --looks '20,40,60 alpha=.01"),
         (("study", "new", "p", *TWO[3:]), "p: a study file's name ends in .toml"),
         (("study", "new", "tiny.toml", *TWO[3:]), "tiny.toml is there already"),
         (("study", "new", "p q.toml", *TWO[3:]), "name"),
@@ -526,8 +528,8 @@ def test_what_would_change_a_study_with_looks_is_refused(refused: Refused) -> No
     write()
     for option in (
         ("--seeds", "20"),
-        ("--set", "width=3"),
-        ("--only", "mlp"),
+        ("width=3",),
+        ("mlp",),
         ("--epochs", "2"),
         ("--dry-run",),
     ):
@@ -627,7 +629,7 @@ def test_a_study_keeps_the_values_and_the_record_of_a_preset_file() -> None:
 @pytest.fixture
 def exported() -> Path:
     """A study of a few seeds, published."""
-    write("mlp width=16", "mlp width=4", "--looks", "3,5", "--reason", "a test", study="p.toml")
+    write("mlp width=16", "mlp width=4", "--looks", "3,5 reason='a test'", study="p.toml")
     run("p.toml")
     assert "next: " in say("export", "p.toml", "--out", "plans").stdout
     return Path("plans/p")
@@ -668,7 +670,7 @@ def test_a_damaged_published_study_is_refused(exported: Path, refused: Refused) 
 
 
 def test_looks_below_20_seeds_are_marked() -> None:
-    write("mlp width=16", "mlp width=4", "--looks", "10,20", "--reason", "runs are dear")
+    write("mlp width=16", "mlp width=4", "--looks", "10,20 reason='runs are dear'")
     assert "NOTE: it looks below 20 seeds" in (shown := say("show", "widths.toml").stdout)
     assert "Reason given: runs are dear" in shown
     run()

@@ -78,7 +78,7 @@ def test_pictures_of_an_environment(tmp_path: Path) -> None:
         ("field", "resolution=40"),
     ):
         out = tmp_path / f"{kind}.png"
-        call("plot", kind, "--task", "beam6g", "--set", setting, "--out", str(out))
+        call("plot", kind, "--task", "beam6g", setting, "--out", str(out))
         assert out.read_bytes().startswith(b"\x89PNG")
 
 
@@ -116,9 +116,9 @@ def not_a_figure(worlds: object, options: object) -> str:
             "shows tasks of beam6g; 'cartpole' is a task of cartpole",
         ),
         (("histogram",), OptionError, "drawn by: qrlsuite evaluate ENTRY"),
-        (("bars", "--set", "epsilon=[0.1]"), OptionError, "did you mean 'epsilons'"),
-        (("bars", "--set", "environment.degree=4"), OptionError, "shows what was trained"),
-        (("bars", "--set", "model.width=4"), OptionError, "write width=... for the picture"),
+        (("bars", "epsilon=[0.1]"), OptionError, "did you mean 'epsilons'"),
+        (("bars", "environment.degree=4"), OptionError, "shows what was trained"),
+        (("bars", "model.width=4"), OptionError, "write width=... for the picture"),
         (("bars", "--out", "x.gif"), OptionError, r"must be \.png, \.pdf or \.svg"),
     ],
 )
@@ -130,8 +130,8 @@ def test_bad_input_says_what_to_type(
 
 
 def test_settings_are_listed() -> None:
-    assert "elevation = 22" in call("plot", "surface", "--settings")
-    assert "degrees" in call("plot", "trajectories", "--settings")
+    assert "elevation = 22" in call("show", "picture", "surface")
+    assert "degrees" in call("show", "trajectories")
 
 
 def test_compare_begins_with_the_verdict_and_fits_eighty_columns(entries: list[EntryResults]) -> None:

@@ -181,7 +181,7 @@ def test_bad_input_of_the_others(tiny_task: str, tmp_path: Path) -> None:
         api.tune(tiny_task, "mlp", vary={"lr": [1e-3]}, out="best.txt", runs=tmp_path)
     with pytest.raises(UnknownNameError, match="did you mean 'fig6'"):
         api.run_study("fig66", runs=tmp_path)
-    with pytest.raises(OptionError, match="format = 'gif'"):
+    with pytest.raises(OptionError, match="--format gif"):
         api.run_study("fig6", format="gif", runs=tmp_path)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="--budget 0h"):
         api.run_study("fig6", budget="0h", runs=tmp_path)

@@ -97,8 +97,8 @@ def test_a_board_ranks_what_it_is_given(small: EntryResults, large: EntryResults
 
 
 def test_what_is_left_out_of_a_board_is_named(large: EntryResults) -> None:
-    with pytest.raises(UnknownNameError, match=r"no entry is left: .*100 seeds, fewer than 101"):
-        api.board(entries=[large], min_seeds=101, **WHERE)
+    with pytest.raises(UnknownNameError, match=r"no entry is left: .*ends at 200000 of 202000 steps"):
+        api.board(entries=[large], horizon=202_000, **WHERE)
 
 
 def test_an_entry_with_fewer_seeds_is_one_that_has_these_alone(small: EntryResults) -> None:

@@ -17,10 +17,10 @@ SMALL = {
     "run": ("--seeds", "2", "--epochs", "1", "--workers", "1"),
     "evaluate": ("--episodes", "5"),
     "tune": ("--sampler", "random trials=1", "--seeds", "2", "--epochs", "1", "--workers", "1"),
-    "study": ("--seeds", "2", "--epochs", "1", "--set", "qubits=2", "--set", "layers=1", "--workers", "1"),
+    "study": ("--seeds", "2", "--epochs", "1", "qubits=2", "layers=1", "--workers", "1"),
 }
 """What is appended to a command, so that it takes seconds; the last of two equal options counts."""
-CIRCUIT = ("--set", "qubits=2", "--set", "layers=1", "--seeds", "1")
+CIRCUIT = ("qubits=2", "layers=1", "--seeds", "1")
 ELSEWHERE = {"doctor"}
 """Imports every package anew, which tests/cli/test_doctor.py does."""
 

@@ -169,7 +169,7 @@ def test_the_commands_on_stored_runs(trained: Path, tmp_path: Path) -> None:
     assert "ddqn mlp width=6: no result with these options on pole" in text
 
     file = tmp_path / "scores.npz"
-    result = qrlsuite(trained, "export", "--rliable", str(file), "--task", "tiny", "--task", "pole")
+    result = qrlsuite(trained, "export", "--out", str(file), "--task", "tiny", "--task", "pole")
     assert result.exit_code == 0, result.output
     with np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
@@ -200,8 +200,7 @@ def test_the_commands_on_stored_runs(trained: Path, tmp_path: Path) -> None:
             ["leaderboard", "--task", "tiny", "--task", "pole", "--horizon", "60", "--entry", "mlp width=9"],
             "width=9",
         ),
-        (["export", "--rliable", "a.npz"], "--rliable: name two tasks or more"),
-        (["export", "--rliable", "a.csv", "--task", "tiny", "--task", "pole"], "must be .npz"),
+        (["export", "--out", "a.npz"], "--out a.npz: name two tasks or more"),
     ],
 )
 def test_wrong_input_says_what_to_type(given: list[str], message: str, trained: Path) -> None:

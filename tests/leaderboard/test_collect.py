@@ -134,8 +134,8 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
     assert "left out" not in output
     output, _ = plot("curves", "--published")  # which cuts nothing
     assert "left out" not in output
-    output, _ = plot("bars", "--published", "--min-seeds", "20", "--set", "epsilons=[0.2]")
-    assert "left out: ddqn mlp width=16: 3 seeds, fewer than 20" in output
+    output, _ = plot("bars", "epsilons=[0.2]", "--published", "--seeds", "20")
+    assert "left out: ddqn mlp width=16: 3 seeds, and not all that were asked for" in output
     output, _ = plot("bars")  # alone it cuts nobody
     assert "left out" not in output
 
@@ -163,8 +163,8 @@ def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -
     everything = rows("--horizon", "2000")
     assert list(everything) == [2000]
     assert {own, other} <= set(everything[2000])
-    assert own not in rows("--min-seeds", "20")[200_000]
-    assert 2000 not in rows("--min-seeds", "20")
+    assert own not in rows("--horizon", "200000")[200_000]
+    assert 2000 not in rows("--horizon", "200000")
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,6 @@ def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -
             "an epoch of task 'beam6g' has 2000 steps; write a multiple of it, such as --horizon 2000",
         ),
         (("--horizon", "4000"), "no entry is left: ddqn mlp width=16: ends at 2000 of 4000 steps"),
-        (("--min-seeds", "4"), "no entry is left: ddqn mlp width=16: 3 seeds, fewer than 4"),
     ],
 )
 def test_what_leaves_nothing_says_why(words: tuple[str, ...], message: str, with_smoke: Path) -> None:

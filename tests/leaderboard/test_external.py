@@ -108,7 +108,7 @@ def test_external_entries_are_not_trained_evaluated_or_published(
 def test_power_and_rliable_take_them(qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path) -> None:
     qrlsuite("import", csv, "--maximum", 100)
     qrlsuite("import", csv, "--maximum", 100, "--task", "another")
-    scores = qrlsuite("export", "--rliable", "scores.npz", "--task", "external", "--task", "another")
+    scores = qrlsuite("export", "--out", "scores.npz", "--task", "external", "--task", "another")
     assert "fast lr=0.1: 20 runs, 2 tasks" in scores.output, scores.exception
     needs = json.loads(
         qrlsuite("power", "fast", "slow", "--task", "external", "--draws", 20, "--json").output

@@ -206,9 +206,7 @@ def test_from_the_command_line(runs: Path, tmp_path: Path, monkeypatch: pytest.M
     def run(*words: str) -> Any:
         return CliRunner().invoke(build(), [*words, "--runs", str(runs)])
 
-    drawn = run(
-        "plot", "fields", "--set", "x=width", "--set", "y=area", "--set", "where=model=net", "--out", "a.png"
-    )
+    drawn = run("plot", "fields", "x=width", "y=area", "where=model=net", "--out", "a.png")
     assert drawn.output == "wrote a.png\n", drawn.exception
     rows = list(csv.DictReader(io.StringIO(run("runs", "--format", "csv").stdout)))
     assert [(row["entry"], row["model.width"], row["seeds_finished"]) for row in rows] == [

@@ -569,10 +569,10 @@ def command(*words: str) -> Any:
 
 def test_commands(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = command("export", "--all", "--runs", str(tmp_path / "runs"), "--out", str(out))
+    done = command("export", "all", "--runs", str(tmp_path / "runs"), "--out", str(out))
     assert done.exit_code == 0
     assert "8 seeds" in done.stdout
-    done = command("verify", str(out), "--rerun", "1", "--choice", "3", "--json")
+    done = command("verify", str(out), "--rerun", "1 choice=3", "--json")
     assert done.exit_code == 0
     (told,) = json.loads(done.stdout)["entries"]
     assert (told["choice"], told["check"]) == (3, "repeated")
@@ -605,7 +605,7 @@ def test_nothing_complete_is_nothing_to_export(tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     with pytest.raises(QrlSuiteError, match="holds no complete entry: qrlsuite runs --runs"):
         CliRunner().invoke(
-            build(), ["export", "--all", "--runs", str(tmp_path / "runs")], catch_exceptions=False
+            build(), ["export", "all", "--runs", str(tmp_path / "runs")], catch_exceptions=False
         )
 
 

@@ -143,7 +143,7 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
         "trackers": {"acme-log"},
     }
     assert installed.script("rzz-cost", "--qubits", "3", "--layers", "2") == "12\n"
-    assert "RZZ" in installed.qrlsuite("show", "ansatz", "rzz-ring", "--qubits", "3").stdout
+    assert "RZZ" in installed.qrlsuite("show", "ansatz", "rzz-ring", "qubits=3").stdout
 
 
 def test_the_scaffold_is_in_the_wheel(installed: Installation) -> None:

@@ -11,10 +11,9 @@ from rich.console import Console
 from rich.text import Text
 
 from qrlsuite import registry, specs, testing
-from qrlsuite.cli.arguments import JsonOption
+from qrlsuite.cli.arguments import JsonOption, split_settings
 from qrlsuite.engine.terminal import printable
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.options import parse_setting
 from qrlsuite.testing import Finding, selection
 from qrlsuite.testing.findings import watching
 from qrlsuite.testing.selection import CheckTarget
@@ -30,8 +29,8 @@ def check(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="Check a single plugin with this value of an option."
+        typer.Argument(
+            metavar="[OPTION=VALUE]...", help="Check a single plugin with these values of its options."
         ),
     ] = None,
     task: Annotated[
@@ -51,7 +50,7 @@ def check(
 
     Exit codes: 0 every rule holds, 1 a rule is broken, 2 nothing has that name.
 
-    Examples: qrlsuite check my-model; qrlsuite check ansatz:ring --set depth=2; qrlsuite check my-distribution
+    Examples: qrlsuite check my-model; qrlsuite check ansatz:ring depth=2; qrlsuite check my-distribution
     """
     if name is None:
         _teach(json_output)
@@ -71,9 +70,12 @@ def check(
     elif task:
         load_task(task)
         more["task"] = task
-    chosen |= {setting.name: setting.value for setting in map(parse_setting, settings or [])}
+    more_names, given = split_settings(settings)
+    if more_names:
+        raise typer.BadParameter(f"{more_names[0]}: give one name, and its options as OPTION=VALUE")
+    chosen |= given
     if chosen and len(items) > 1:
-        raise typer.BadParameter("--set is for one thing: name it, qrlsuite check KIND:NAME --set NAME=VALUE")
+        raise typer.BadParameter("options are for one thing: name it, qrlsuite check KIND:NAME OPTION=VALUE")
     if json_output:
         results = [(item, _findings(item, chosen, more)) for item in items]
         typer.echo(json.dumps([_plain(item, finding) for item, findings in results for finding in findings]))

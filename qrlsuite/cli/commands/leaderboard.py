@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from qrlsuite import api
+from qrlsuite.api.entries import write_page
 from qrlsuite.cli.arguments import (
     AlphaOption,
     EntryOption,
     HorizonOption,
-    MinSeedsOption,
     PublishedOption,
     RunsOption,
     TasksOption,
@@ -25,10 +24,7 @@ from qrlsuite.cli.arguments import (
 from qrlsuite.engine.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.leaderboard.boards.board import Leaderboard
 from qrlsuite.leaderboard.boards.times import ALPHA
-from qrlsuite.leaderboard.shelf import published_studies
-from qrlsuite.results.store import write_atomically
 
 
 class Format(StrEnum):
@@ -65,7 +61,6 @@ def leaderboard(
         ),
     ] = None,
     horizon: HorizonOption = None,
-    min_seeds: MinSeedsOption = 1,
     format_: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.table,
     output: Annotated[
         Path | None,
@@ -103,7 +98,7 @@ def leaderboard(
     more at none: permutation tests, with Holm's correction over all pairs of the board, so that --alpha is the
     probability of any false difference. An entry's rank is 1 + the number of entries that outperform it; a range says
     which ranks the decided pairs leave. The order is by steps below threshold. Entries with fewer than 20 seeds are
-    not ranked. --entry and --min-seeds choose what is shown, and change no rank.
+    not ranked. --entry chooses what is shown, and changes no rank.
 
     --rule paper ranks by the paper's definition instead: tiers of significant outperformance in the cells of the
     task's grid, by intervals of the sample complexity.
@@ -127,40 +122,46 @@ def leaderboard(
             "--pairs: only the board of one task by steps has the matrix of pairs; --format json has the others'"
         )
 
-    def of(tasks: Sequence[str], by: By) -> Leaderboard:
-        return api.board(
-            tasks,
-            by=by.value,
-            runs=runs,
-            published=published,
-            rule=rule,
-            alpha=alpha,
-            horizon=horizon,
-            entries=entry or (),
-            study=study,
-            min_seeds=min_seeds,
-        )
-
-    board = of(tasks, by)
+    asked: dict[str, Any] = {
+        "by": by.value,
+        "runs": runs,
+        "published": published,
+        "study": study,
+        "rule": rule,
+        "alpha": alpha,
+        "horizon": horizon,
+        "entries": entry or (),
+    }
+    if format_ is Format.html:
+        path, refused = write_page(output, tasks, **asked)
+        _left_out(refused)
+        if path is None:
+            raise _nothing(runs, tasks)
+        typer.echo(f"wrote {path}")
+        return
+    board = api.board(tasks, **asked)
     if format_ is Format.json:
         typer.echo(json.dumps(board.as_dict()))
         return
-    for line in board.refused:
-        typer.echo(f"left out: {line}", err=True)
-    if format_ is Format.html:
-        plain = len(tasks) < 2 and by is By.steps
-        boards = [board] if plain else [of(names, By.steps) for names in [[name] for name in tasks] or [[]]]
-        if _page(boards, None if plain else board, output, runs, tasks, study, published):
-            return
+    _left_out(board.refused)
     if not board.sections:
-        raise UnknownNameError(
-            f"{runs} holds no results{f' of task {tasks[0]}' if tasks else ''} yet: qrlsuite run; "
-            "--published shows those that come with the suite"
-        )
+        raise _nothing(runs, tasks)
     if format_ is Format.csv:
         typer.echo(csv_rows(board.flat()), nl=False)
-        return
-    _write(board.sheets(explain, pairs), format_)
+    else:
+        _write(board.sheets(explain, pairs), format_)
+
+
+def _left_out(lines: Sequence[str]) -> None:
+    for line in lines:
+        typer.echo(f"left out: {line}", err=True)
+
+
+def _nothing(runs: Path, tasks: Sequence[str]) -> UnknownNameError:
+    return UnknownNameError(
+        f"{runs} holds no results{f' of task {tasks[0]}' if tasks else ''} yet: qrlsuite run; "
+        "--published shows those that come with the suite"
+    )
 
 
 def _write(sheets: Sequence[Sheet], format_: Format) -> None:
@@ -173,32 +174,3 @@ def _write(sheets: Sequence[Sheet], format_: Format) -> None:
         console = table_console(WIDE)
         for sheet in sheets:
             console.print(sheet)
-
-
-def _page(
-    boards: Sequence[Leaderboard],
-    beside: Leaderboard | None,
-    output: Path | None,
-    runs: Path,
-    tasks: Sequence[str],
-    study: str | None,
-    published: bool,
-) -> bool:
-    """Write the page, with the studies with looks of the tasks; returns whether there is anything to show."""
-    from qrlsuite.leaderboard import report  # its templates' engine, which other formats do without
-
-    sections = tuple(section for board in boards for section in board.sections)
-    held = tasks or (sorted({section.task for section in sections}) if study is not None else [])
-    studies, unreadable = published_studies.collected(runs, held, published)
-    for line in unreadable:
-        typer.echo(f"left out: {line}", err=True)
-    if not sections and not studies:
-        return False
-    path = output or runs / "leaderboard.html"
-    left_out = dict.fromkeys(
-        line for board in (*boards, *([beside] if beside else [])) for line in board.refused
-    )
-    shown = replace(boards[0], sections=sections, refused=(*left_out, *unreadable))
-    write_atomically(path, report.render(shown, studies=studies, beside=beside).encode())
-    typer.echo(f"wrote {path}")
-    return True

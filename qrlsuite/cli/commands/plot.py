@@ -13,14 +13,13 @@ from qrlsuite.cli.arguments import (
     EntryOption,
     HorizonOption,
     JsonOption,
-    MinSeedsOption,
     PublishedOption,
     RunsOption,
+    split_settings,
 )
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.pictures.compose import compose, settings_of, summaries
-from qrlsuite.options import parse_setting
+from qrlsuite.leaderboard.pictures.compose import compose, summaries
 from qrlsuite.results.store import write_atomically
 
 
@@ -35,6 +34,13 @@ class PlotCommand(TyperCommand):
 
 def plot(
     kind: Annotated[str, typer.Argument(help="What to draw; the kinds are listed below.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=VALUE]...",
+            help="Settings of the picture (`qrlsuite show picture KIND` lists them); environment.NAME: of the task.",
+        ),
+    ] = None,
     task: Annotated[
         list[str] | None,
         typer.Option(
@@ -44,19 +50,12 @@ def plot(
     ] = None,
     entry: EntryOption = None,
     horizon: HorizonOption = None,
-    min_seeds: MinSeedsOption = 1,
     seeds: Annotated[
         str | None,
         typer.Option(
             "--seeds",
-            help="Only these seeds of every entry, 30 or 0:30: the sample complexity of 30 runs is another quantity "
-            "than that of 100.",
-        ),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="A setting of the picture; environment.NAME: of the task."
+            help="Only these seeds of every entry, 30 or 0:30, and no entry that lacks one: the sample complexity of "
+            "30 runs is another quantity than that of 100.",
         ),
     ] = None,
     output: Annotated[
@@ -66,9 +65,6 @@ def plot(
             help="png, pdf or svg; default: TASK-KIND.png, in the results folder where it shows results.",
         ),
     ] = None,
-    list_settings: Annotated[
-        bool, typer.Option("--settings", help="List the settings of this kind, and draw nothing.")
-    ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -78,12 +74,9 @@ def plot(
     All entries of a picture are cut to the shortest. An entry that ends before the others is left out, and named,
     unless --entry asks for it.
 
-    Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface --set style=3d;
-    qrlsuite plot trajectories --task beam6g --set environment.degree=5
+    Examples: qrlsuite plot bars --task beam6g --out bars.pdf; qrlsuite plot surface style=3d;
+    qrlsuite plot trajectories environment.degree=5 --task beam6g
     """
-    if list_settings:
-        _print_settings(kind, settings_of(kind, task or []), json_output)
-        return
     format_ = pictures.format_of(output)
     picture_settings, environment_settings = _split(settings or [])
     drawn = compose(
@@ -91,7 +84,6 @@ def plot(
         task or [],
         entry or [],
         horizon=horizon,
-        min_seeds=min_seeds,
         seeds=seeds,
         runs=runs,
         published=published,
@@ -110,27 +102,18 @@ def plot(
         typer.echo(f"wrote {path}")
 
 
-def _split(settings: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Divide `--set` words into the picture's settings and the environment's options."""
+def _split(words: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Divide `NAME=VALUE` words into the picture's settings and the environment's options."""
+    names, settings = split_settings(words)
+    if names:
+        raise OptionError(f"{names[0]}: write settings of the picture as NAME=VALUE")
     picture: dict[str, Any] = {}
     environment: dict[str, Any] = {}
-    for setting in map(parse_setting, settings):
-        if setting.side not in (None, "environment", "picture"):
+    for full_name, value in settings.items():
+        side, dot, name = full_name.rpartition(".")
+        if dot and side not in ("environment", "picture"):
             raise OptionError(
-                f"--set {setting.side}.{setting.name}: write {setting.name}=... for the picture or "
-                f"environment.{setting.name}=... for the task's environment"
+                f"{full_name}: write {name}=... for the picture or environment.{name}=... for the task's environment"
             )
-        (environment if setting.side == "environment" else picture)[setting.name] = setting.value
+        (environment if side == "environment" else picture)[name] = value
     return picture, environment
-
-
-def _print_settings(kind: str, rows: list[dict[str, Any]], json_output: bool) -> None:
-    if json_output:
-        typer.echo(json.dumps(rows))
-        return
-    typer.echo(
-        f"settings of '{kind}' (change with --set NAME=VALUE)" if rows else f"'{kind}' has no settings"
-    )
-    for row in rows:
-        typer.echo(f"  {row['name']} = {json.dumps(row['default'])}    {row['values']}")
-        typer.echo(f"      {row['description']}")

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from qrlsuite import options, registry, specs
+from qrlsuite.api.arguments import where_of
+from qrlsuite.api.training import resolve_entry, train_entry
 from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of
 from qrlsuite.cli.training import (
     BudgetOption,
@@ -18,16 +20,9 @@ from qrlsuite.cli.training import (
     SameOption,
     TrackOption,
     WorkersOption,
-    where_of,
 )
-from qrlsuite.engine import missing
-from qrlsuite.engine.display import RunDisplay
-from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.experiment.entry import resolve
+from qrlsuite.errors import OptionError
 from qrlsuite.notation import Written, parse_entry
-from qrlsuite.results.seeds import parse_seeds
-from qrlsuite.results.store import plugins_in
-from qrlsuite.training import trackers
 
 QUICK_SEEDS = 8
 QUICK_EPOCHS = 10
@@ -101,49 +96,33 @@ def run(
     Examples: qrlsuite run mlp width=16 --task beam6g --seeds 20; qrlsuite run --task beam6g --model vqc-pennylane
     --set qubits=6
     """
-    written = _written(entry or [], model, settings or [])
-    try:
-        resolved = resolve(task, _quick(written) if quick else written)
-    except UnknownNameError as error:
-        raise UnknownNameError(f"{error}{plugins_in(runs, str(error))}") from None
-    if track:
-        trackers.ask(track)
-    seed_numbers = parse_seeds(seeds) if seeds else list(range(QUICK_SEEDS)) if quick else None
-    last = epochs or (QUICK_EPOCHS if quick else None)
     where = where_of(engine, workers, device, fresh, same)
-    missing.check_budget(budget, where)
-    for line in missing.require_same_code(runs, [resolved], where):
-        typer.echo(line, err=True)
-    work = missing.find(runs, resolved, where, seed_numbers, last)
-    display = RunDisplay(work, where.workers, quiet=json_output)
-    if not json_output:
-        display.expected = missing.expected(work, where)
-    try:
-        outcome = missing.train(work, where, display, budget, confirmed=yes)
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None
-    if outcome.submitted is not None:
-        typer.echo(json.dumps({"submitted": outcome.submitted}) if json_output else outcome.submitted)
-        return
-    summary = missing.summarize(work)
+    done = train_entry(
+        resolve_entry(task, _written(entry or [], model, settings or [], quick), runs=runs),
+        where,
+        seeds or (QUICK_SEEDS if quick else None),
+        epochs or (QUICK_EPOCHS if quick else None),
+        budget,
+        track or (),
+        runs,
+        progress=not json_output,
+        confirmed=yes,
+    )
     if json_output:
-        typer.echo(json.dumps(summary))
-    else:
-        display.finished(summary)
+        typer.echo(json.dumps({"submitted": done.submitted} if done.submitted else done.summary()))
+    elif done.submitted is not None:
+        typer.echo(done.submitted)
 
 
-def _written(words: list[str], model: str | None, settings: list[str]) -> Written:
-    """Read the entry, given as arguments or by --model, and what --set adds."""
+def _written(words: list[str], model: str | None, settings: list[str], quick: bool) -> Written:
+    """Read the entry, given as arguments or by --model, and what --set and --quick add."""
     if bool(words) == (model is not None):
         problem = f"'{' '.join(words)}' and --model {model}: give one of them" if words else "name a model"
         raise OptionError(f"{problem}, for example: qrlsuite run mlp width=16 --task beam6g")
     text = " ".join(words) or str(model)
-    return parse_entry(text).given(settings=tuple(map(options.parse_setting, settings)))
-
-
-def _quick(written: Written) -> Written:
-    """Reduce the qubits of a circuit, unless they are written."""
-    names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, written.model).options))
-    if "qubits" not in names or any(setting.name == "qubits" for setting in written.settings):
+    written = parse_entry(text).given(settings=tuple(map(options.parse_setting, settings)))
+    if not quick or any(setting.name == "qubits" for setting in written.settings):
         return written
-    return written.given(settings=(options.Setting("model", "qubits", QUICK_QUBITS),))
+    names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, written.model).options))
+    fewer = (options.Setting("model", "qubits", QUICK_QUBITS),) if "qubits" in names else ()
+    return written.given(settings=fewer)

@@ -76,7 +76,7 @@ def runs(
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in table]
     typer.echo(lines[0])
     for line, entry_status in zip(lines[1:], statuses):
-        typer.echo("\n".join([line, *map(printable, _unfinished(entry_status.as_dict()))]))
+        typer.echo("\n".join([line, *map(printable, _unfinished(entry_status))]))
 
 
 @app.command("gc")
@@ -152,25 +152,11 @@ def _row(entry: EntrySurvey, now: float) -> tuple[str, ...]:
     )
 
 
-def _unfinished(row: dict[str, Any]) -> list[str]:
+def _unfinished(status: EntryStatus) -> list[str]:
     """Return a line for each group of an entry that has not finished."""
-    lines = []
-    if row["queue_problem"]:
-        lines.append(f"  the queue was not asked, seeds may have left it: {row['queue_problem']}")
-    for group in row["groups"]:
-        parts = [f"  {group['state']:<9}"]
-        parts += [f"seeds {format_seeds(group['seeds'])}"] if group["seeds"] else []
-        parts += [f"epoch {group['epoch']}/{group['epochs']}"] if group["epochs"] else []
-        parts += [str(group["phase"])] if group["phase"] and group["state"] == "running" else []
-        if isinstance(group["median_score"], int | float):
-            parts.append(f"median score {group['median_score']:.3f}")
-        if group["seconds_left"] is not None and group["state"] == "running":
-            parts.append(f"{duration(group['seconds_left'])} left")
-        parts += [group["where"]] if group["where"] != "nobody" else []
-        parts += ["continued by the same `qrlsuite run`"] if group["state"] == "stopped" else []
-        parts += [str(group["error"])] if group["error"] else []
-        lines.append("  ".join(parts))
-    return lines
+    problem = status.queue_problem
+    silent = [f"the queue was not asked, seeds may have left it: {problem}"] if problem else []
+    return [f"  {line}" for line in (*silent, *(group.text for group in status.groups))]
 
 
 def _collect_garbage(folder: Path, task: str | None, yes: bool, json_output: bool) -> None:

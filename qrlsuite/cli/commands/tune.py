@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 
+from qrlsuite.api.arguments import where_of
+from qrlsuite.api.training import plan_tuning
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.cli.training import (
     DeviceOption,
@@ -17,14 +19,11 @@ from qrlsuite.cli.training import (
     FreshOption,
     SameOption,
     WorkersOption,
-    where_of,
 )
 from qrlsuite.engine.terminal import command, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.notation import write_setting
 from qrlsuite.results.text import hours_text
-from qrlsuite.tuning import runner, search
-from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.search import Search
 
 LARGE = 200
@@ -121,31 +120,28 @@ def tune(
 
     Example: qrlsuite tune "mlp width=16" "vqc-native qubits=6" --task beam6g
     """
-    requests = search.read_requests(
-        task, entries, vary or (), sampler, search.tuning_seeds(seeds), epochs, objective.value, budget
-    )
-    path = search.preset_path(out, requests)
-    searches = runner.build(requests, runs)
     where = where_of(engine, workers, device, fresh, same)
-    display = TuneDisplay(searches, where, quiet=json_output)
-    display.begin()
-    if dry_run:
-        if json_output:
-            content = {"searches": [search.as_dict(each) for each in searches], "complete": False}
-            typer.echo(json.dumps(content))
-        return
-    if not yes and budget is None:
+    tuning = plan_tuning(
+        task,
+        entries,
+        vary,
+        sampler,
+        seeds,
+        epochs,
+        objective.value,
+        budget,
+        out,
+        where,
+        runs,
+        progress=not json_output,
+    )
+    searches = tuning.searches
+    if not (dry_run or yes or budget):
         _require_few(searches)
-    try:
-        complete = runner.run(searches, runs, where, display, path)
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+    complete = not dry_run and tuning.run()
     if json_output:
-        rows = [
-            {**search.as_dict(each), "preset": None if each.written is None else str(each.written)}
-            for each in searches
-        ]
-        typer.echo(json.dumps({"searches": rows, "complete": complete}))
+        typer.echo(json.dumps({"searches": [each.as_dict() for each in searches], "complete": complete}))
+    if json_output or dry_run:
         return
     _report(searches, runs, complete)
     if not complete and not any(each.trials or each.pending for each in searches):

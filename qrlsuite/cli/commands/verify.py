@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from qrlsuite.api.publishing import find_published, read_rerun
 from qrlsuite.cli.arguments import JsonOption
 from qrlsuite.engine.terminal import printable
-from qrlsuite.errors import OptionError, QrlSuiteError
-from qrlsuite.leaderboard.shelf import published, published_studies
 from qrlsuite.leaderboard.shelf import verify as checks
-from qrlsuite.leaderboard.shelf.changed import changed
 from qrlsuite.results.progress import Progress as RunProgress
 
 
@@ -32,17 +30,10 @@ def verify(
         typer.Option(
             "--rerun",
             metavar="N|auto",
-            help="Seeds of each entry to train again; auto: as many as find a tenth forged with probability .95.",
+            help="Seeds of each entry to train again; auto: as many as find a tenth forged with probability .95. '2 "
+            "choice=31' trains those of an earlier check again, by the number that it printed; proves nothing anew.",
         ),
     ] = "0",
-    choice: Annotated[
-        int | None,
-        typer.Option(
-            "--choice",
-            min=0,
-            help="The number that an earlier check printed, to train the same seeds again; proves nothing anew.",
-        ),
-    ] = None,
     base: Annotated[
         str | None,
         typer.Option(
@@ -69,18 +60,12 @@ def verify(
 
     Example: qrlsuite verify leaderboard/entries --rerun 2
     """
-    if base is not None and paths:
-        raise OptionError("give PATH or --base, not both")
-    given = list(paths or published.folders())
-    study_folders = [path for path in given if published_studies.is_published(path)]
-    if base is not None:
-        given, study_folders = changed(base, Path.cwd())
-    folders = [folder for path in given for folder in checks.find(path)]
-    checked_studies = [_study(folder) for folder in study_folders]
+    wanted, choice = read_rerun(rerun)
+    found = find_published(paths or [], base)
+    checked_studies = found.read_studies()
     if not json_output:
         for study in checked_studies:
             _say(study["ok"], study["study"], study["message"])
-    wanted = _wanted(rerun)
     verdicts = []
     with Progress(
         TextColumn("{task.description}"),
@@ -89,8 +74,8 @@ def verify(
         console=Console(stderr=True),
         transient=True,
     ) as bar:
-        whole = bar.add_task("", total=len(folders))
-        for index, folder in enumerate(folders):
+        whole = bar.add_task("", total=len(found.entries))
+        for index, folder in enumerate(found.entries):
 
             def report(progress: RunProgress, index: int = index) -> None:
                 bar.update(whole, completed=index + progress.epoch / max(1, progress.epochs))
@@ -104,7 +89,7 @@ def verify(
                 _say(verdicts[-1].ok, verdicts[-1].name, _message(verdicts[-1]))
     if json_output:
         typer.echo(json.dumps({"entries": [v.as_dict() for v in verdicts], "studies": checked_studies}))
-    elif base is not None and not folders:
+    elif base is not None and not found.entries:
         typer.echo(f"no entry differs from {printable(base)}")
     else:
         good = sum(verdict.ok for verdict in verdicts)
@@ -117,33 +102,8 @@ def _say(ok: bool, name: str, message: str) -> None:
     typer.echo(f"{'ok    ' if ok else 'FAILED'} {printable(f'{name}: {message}')}")
 
 
-def _study(folder: Path) -> dict[str, Any]:
-    """Read a published study, and say what is wrong with it."""
-    try:
-        outcome = published_studies.read(folder)
-    except QrlSuiteError as error:
-        return {"study": folder.name, "folder": str(folder), "ok": False, "message": str(error)}
-    message = f"study sound: {len(outcome.pairs)} pairs, its verdicts computed again"
-    return {"study": folder.name, "folder": str(folder), "ok": True, "message": message}
-
-
-def _wanted(rerun: str) -> checks.Wanted:
-    """Read --rerun.
-
-    Raises
-    ------
-    OptionError
-        If it is neither a whole number nor `auto`.
-    """
-    if rerun == "auto":
-        return "auto"
-    if not rerun.isdecimal():
-        raise OptionError(f"--rerun {rerun}: write a number of seeds, such as --rerun 26, or --rerun auto")
-    return int(rerun)
-
-
 def _message(result: checks.VerificationResult) -> str:
     """Return an entry's message, with the word for what passed, and what is needed to train the same seeds again."""
     word = f"{result.check}: " if result.ok and result.seeds else ""
-    again = "" if result.choice is None else f" [files {result.digest}; --choice {result.choice}]"
+    again = "" if result.choice is None else f" [files {result.digest}; choice={result.choice}]"
     return f"{word}{result.message}{again}"

@@ -1,0 +1,216 @@
+"""How many seeds, and core-hours, it takes to find a difference; simulated from the seeds of one or two entries."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from qrlsuite.api.arguments import several
+from qrlsuite.api.entries import load
+from qrlsuite.engine.sheet import Sheet
+from qrlsuite.engine.terminal import Shown
+from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.leaderboard.boards import ranked
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results import speed
+from qrlsuite.results.speed import BASES
+from qrlsuite.results.store import EntryStore
+from qrlsuite.results.text import hours_text
+from qrlsuite.statistics import MIN_RUNS, LearningCurves, SmoothedRuns
+from qrlsuite.statistics.curves import common_horizon
+from qrlsuite.statistics.planning import LADDER, Need, runs_needed, runs_to_detect
+from qrlsuite.statistics.times import mean_time
+
+SLOWER = (0.10, 0.25, 0.50)
+POWERS = (0.8, 0.9)
+
+
+@dataclass(frozen=True, repr=False)
+class SeedsNeeded(Shown):
+    """How many seeds find differences.
+
+    Attributes
+    ----------
+    entries:
+        The one or two from whose seeds pairs were simulated.
+    horizon:
+        Environment steps.
+    needs:
+        For each difference and power one row of plain values.
+    basis:
+        What the core-hours rest on.
+    draws:
+        Simulated pairs of each row.
+    """
+
+    entries: tuple[EntryResults, ...]
+    horizon: int
+    needs: tuple[dict[str, Any], ...]
+    basis: str
+    draws: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "task": self.entries[0].task,
+            "entries": [
+                {"entry": entry.name, "label": entry.label, "seeds": len(entry.seeds)}
+                for entry in self.entries
+            ],
+            "horizon": self.horizon,
+            "draws": self.draws,
+            "core_hours_basis": self.basis,
+            "needs": list(self.needs),
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Show a row for each difference and power, and what they rest on."""
+        heads = ("difference", "power", "seeds, all at once", "seeds with looks: mean (most)", "its looks")
+        rows, before = [], None
+        for need in self.needs:
+            shown = "" if need["difference"] == before else need["difference"]
+            before = need["difference"]
+            rows.append((shown, f"{need['power']:g}", *_cells(need)))
+        yield Sheet.of("", heads, rows, words=("difference", "its looks"))
+        pilots = " and ".join(f"{len(entry.seeds)} seeds of {entry.label}" for entry in self.entries)
+        error = 100 * (0.8 * 0.2 / self.draws) ** 0.5
+        known = any(need["fixed_core_hours"] or need["mean_core_hours"] for need in self.needs)
+        yield Text(
+            f"Seeds of each of the two entries, with the core-hours of both. Simulated from {pilots},\n"
+            f"{self.horizon} steps, {self.draws} pairs per line (power to within {error:.0f} points or so)."
+        )
+        if min(len(entry.seeds) for entry in self.entries) < MIN_RUNS:
+            yield Text(f"Fewer than {MIN_RUNS} seeds are a weak pilot: rare failures may be missing from it.")
+        yield Text(f"Core-hours: {self.basis}." if known else f"Core-hours are {self.basis}.")
+
+
+def seeds_needed(
+    first: str,
+    second: str | None = None,
+    *,
+    task: str | None = None,
+    draws: int = 200,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+    progress: bool = True,
+) -> SeedsNeeded:
+    """Simulate how many seeds find that another entry is 10, 25 or 50 percent slower than this one.
+
+    Of two entries, also how many find the difference between them. Pairs are judged by rule `times` at alpha = .05:
+    all seeds at once, and with looks.
+
+    Parameters
+    ----------
+    first, second:
+        Entries with two seeds or more.
+    task, runs, published:
+        As for `load`.
+    draws:
+        Simulated pairs of each row.
+
+    Raises
+    ------
+    UnknownNameError
+        If an entry is unknown.
+    OptionError
+        If an entry has a single seed, or they are of different tasks.
+    """
+    names = several(first) if second is None else (first, second)
+    entries = [load(name, task=task, runs=runs, published=published) for name in names]
+    for entry in entries:
+        if len(entry.seeds) < 2:
+            raise OptionError(f"'{entry.label}' has a single seed, which has no spread: train two or more")
+    if len({entry.task_hash for entry in entries}) > 1:
+        raise OptionError(
+            f"'{entries[0].label}' is of task {entries[0].task}, '{entries[1].label}' of {entries[1].task}"
+        )
+    curves = [ranked.learning_curves(entry) for entry in entries]
+    horizon = common_horizon(curves[0], curves[-1])
+    curves = [each.cut(horizon) for each in curves]
+    per_pair, basis = _core_hours(entries, curves, Path(runs))
+    console = Console(stderr=True, quiet=not progress, highlight=False)
+    rows = []
+    for title, job in _jobs(entries, curves, draws):
+        with console.status(Text(f"simulating: {title}")):
+            rows += [_row(title, need, per_pair) for need in job()]
+    return SeedsNeeded(tuple(entries), horizon, tuple(rows), basis, draws)
+
+
+def _jobs(
+    entries: Sequence[EntryResults], curves: Sequence[LearningCurves], draws: int
+) -> list[tuple[str, Callable[[], tuple[Need, ...]]]]:
+    """Return what is simulated: the difference between two entries, then fixed ones."""
+    ranking = ranked.ranking_of(entries)
+    grid = ranking.grid
+    bounds = (0.0, 1.0) if ranking.thresholds is None else None
+    pilots = [SmoothedRuns(each, bounds=bounds) for each in curves]
+    jobs: list[tuple[str, Callable[[], tuple[Need, ...]]]] = []
+    if len(entries) == 2:
+        order = sorted((0, 1), key=lambda index: mean_time(curves[index], grid).mean)
+        better, worse = (pilots[index] for index in order)
+        ratio = mean_time(worse.entry, grid).mean / max(1e-9, mean_time(better.entry, grid).mean) - 1
+        title = f"{entries[order[1]].label} against {entries[order[0]].label}: {100 * ratio:.0f}% slower"
+        jobs.append((title, functools.partial(runs_needed, better, worse, grid, POWERS, n_pairs=draws)))
+    for share in SLOWER:
+        detect = functools.partial(runs_to_detect, pilots[0], grid, share, powers=POWERS, n_pairs=draws)
+        jobs.append((f"{100 * share:.0f}% slower than {entries[0].label}", detect))
+    return jobs
+
+
+def _core_hours(
+    entries: Sequence[EntryResults], curves: Sequence[LearningCurves], runs: Path
+) -> tuple[float | None, str]:
+    """Return the core-hours of a seed of each of two entries together, None where unknown; and what that rests on."""
+    speeds = speed.known(runs)
+    total, bases = 0.0, []
+    for entry, learned in ((entries[0], curves[0]), (entries[-1], curves[-1])):
+        try:
+            estimate = speeds.estimate(EntryStore(entry.folder).entry(), None)
+        except StoreError:  # imported curves, or an entry of another version
+            return None, BASES["unknown"]
+        if estimate.seconds is None:
+            return None, BASES["unknown"]
+        total += estimate.seconds * learned.values.shape[1] / 3600
+        bases.append(f"{BASES[estimate.basis]}, to within a factor of {estimate.within:.3g}")
+    return total, "; ".join(dict.fromkeys(bases))
+
+
+def _row(title: str, need: Need, per_pair: float | None) -> dict[str, Any]:
+    """Return a need with its cost as plain values."""
+
+    def hours(seeds: float | None) -> float | None:
+        return None if seeds is None or per_pair is None else seeds * per_pair
+
+    mean, most = (need.mean_runs, need.looks[-1]) if need.looks else (None, None)
+    return {
+        "difference": title,
+        "power": need.power,
+        "fixed_seeds": need.fixed,
+        "fixed_core_hours": hours(need.fixed),
+        "looks": list(need.looks) or None,
+        "mean_seeds": mean,
+        "mean_core_hours": hours(mean),
+        "most_seeds": most,
+        "most_core_hours": hours(most),
+    }
+
+
+def _cells(need: dict[str, Any]) -> tuple[str, str, str]:
+    """Write seeds all at once and with looks, each with its core-hours; and the looks."""
+    fixed, mean = (
+        "" if need[key] is None else f", {hours_text(need[key])} h"
+        for key in ("fixed_core_hours", "mean_core_hours")
+    )
+    over = f"over {LADDER[-1]}"
+    at_once = over if need["fixed_seeds"] is None else f"{need['fixed_seeds']}{fixed}"
+    if not need["looks"]:
+        return at_once, over, ""
+    with_looks = f"{need['mean_seeds']:.0f} ({need['most_seeds']}){mean}"
+    return at_once, with_looks, ", ".join(map(str, need["looks"]))

@@ -1,0 +1,210 @@
+"""What `qrlsuite show` shows of whatever has a name, as plain values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qrlsuite import circuit, registry, specs
+from qrlsuite.circuit import drawing, export
+from qrlsuite.circuit.description import canonical
+from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
+from qrlsuite.errors import OptionError, UnknownNameError, nearest
+from qrlsuite.experiment import catalog, identity
+from qrlsuite.leaderboard import pictures, rules
+from qrlsuite.leaderboard.pictures import compose
+from qrlsuite.leaderboard.shelf import collect, published_studies
+from qrlsuite.leaderboard.shelf import published as published_entries
+from qrlsuite.results import codes, lookup
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import EntryStore, entries, write_atomically
+from qrlsuite.results.survey import outline
+
+if TYPE_CHECKING:
+    from qrlsuite.studies.outcome import StudyOutcome
+    from qrlsuite.studies.runner import Overview
+
+PICTURE = "picture"
+"""The one kind that nothing registers."""
+
+
+def describe(
+    name: str,
+    kind: str | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    code: bool = False,
+    out: Path | None = None,
+    format: str | None = None,
+    runs: str | PathLike[str] = "runs",
+    published: bool = False,
+) -> dict[str, Any] | Overview | StudyOutcome:
+    """Describe a registered thing, a picture, an entry or a study.
+
+    Parameters
+    ----------
+    name:
+        Of the thing; of an entry its label or folder, of a study its file or folder, too.
+    kind:
+        `model`, `ansatz`, ...; None looks among all.
+    settings:
+        Of an ansatz: its options, `qubits` and `layers`.
+    code:
+        Describe the code identity, and what it is taken of.
+    out, format:
+        Of an ansatz: a file for its drawing; the language of a program (`qasm3`, `qiskit`, `pennylane`).
+    runs, published:
+        As for `load`.
+
+    Returns
+    -------
+    dict or Overview or StudyOutcome
+        Of a study how far it is, as `read_study` returns it.
+
+    Raises
+    ------
+    UnknownNameError
+        If nothing or several things have the name.
+    OptionError
+        If settings, a file or a format are given that the thing cannot have.
+    """
+    folder = Path(runs)
+    of_ansatz = bool(settings or out or format)
+    among = [] if kind == PICTURE else [specs.kind(kind)] if kind else list(specs.KINDS.values())
+    if specs.StudySpec in among and (name.endswith(".toml") or published_studies.folder_of(name)):
+        among = [specs.StudySpec]
+    known = registry.load()
+    found = [each for each in among if name in known.of(each)]
+    if name.startswith("gym:") and specs.TaskSpec in among:
+        found = [specs.TaskSpec]
+    if specs.StudySpec in (*found[:1], *among[:1]) and len(found) < 2:
+        from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
+
+        return read_study(name, runs=folder, published=published)
+    if kind in (None, PICTURE) and not found and name in compose.summaries():
+        return compose.describe(name)
+    if not found and kind is None and (store := _stored(folder, name, published)):
+        return _code_of_entry(store) if code else _outline(store)
+    if not found:
+        names = [each for spec in among for each in known.of(spec)] or list(compose.summaries())
+        names += published_studies.names() if specs.StudySpec in among else []
+        more = "; --published looks among the published entries, too" if kind is None else ""
+        raise UnknownNameError(f"nothing called '{name}'{nearest(name, names)}{more}")
+    if len(found) > 1:
+        singulars = " or ".join(f"`show {each.kind} {name}`" for each in found)
+        raise UnknownNameError(f"'{name}' is several things; write {singulars}")
+    if of_ansatz and found != [specs.AnsatzSpec]:
+        raise OptionError(
+            f"{specs.title(found[0], name)}: NAME=VALUE, --out and --format draw an ansatz; options are changed where "
+            "they are used, as in `qrlsuite run --set NAME=VALUE`"
+        )
+    if found == [specs.AnsatzSpec]:
+        return _ansatz(name, settings or {}, code, out, format)
+    if code:
+        return _code_of_plugin(found[0], name)
+    content = catalog.describe(found[0], name)
+    return content | ({"promises": rules.load(name).promise} if found[0] is specs.RuleSpec else {})
+
+
+def _ansatz(
+    name: str, settings: Mapping[str, Any], code: bool, out: Path | None, format: str | None
+) -> dict[str, Any]:
+    """Describe an ansatz with its drawing and resources; as a program, or its code, where these are asked for."""
+    picture_format = pictures.format_of(out, "--out")
+    if "name" in settings:
+        raise OptionError(f"ansatz '{name}': name: no option of that name")
+    drawn = circuit.ansatz(name, **{"qubits": 4, "layers": 2, **settings})
+    if code:
+        return {"circuit text": canonical(drawn), **identity.of_registered(specs.AnsatzSpec, name, drawn)}
+    if format is not None:
+        return {"format": format, "text": export.export(drawn, format)}
+    content = catalog.describe(specs.AnsatzSpec, name) | {"resources": {}}
+    for resource, count in dataclasses.asdict(drawing.resources(drawn)).items():
+        content["resources"][resource] = count
+        if resource == "parameters":
+            rank = jacobian_rank(drawn)
+            text = f"not computed where gates connect more than {LARGEST_RANK} qubits"
+            content["resources"]["jacobian_rank"] = text if rank is None else rank
+    if out is not None:
+        write_atomically(out, pictures.encode(drawing.draw_figure(drawn), picture_format))
+        content["figure"] = str(out)
+    return content | {"drawing": str(drawing.draw_text(drawn))}
+
+
+def _code_of_plugin(kind: type[specs.Spec], name: str) -> dict[str, Any]:
+    """Return what a registered thing adds to the identity of an entry: its files or `numerics`.
+
+    Raises
+    ------
+    OptionError
+        If it computes nothing of an entry.
+    """
+    if not issubclass(kind, specs.NumericSpec):
+        raise OptionError(f"{specs.title(kind, name)} computes nothing of an entry, and has no code identity")
+    return dict(identity.of_registered(kind, name, None))
+
+
+def _stored(runs: Path, name: str, published: bool) -> EntryStore | None:
+    """Find an entry by its folder, or by what it is called in the results folder; None where nothing fits.
+
+    Raises
+    ------
+    UnknownNameError
+        If several fit, or none of the published ones does.
+    """
+    if (Path(name) / "entry.json").exists():
+        return EntryStore(Path(name))
+    if published:
+        return EntryStore(collect.find(runs, name, published).folder)
+    if not runs.is_dir():
+        return None
+    stored = lookup.stored(entries(runs))
+    try:
+        return lookup.choose(stored, name, runs).store
+    except UnknownNameError:
+        if any(lookup.mentions(entry, name) for entry in stored):
+            raise
+        return None
+
+
+def _outline(store: EntryStore) -> dict[str, Any]:
+    """Return an entry's options and how it was made; a published one has no folders of seeds, but says it itself."""
+    content = outline(store)
+    if not published_entries.is_published(store.path):
+        return content
+    made = published_entries.read(store.path)
+    said = made.record["published"]
+    return content | {
+        "seeds": len(made.seeds),
+        "provenance": said["provenance"],
+        "parameters": said["parameters"],
+    }
+
+
+def _code_of_entry(store: EntryStore) -> dict[str, Any]:
+    """Return the steps from an entry's code to its identity, and with which identities its seeds were trained."""
+    entry = store.entry()
+    now, drawn = identity.of(entry), identity.circuit_of(entry)
+    return {
+        "label": entry.label,
+        **({} if drawn is None else {"circuit": canonical(drawn)}),
+        "parts": {f"{part['role']} {part['name']}": dict(part) for part in now.parts},
+        "text": now.text,
+        "digest": now.digest,
+        "seeds": _codes_of_seeds(store),
+    }
+
+
+def _codes_of_seeds(store: EntryStore) -> dict[str, list[str]]:
+    """Return the digests of the code of an entry's seeds, or of its record where it is published."""
+    if published_entries.is_published(store.path):
+        made = published_entries.read(store.path)
+        code = codes.read(made.record, store.path / "entry.json")
+        return {format_seeds(made.seeds): ["not recorded" if code is None else code.digest]}
+    return {
+        format_seeds(group.seeds): [digest or "not recorded" for digest in group.codes]
+        for group in codes.of_seeds(store)
+    }
