@@ -68,6 +68,24 @@ def quantum_parameters(module: nn.Module) -> set[str]:
     return set() if declared is None else set(declared())
 
 
+def remembers(module: nn.Module) -> int:
+    """Return how many numbers a module, or each agent of a population, remembers from step to step; 0 for most.
+
+    A module that remembers has an attribute `remembers`, a whole number M. `forward(x, state)` then returns outputs
+    (B, out) and the next state (B, M) for x (B, in) and the state so far (B, M), which is 0 where an episode begins.
+    `forward(x)` returns the outputs alone, those of an episode's first step.
+    """
+    return int(getattr(module, "remembers", 0))
+
+
+def remember(population: nn.Module, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Return outputs (S, B, out) and the next state (S, B, M) for x (S, B, in); without a memory M is 0."""
+    if not remembers(population):
+        return population(x), state
+    outputs, after = population(x, state)
+    return outputs, after
+
+
 def learning_rates(module: nn.Module) -> dict[str, float]:
     """Return a module's factors on its learning rates by the name of a parameter: its `learning_rates()`, else none.
 
@@ -160,6 +178,7 @@ class StackedPopulation(nn.Module):
         self._size = len(modules)
         self._quantum = frozenset(quantum_parameters(first))
         self._rates = learning_rates(first)
+        self.remembers = remembers(first)
         self._vmap = vmap
         holder = copy.deepcopy(first)
         for name, _ in list(holder.named_parameters()):
@@ -185,12 +204,13 @@ class StackedPopulation(nn.Module):
         """Return the factors on learning rates, see the function of that name."""
         return dict(self._rates)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (S, B, in) to (S, B, out)."""
-        state = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
+        """Map (S, B, in) to (S, B, out); with a state (S, B, M), return the next one, too (see `remembers`)."""
+        own = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+        inputs = (x,) if state is None else (x, state)
         if self._vmap:
             try:
-                return torch.vmap(self._call)(state, x)
+                return torch.vmap(self._call)(own, *inputs)
             except RuntimeError as error:
                 if _NOT_VMAPPABLE.search(str(error)) is None:  # the module's own, or memory is exhausted
                     raise
@@ -199,11 +219,16 @@ class StackedPopulation(nn.Module):
                 self.problem = (
                     f"cannot be run by torch.vmap, so its agents are computed one by one, slowly: {reason}"
                 )
-        return torch.stack([self._call({k: v[s] for k, v in state.items()}, x[s]) for s in range(self._size)])
+        results = [
+            self._call({k: v[s] for k, v in own.items()}, *(each[s] for each in inputs))
+            for s in range(self._size)
+        ]
+        if state is None:
+            return torch.stack(results)
+        return tuple(torch.stack(part) for part in zip(*results))
 
-    def _call(self, state: Mapping[str, Tensor], x: Tensor) -> Tensor:
-        result: Tensor = torch.func.functional_call(self.__dict__["_skeleton"], dict(state), (x,))
-        return result
+    def _call(self, state: Mapping[str, Tensor], *inputs: Tensor) -> Any:
+        return torch.func.functional_call(self.__dict__["_skeleton"], dict(state), inputs)
 
 
 _NOT_VMAPPABLE = re.compile(

@@ -10,7 +10,7 @@ from qrlsuite.specs import AlgorithmSpec
 
 @hookimpl
 def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
-    """Register `ddqn`, `ppo`, `reinforce`, `sac` and `td3`."""
+    """Register `ddqn`, `drqn`, `ppo`, `reinforce`, `sac` and `td3`."""
     register(
         AlgorithmSpec(
             name="ddqn",
@@ -18,6 +18,15 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
             options="qrlsuite.plugins.algorithms.ddqn:DDQNOptions",
             factory="qrlsuite.plugins.algorithms.ddqn:DDQN",
             memory="qrlsuite.plugins.algorithms.ddqn:memory",
+        )
+    )
+    register(
+        AlgorithmSpec(
+            name="drqn",
+            summary="Deep recurrent Q-learning: double Q-learning on sequences, for models that remember",
+            options="qrlsuite.plugins.algorithms.drqn:DRQNOptions",
+            factory="qrlsuite.plugins.algorithms.drqn:DRQN",
+            memory="qrlsuite.plugins.algorithms.drqn:memory",
         )
     )
     register(

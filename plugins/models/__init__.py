@@ -22,7 +22,7 @@ MEMORY = {
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier` and the `vqc-*` models."""
+    """Register `mlp`, `fourier`, `gru` and the `vqc-*` models."""
     register(
         ModelSpec(
             name="mlp",
@@ -43,6 +43,16 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             build="qrlsuite.plugins.models.fourier:build",
             population="qrlsuite.plugins.models.fourier:population",
             memory="qrlsuite.plugins.models.fourier:memory",
+        )
+    )
+    register(
+        ModelSpec(
+            name="gru",
+            summary="Gated recurrent unit, a network that remembers; options: width, input_scale",
+            family="classical",
+            options="qrlsuite.plugins.models.gru:GRUOptions",
+            build="qrlsuite.plugins.models.gru:build",
+            memory="qrlsuite.plugins.models.gru:memory",
         )
     )
     for backend, summary in CIRCUITS.items():

@@ -147,9 +147,9 @@ class World:
     make: Callable[[int], LaneEnv]
 
     @classmethod
-    def toy(cls, kind: str) -> World:
+    def toy(cls, kind: str, hidden: bool = False) -> World:
         """Return the toy with a kind of actions."""
-        return cls(lambda lanes: Toy(lanes, kind))
+        return cls(lambda lanes: Toy(lanes, kind, hidden))
 
     @classmethod
     def of_task(cls, name: str) -> World:
@@ -191,6 +191,22 @@ class _Linear(nn.Module):
         return population.linear(x, self.weight, self.bias)
 
 
+class _Remembering(nn.Module):
+    """A population of layers that see the mean of an episode's observations so far, the last half of it."""
+
+    def __init__(self, outputs: int, inputs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__()
+        self.remembers = inputs
+        self.layer = _Linear(outputs, 2 * inputs, generators)
+
+    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
+        """Map (S, B, inputs), and what is remembered (S, B, inputs), to (S, B, outputs) and what is remembered."""
+        before = torch.zeros_like(x) if state is None else state
+        after = 0.5 * before + 0.5 * x
+        outputs = self.layer(torch.cat([x, before], 2))
+        return outputs if state is None else (outputs, after)
+
+
 class ToyGroup:
     """An algorithm with a group of seeds, as the core runs it."""
 
@@ -212,6 +228,7 @@ class ToyGroup:
         self.envs.seed_lanes([s.numpy("environment", e) for s in self.streams for e in range(lanes)])
         self.outputs: list[int] = []
         factory = specs.resolve(spec.factory)
+        self._memory = asks_for_more(getattr(factory, "act", len))
         own = subject.options() if options is None else options
         self.algorithm = factory(self.envs, self._model, own, self.streams, torch.device("cpu"))
 
@@ -226,7 +243,9 @@ class ToyGroup:
         call = len(self.outputs)
         self.outputs.append(outputs)
         given = self.world.inputs if inputs is None else inputs
-        return _Linear(outputs, given, [s.torch("init", call) for s in self.streams])
+        generators = [s.torch("init", call) for s in self.streams]
+        model = _Remembering if self._memory else _Linear
+        return model(outputs, given, generators)
 
     def start(self) -> ToyGroup:
         """Begin."""

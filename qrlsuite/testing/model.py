@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
 import math
 from collections.abc import Iterator, Sequence
@@ -58,27 +59,48 @@ class Subjects:
 
     def agent(self, seed: int, options: Any = None) -> nn.Module:
         """Return one agent, from a generator of that seed."""
+        return self._told(self._raw(seed, options))
+
+    def _raw(self, seed: int, options: Any = None) -> nn.Module:
         own = self.options if options is None else options
         with seeded(seed):  # as `run` builds it
             return self.make(own, torch.Generator().manual_seed(seed))
+
+    @functools.cached_property
+    def remembered(self) -> int:
+        """How many numbers an agent remembers from step to step."""
+        return populations.remembers(self._raw(0))
+
+    def _told(self, module: nn.Module) -> nn.Module:
+        """Let a module that remembers take its state behind the inputs, and return the next one behind the outputs."""
+        if not self.remembered:
+            return module
+        inputs, forward = self.inputs, type(module).forward
+
+        def told(self: nn.Module, x: Tensor) -> Tensor:
+            return torch.cat(forward(self, x[..., :inputs], x[..., inputs:]), -1)
+
+        module.__class__ = type(type(module).__name__, (type(module),), {"forward": told})
+        return module
 
     def make(self, options: Any, generator: torch.Generator) -> nn.Module:
         """Return one agent from a generator."""
         return build_agent(self.build, self.inputs, OUT, options, generator, self.space)
 
     def x(self, *lead: int, seed: int = 0, batch: int = B) -> Tensor:
-        """Return inputs (*lead, batch, inputs)."""
-        drawn = torch.rand(*lead, batch, self.inputs, generator=torch.Generator().manual_seed(seed))
+        """Return inputs (*lead, batch, inputs), and what is remembered behind them."""
+        size = self.inputs + self.remembered
+        drawn = torch.rand(*lead, batch, size, generator=torch.Generator().manual_seed(seed))
         return drawn * 2 - 1
 
     def population(self, seeds: Sequence[int], options: Sequence[Any] | None = None) -> nn.Module:
         """Return a population of freshly built agents, each with options of its own where these are given."""
         own = [self.options] * len(seeds) if options is None else options
-        agents = [self.agent(*each) for each in zip(seeds, own)]
+        agents = [self._raw(*each) for each in zip(seeds, own)]
         if self.spec.population is None:
-            return populations.stack(agents)
+            return self._told(populations.stack(agents))
         population: nn.Module = specs.resolve(self.spec.population)(agents, populations.joined(own))
-        return population
+        return self._told(population)
 
 
 def check(subject: Subject, task: str | None = None) -> list[Finding]:
@@ -160,7 +182,7 @@ def _shapes(subjects: Subjects) -> None:
         values = agent(subjects.x()[:batch])
         require(isinstance(values, Tensor), f"forward returned {type(values).__name__}, not a tensor")
         require(
-            tuple(values.shape) == (batch, OUT),
+            tuple(values.shape) == (batch, OUT + subjects.remembered),
             f"forward maps ({batch}, {subjects.inputs}) to {tuple(values.shape)}, and it must give ({batch}, {OUT}): "
             "the last layer has as many outputs as there are actions, and the batch comes first",
         )
@@ -211,7 +233,10 @@ def _registered(subjects: Subjects) -> None:
 def _unregistered(subjects: Subjects) -> None:
     try:
         unregistered.require_none(
-            subjects.agent, subjects.inputs, subjects.spec.name, subjects.spec.population is None
+            subjects.agent,
+            subjects.inputs + subjects.remembered,
+            subjects.spec.name,
+            subjects.spec.population is None,
         )
     except PluginError as error:
         raise BrokenRuleError(str(error)) from None
@@ -420,7 +445,7 @@ def _population(subjects: Subjects) -> None:
     together, x = subjects.population(range(S)), subjects.x(S)
     values = together(x)
     require(
-        tuple(values.shape) == (S, B, OUT),
+        tuple(values.shape) == (S, B, OUT + subjects.remembered),
         f"the population maps ({S}, {B}, {subjects.inputs}) to {tuple(values.shape)}, and it must give "
         f"({S}, {B}, {OUT})",
     )

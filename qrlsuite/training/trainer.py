@@ -118,6 +118,19 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
     )
 
 
+def _that_remember(model: str) -> str:
+    """Say which algorithms train a model that remembers."""
+    known = registry.load()
+    found = [
+        name
+        for name in known.names(specs.AlgorithmSpec)
+        if asks_for_more(getattr(specs.resolve(registry.get(specs.AlgorithmSpec, name).factory), "act", len))
+    ]
+    return (
+        f"take one of {', '.join(found)}: qrlsuite run '{found[0]} {model}'" if found else "no algorithm does"
+    )
+
+
 class _FirstNetwork(Exception):
     """The sizes of the first network that an algorithm asks for."""
 
@@ -468,6 +481,11 @@ class Trainer:
             own_options = population.joined([each.algorithm_options for each in entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
         self._informed = asks_for_more(self.algorithm.act)
+        if not self._informed and any(population.remembers(module) for module in self.models.built):
+            raise OptionError(
+                f"model '{entry.model.name}' remembers what it saw in an episode, and algorithm "
+                f"'{entry.algorithm.name}' would make it forget: {_that_remember(entry.model.name)}"
+            )
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:

@@ -14,7 +14,7 @@ from qrlsuite import registry, specs
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.testing.group import Toy
-from qrlsuite.training.trainer import Trainer
+from qrlsuite.training.trainer import Trainer, asks_for_more
 from tests.algorithms.worlds import Contexts, Group
 from tests.conftest import results
 
@@ -23,6 +23,7 @@ COUNTED = {
     "ddqn": ((), 1, (387, 0), (17, 12)),  # its target network is a copy
     "ppo": ((), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
     "reinforce": ((), 1, (387, 0), (17, 12)),
+    "drqn": ((), 1, (387, 0), (17, 12)),
     "sac": ((), 3, (387 * 3, 0), (17 + 2 * 17, 12 * 3)),
     "reinforce with a value network": (("baseline=value",), 2, (387 + 353, 0), (17 + 11, 12 + 12)),
 }
@@ -30,6 +31,7 @@ COUNTED = {
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "ddqn": [{"buffer": 50, "batch": 16, "target_steps": 4}],
     "ppo": [{"batch": 8, "repeats": 2}, {"batch": 64, "repeats": 3, "validation": "sampled"}],
+    "drqn": [{"buffer": 40, "batch": 7, "length": 3, "burn_in": 2, "target_steps": 4}],
     "sac": [{"buffer": 50, "batch": 7, "warm_up": 12}],
     "td3": [{"buffer": 50, "batch": 7, "warm_up": 12, "updates": 2}],
     "reinforce": [{"baseline": b, "memory": m} for b, m in (("none", 4), ("mean", 90), ("value", 12))],
@@ -82,7 +84,8 @@ def trained(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) 
 
 def actions(made: Group) -> NDArray[Any]:
     observations = [s.numpy("test").random((11, 4)).astype(np.float32) for s in made.streams]
-    chosen: NDArray[Any] = made.algorithm.act(np.stack(observations))
+    more = (np.ones((len(made.streams), 11), np.bool_), {}) if asks_for_more(made.algorithm.act) else ()
+    chosen: NDArray[Any] = made.algorithm.act(np.stack(observations), *more)
     return chosen
 
 
