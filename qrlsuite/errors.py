@@ -49,7 +49,7 @@ def listed(names: Sequence[str], most: int = 20) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return `"; did you mean 'x'?"` for the closest known name, else the list of what there is.
+    """Return `"; did you mean 'x'?"` for the closest known name, the first of several, else the list of what there is.
 
     Parameters
     ----------
@@ -59,7 +59,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
         Every name that would have been accepted.
     """
     names = sorted(set(known))
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     if close:
-        return f"; did you mean '{close[0]}'?"
+        best = difflib.SequenceMatcher(None, close[0], name).ratio()
+        equal = [each for each in close if difflib.SequenceMatcher(None, each, name).ratio() == best]
+        return f"; did you mean '{min(equal)}'?"
     return f"; known: {listed(names)}" if names else "; none is registered"
