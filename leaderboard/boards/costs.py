@@ -19,6 +19,7 @@ import numpy as np
 
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import listed
+from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.boards.ranked import Complexity, cell_text, complexity_at, ranking_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import collect
@@ -280,7 +281,7 @@ class CostSection:
 
     def notes(self) -> list[str]:
         """Explain the columns, and the marks that occur."""
-        lines = []
+        lines = tables.external_entries([row.entry for row in self.rows])
         if self.compared is not None:
             lines.append(
                 f"rank: by significant outperformance, within {self.unit.text(self.budget)} {self.unit.name}, which is "

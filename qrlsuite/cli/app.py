@@ -63,7 +63,9 @@ BUILT_IN = {
         ),
         LazyCommand("play", "Show an episode of a trained agent.", f"{_ROOM}.play:play"),
         LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
-        LazyCommand("import", "Take over seeds trained elsewhere.", f"{_ROOM}.import_:import_entries"),
+        LazyCommand(
+            "import", "Take over seeds and curves made elsewhere.", f"{_ROOM}.import_:import_entries"
+        ),
         LazyCommand(
             "export",
             "Write entries to publish on a leaderboard.",

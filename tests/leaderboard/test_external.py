@@ -81,6 +81,9 @@ def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
     assert "curves that other programs made, and nobody here can train or check again: external fast" in board
     [fast] = [line for line in board.splitlines() if "fast lr=0.1" in line and "█" in line]
     assert fast.split()[-4:] == ["20", "-", "-", "-"]  # seeds, core-hours, parameters, settings
+    for by in ("score", "area", "core-hours"):
+        other = qrlsuite("leaderboard", "--by", by, "--explain").output
+        assert "curves that other programs made" in other, by
     rows = json.loads(qrlsuite("leaderboard", "--format", "json").output)["sections"][0]["rows"]
     assert [row["external"] for row in rows] == [True, True]
     assert "external fast" in qrlsuite("runs").output
