@@ -57,6 +57,8 @@ class GymLanes(LaneEnv):
         Keyword arguments of `gymnasium.make`.
     normalization, low, high:
         See `qrlsuite.normalization.Normalization`; for boxes, and a Dict or Tuple, only.
+    observe:
+        Places of the flattened values that are shown, in this order; None shows all.
 
     Raises
     ------
@@ -73,6 +75,7 @@ class GymLanes(LaneEnv):
         normalization: Kind = "none",
         low: Sequence[float] | None = None,
         high: Sequence[float] | None = None,
+        observe: Sequence[int] | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
@@ -80,6 +83,9 @@ class GymLanes(LaneEnv):
         keywords = dict(arguments or {})
         first = make(env_id, keywords)
         self._action_space, self._raw_space, flat = _supported(env_id, first)
+        self._shown = None if observe is None else _places(env_id, observe, flat)
+        if self._shown is not None:
+            flat = spaces.Box(flat.low[self._shown], flat.high[self._shown], dtype=np.float32)
         if normalization != "none" and not isinstance(
             self._raw_space, spaces.Box | spaces.Dict | spaces.Tuple
         ):
@@ -91,7 +97,7 @@ class GymLanes(LaneEnv):
         self.running_statistics = normalization == "running"
         self.envs = [first, *(make(env_id, keywords) for _ in range(num_envs - 1))]
         batched_spaces(self, self._normalize.space, action_spaces.from_zero(self._action_space), num_envs)
-        self.unflattened_space = self._raw_space
+        self.unflattened_space = self._raw_space if observe is None else None
         limit = first.spec.max_episode_steps if first.spec is not None else None
         self.capacity = int(limit or UNLIMITED)
         self.streams = []
@@ -305,12 +311,32 @@ class GymLanes(LaneEnv):
     def _flat(self, observation: Any) -> NDArray[Any]:
         """Return one observation as (n,)."""
         if isinstance(self._raw_space, spaces.Box):  # nearly always, and six times faster
-            return np.asarray(observation, dtype=np.float32).reshape(-1)
-        return np.asarray(spaces.flatten(self._raw_space, observation))
+            flat = np.asarray(observation, dtype=np.float32).reshape(-1)
+        else:
+            flat = np.asarray(spaces.flatten(self._raw_space, observation))
+        return flat if self._shown is None else flat[self._shown]
 
     def _observations(self) -> NDArray[np.float32]:
         """Return the normalized observations (L, n), a new array."""
         return self._normalize(self._raw.copy())
+
+
+def _places(env_id: str, observe: Sequence[int], flat: spaces.Box) -> NDArray[np.int64]:
+    """Return the places of an observation's values that are shown.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If there is none, one is there twice, or one is no place.
+    """
+    places = np.array(observe, dtype=np.int64)
+    size = int(np.prod(flat.shape))
+    if not places.size or len(set(observe)) < len(observe) or places.min() < 0 or places.max() >= size:
+        raise OptionError(
+            f"environment '{env_id}': observe = {[*observe]} must name places among the {size} values of an "
+            f"observation, 0 to {size - 1}, each once"
+        )
+    return places
 
 
 def _no_actions(space: spaces.Space[Any], lanes: int, capacity: int) -> NDArray[Any]:

@@ -12,6 +12,7 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.gymlanes import GymLanes, specification
 from qrlsuite.normalization import KIND, Kind
+from qrlsuite.options import Since
 
 _OWN = {
     "id": "the option id",
@@ -42,6 +43,11 @@ class GymOptions:
     high: Annotated[
         tuple[float, ...] | None, Field(description="what becomes 1 with bounds; absent: the box's own")
     ] = None
+    observe: Annotated[
+        tuple[int, ...] | None,
+        Field(description="places of an observation's values that are shown, [0, 2]; absent: all"),
+        Since("0.2.0"),
+    ] = None
 
     @field_validator("id")
     @classmethod
@@ -66,4 +72,6 @@ def make_vector(options: GymOptions, num_envs: int) -> LaneEnv:
     arguments = dict(options.arguments)
     if options.max_episode_steps is not None:
         arguments["max_episode_steps"] = options.max_episode_steps
-    return GymLanes(options.id, num_envs, arguments, options.normalization, options.low, options.high)
+    return GymLanes(
+        options.id, num_envs, arguments, options.normalization, options.low, options.high, options.observe
+    )

@@ -402,6 +402,28 @@ def test_normalizations_that_cannot_be(given: dict[str, Any], message: str) -> N
         GymLanes("CartPole-v1", 1, **given)
 
 
+def test_some_values_alone_are_shown() -> None:
+    """CartPole's position and angle, the other way round; states and normalization are those of what is shown."""
+    whole, some = lanes("CartPole-v1", 3), GymLanes("CartPole-v1", 3, observe=[2, 0])
+    bounded = GymLanes("CartPole-v1", 3, None, "bounds", [-0.5, -5], [0.5, 5], [2, 0])
+    for env in (whole, some, bounded):
+        env.seed_from(0)
+    seen, shown, scaled = (env.reset()[0] for env in (whole, some, bounded))
+    for _ in range(30):
+        np.testing.assert_array_equal(shown, seen[:, [2, 0]])
+        np.testing.assert_allclose(scaled, shown / [0.5, 5], rtol=1e-6)
+        seen, shown, scaled = (env.step(np.ones(3, np.int64))[0] for env in (whole, some, bounded))
+    assert shown in some.observation_space
+    assert some.unflattened_space is None
+    again = GymLanes("CartPole-v1", 3, observe=[2, 0])
+    again.load_state_dict(some.state_dict())
+    for wrong in ([], [0, 0], [4], [-1]):
+        with pytest.raises(
+            OptionError, match=r"must name places among the 4 values of an observation, 0 to 3, each"
+        ):
+            GymLanes("CartPole-v1", 1, observe=wrong)
+
+
 @pytest.mark.parametrize("kind", ["arctan", "running"])
 def test_normalization_is_for_boxes(kind: Any) -> None:
     with pytest.raises(OptionError, match=rf"'{kind}' is for boxes, and its observations are Discrete\(16\)"):
