@@ -589,7 +589,7 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
     header, line = done.stdout.splitlines()
     assert header.startswith("task,horizon,rank,rank_worst,entry")
     assert line.startswith("tiny,")
-    with pytest.raises(QrlSuiteError, match="--all"):
+    with pytest.raises(QrlSuiteError, match="export all"):
         CliRunner().invoke(build(), ["export", "--runs", str(tmp_path / "runs")], catch_exceptions=False)
 
 
