@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from qrlsuite import cells, own, shortforms, specs
-from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError
 from qrlsuite.results import codes
 
 Thing = TypeVar("Thing")
@@ -151,7 +151,7 @@ def _show(made: own.Loaded) -> None:
     for each in made.registered:
         try:
             picture = _picture(each.spec)
-        except QrlSuiteError as error:  # not of this size
+        except OptionError as error:  # not of this size
             picture = str(error)
         if picture:
             print(picture)
@@ -162,12 +162,7 @@ def _picture(spec: specs.Spec) -> str:
         from qrlsuite.circuit import ansatz
         from qrlsuite.circuit.drawing import draw_text
 
-        try:
-            drawn = ansatz(spec.name, *SIZE)
-        except QrlSuiteError:
-            raise
-        except Exception as error:
-            raise PluginError(f"{spec.title} cannot be built: {own.failure(error)}") from error
+        drawn = ansatz(spec.name, *SIZE)
         return f"{SIZE[0]} qubits, {SIZE[1]} layers:\n{draw_text(drawn)}"
     if isinstance(spec, specs.ModelSpec):
         import torch

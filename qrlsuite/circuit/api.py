@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import threading
+import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from qrlsuite.circuit.description import MAX_QUBITS, Circuit, mean_field_refusal, without_products
-from qrlsuite.errors import OptionError, nearest
+from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, nearest
 
 if TYPE_CHECKING:
     import torch
@@ -101,6 +102,8 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         If no ansatz has that name.
     OptionError
         For a number of qubits or layers, or an option, that the ansatz cannot have.
+    PluginError
+        If the ansatz fails otherwise, or returns no circuit.
     """
     from qrlsuite import options as option_values
     from qrlsuite import registry, specs
@@ -111,7 +114,17 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         raise OptionError(f"layers = {layers!r}: a circuit has 1 layer or more")
     spec = registry.get(specs.AnsatzSpec, name)
     chosen = option_values.build(specs.resolve(spec.options), options, f"ansatz '{name}'")
-    circuit: Circuit = specs.resolve(spec.build)(qubits, layers, chosen)
+    try:
+        circuit = specs.resolve(spec.build)(qubits, layers, chosen)
+    except QrlSuiteError:
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise PluginError(
+            f"ansatz '{name}' cannot be built: {registry.words(error)} ({last.filename}, line {last.lineno})"
+        ) from error
+    if not isinstance(circuit, Circuit):
+        raise PluginError(f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit")
     circuit.require_simulable()
     return circuit
 

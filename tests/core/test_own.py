@@ -573,6 +573,18 @@ def test_what_workers_could_not_have_is_refused(cell: Callable[[str], None]) -> 
         exec(head + "return Circuit(qubits)\n", vars(sys.modules["__main__"]))
 
 
+def test_a_builder_that_fails_is_named_with_its_line() -> None:
+    own.load(
+        write("bad.py", "def worse(qubits, layers):\n    return qubits.foo\ndef none(qubits, layers): ...\n")
+    )
+    with pytest.raises(
+        PluginError, match=r"^ansatz 'worse' cannot be built: AttributeError.*bad.py, line 2\)$"
+    ):
+        resolve("beam6g", "vqc-native ansatz=worse")
+    with pytest.raises(PluginError, match=r"^ansatz 'none' returns NoneType, and must return a Circuit$"):
+        resolve("beam6g", "vqc-native ansatz=none")
+
+
 def test_a_clash_with_another_file_names_it(cell: Callable[[str], None]) -> None:
     own.load(write("other.py", RING.replace("def ring", "def my_ring")))
     with pytest.raises(
