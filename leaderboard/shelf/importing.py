@@ -20,6 +20,7 @@ from safetensors.numpy import save as encode
 
 from qrlsuite import registry, specs
 from qrlsuite.errors import StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.preset import TUNING_SEEDS
@@ -133,11 +134,14 @@ def import_seeds(source: EntryStore, runs: Path, plan: str | None = None) -> Imp
     store = EntryStore.create(runs, entry, _place_for(store, source, exported is not None, runs, entry))
     claim = acquire(store, seeds)
     try:
-        return (
+        done = (
             _from_runs(source, runs_by_seed, entry, store)
             if exported is None
             else _from_export(exported, agents, entry, store)
         )
+        if (plugins := identity.plugins(entry)) and not codes.others(store, code := identity.of(entry)):
+            codes.prepare(store, code, plugins)
+        return done
     finally:
         claim.release()
 

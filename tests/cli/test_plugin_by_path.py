@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import qrlsuite, start
+from tests.commands import qrlsuite, start, start_worker
 from tests.conftest import HANGS, TINY, results
 from tests.core.test_own import ALL, RING
 
@@ -103,6 +103,30 @@ def test_a_copy_that_was_altered_is_not_imported(folder: Path) -> None:
     assert copy.read_text() == RING, "a command with the plugin makes the copy anew"
 
 
+def test_a_worker_finds_the_plugin_in_the_entrys_folder_alone(folder: Path) -> None:
+    """As a queue starts one, on a machine without the file."""
+    run(folder, "--seeds", "1")
+    (folder / "ring.py").rename(folder / "elsewhere")
+    worker = start_worker(str(entry_of(folder)), "--seeds", "1:3", "--epochs", "2")
+    assert worker.wait() == 0, worker.communicate()
+    assert json.loads((entry_of(folder) / "seed-0002" / "run.json").read_text())["status"] == "finished"
+
+
+def test_an_import_takes_the_copy_along(folder: Path) -> None:
+    run(folder)
+    entry, theirs = entry_of(folder), folder / "theirs"
+    (folder / "runs").rename(theirs)
+    (folder / "ring.py").rename(folder / "elsewhere")
+    given = theirs / "tiny" / entry.name
+    lacking = qrlsuite("import", str(given), cwd=folder)
+    assert (lacking.returncode, "if you trust it, add --plugin " in lacking.stderr) == (2, True)
+    taken = qrlsuite("import", str(given), "--plugin", str(given), cwd=folder)
+    assert taken.returncode == 0, taken.stderr
+    shutil.rmtree(theirs)
+    played = qrlsuite("evaluate", entry.name, "--episodes", "2", "--plugin", str(entry), cwd=folder)
+    assert played.returncode == 0, played.stderr
+
+
 def test_a_record_that_names_other_files_is_refused(folder: Path) -> None:
     run(folder)
     entry = entry_of(folder)
@@ -122,8 +146,9 @@ def test_a_record_that_names_other_files_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize("engine", ["local", "command"])
 def test_a_killed_run_goes_on_to_the_same_bytes(folder: Path, engine: str) -> None:
     """The file is gone in between: workers have the entry's copy, and the entry says where it is."""
-    words = ("run", ENTRY, "--task", "tiny.toml", "--seeds", "2", "--workers", "2", "--engine", engine)
-    command = start(*words, "--epochs", "100000", "--plugin", "ring.py", cwd=folder)
+    (folder / "mine.py").write_text(ALL)
+    words = ("run", "http-net2", "--task", "tiny.toml", "--seeds", "2", "--workers", "2", "--engine", engine)
+    command = start(*words, "--epochs", "100000", "--plugin", "mine.py", cwd=folder)
     deadline = time.monotonic() + HANGS
     while not [
         path for path in folder.glob("runs/tiny/*/seed-*/epochs.jsonl") if path.read_text().count("\n") > 1
@@ -134,14 +159,14 @@ def test_a_killed_run_goes_on_to_the_same_bytes(folder: Path, engine: str) -> No
     command.send_signal(signal.SIGINT if engine == "command" else signal.SIGKILL)
     command.wait()
     entry = entry_of(folder)
-    (folder / "ring.py").rename(folder / "elsewhere")
+    (folder / "mine.py").rename(folder / "elsewhere")
     while qrlsuite("runs", "--json", cwd=folder).stdout.count('"training"') and time.monotonic() < deadline:
         time.sleep(0.05)
     epochs = 1 + max(len(path.read_text().splitlines()) for path in entry.glob("seed-*/epochs.jsonl"))
-    run(folder, "--engine", engine, epochs=epochs, plugin=str(entry))
+    run(folder, "--engine", engine, epochs=epochs, plugin=str(entry), entry="http-net2")
     shutil.move(folder / "runs", folder / "killed")
-    shutil.move(folder / "elsewhere", folder / "ring.py")
-    run(folder, epochs=epochs)
+    shutil.move(folder / "elsewhere", folder / "mine.py")
+    run(folder, epochs=epochs, plugin="mine.py", entry="http-net2")
     for seed in (0, 1):
         assert results(entry_of(folder), seed) == results(folder / "killed" / "tiny" / entry.name, seed)
 
