@@ -51,7 +51,7 @@ class VQCOptions:
     layers: Annotated[int, Field(ge=1, le=256, description="layers of the circuit")] = 4
     ansatz: Annotated[str, Field(description="circuit family: iqp, cx, cz, skolik, or a plugin's")] = "iqp"
     gate: Annotated[
-        Literal["rot", "xyz", "u3"], Field(description="variational gate, for the ansaetze that offer it")
+        Literal["rot", "xyz", "u3"], Field(description="variational gate, for the ansatzes that offer it")
     ] = "rot"
     ansatz_options: Annotated[
         dict[str, OptionValue],

@@ -39,7 +39,7 @@ SAMPLED_SEEDS = 8
 
 BASES = {
     "measured": "measured on its own epochs",
-    "reference": "the most similar reference speed, scaled by a calibration of this machine",
+    "reference": "the most similar reference speed, scaled to the speed of this machine",
     "unknown": "not known before a first epoch is trained",
 }
 

@@ -574,7 +574,7 @@ def test_listing() -> None:
     shown = say("show", "fig7", "--runs", "nowhere").stdout
     assert "ddqn vqc-native qubits=14" in shown
     assert "0/100" in shown
-    assert "reference speed, scaled by a calibration of this machine" in shown
+    assert "reference speed, scaled to the speed of this machine" in shown
     assert "3,567 core-hours" in shown
 
 
