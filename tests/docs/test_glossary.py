@@ -61,7 +61,6 @@ ALLOWED = {
     "docs/error-rates.md": ("plans rather too many seeds", "benchmarks/calibration.py"),
     "docs/statistics.md": ("How many runs to plan",),
     "docs/tuning.md": ('"Hyperparameter optimization"',),  # the paper's title of a table
-    "qrlsuite/statistics": ("plan's entries", "entries of the plan"),  # of a `DecisionPlan`
     "qrlsuite/cli/app.py": ("benchmarks/calibration.py",),
 }
 """By file or folder: phrases in which a word is the right one."""
