@@ -23,6 +23,7 @@ from qrlsuite.studies.outcome import StudyOutcome
 
 PAPER = "https://arxiv.org/abs/2501.15893"
 SCRIPTS = ("page.js", "curves.js", "picked.js")
+LIVE = "live.js"
 LONGEST_REASON = 600
 
 
@@ -31,6 +32,7 @@ def render(
     title: str = "Sample complexity leaderboard",
     studies: Sequence[StudyOutcome] = (),
     beside: Leaderboard | None = None,
+    live: bool = False,
 ) -> str:
     """Return a leaderboard as one self-contained HTML page.
 
@@ -47,12 +49,15 @@ def render(
         Studies with looks, for a section of their own.
     beside:
         The same entries by another axis or over several tasks, for sections of their own.
+    live:
+        Whether `qrlsuite.leaderboard.report.live` serves it: it then asks its server for the progress of runs, and for
+        a newer page.
     """
     curves = {id(row.entry): row.entry for section in board.sections for row in section.rows}
     shown = entries.views(list(curves.values()))
     by_curves = {id(entry.curves): entry for entry in shown}
     boards = [sections.view(section, number, by_curves) for number, section in enumerate(board.sections)]
-    scripts = [_file(name) for name in SCRIPTS]
+    scripts = [_file(name) for name in (*SCRIPTS, *[LIVE] * live)]
     data = {"entries": entries.curves_data(shown), "sections": [view.data for view in boards]}
     now = datetime.datetime.now(datetime.UTC)
     return (
@@ -74,7 +79,8 @@ def render(
             rule=board.rule,
             promise=clean(board.promise, LONGEST_REASON),
             paper=PAPER,
-            policy=_policy(scripts),
+            live=live,
+            policy=_policy(scripts) + "; connect-src 'self'" * live,
             css=Markup(_file("style.css")),
             data=Markup(script_json(data)),
             scripts=[Markup(script) for script in scripts],

@@ -11,6 +11,7 @@
   const IN_WORDS = 3; // picked entries of which every pair has its sentence
 
   const drawings = [];
+  const states = window.report.states = []; // what the reader chose in each section, to be kept while pages change
   data.sections.forEach((section, number) => {
     const find = (name) => document.querySelector(`.${name}[data-section="${number}"]`);
     const [panel, cells, matrix, decisions] = ["picked", "pair", "matrix", "p-values"].map(find);
@@ -57,10 +58,12 @@
       const several = picked.length > 1 && picked.length <= IN_WORDS;
       const pairs = several ? picked.flatMap((a, k) => picked.slice(k + 1).map((b) => sentence(a, b))) : [];
       const hint = picked.length > IN_WORDS ? `${picked.length} picked. The verdicts of two or three stand here.`
-        : picked.length ? "Click another row to compare." : "Click rows to see their learning curves.";
+        : !picked.length ? "Click rows to see their learning curves." : rows.length > 1 ? "Click another row to compare." : "";
       words.replaceChildren(...(pairs.length ? pairs : [hint]).map((line) => element("p", { class: pairs.length ? "verdict" : "note" }, line)));
     };
+    let touched = false; // until then a newer page picks anew
     const pick = (places) => {
+      touched = true;
       mark(places);
       draw();
     };
@@ -180,6 +183,16 @@
     panel.hidden = false;
     if (cells) cells.hidden = false;
     mark(picked);
+    states.push({
+      task: section.task,
+      read: () => ({ names: touched ? picked.map((place) => names[place]) : null, search: search.value, singles: singles.checked }),
+      write: (state) => {
+        [search.value, singles.checked] = [state.search, state.singles];
+        filter();
+        if (state.names) [touched] = [true, mark(state.names.map((name) => names.indexOf(name)).filter((place) => place >= 0))];
+        draw();
+      },
+    });
     drawings.push([plot, draw]);
   });
 

@@ -151,7 +151,9 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         algorithm=algorithm,
         lead=_lead(rows, section.times),
         answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) == 1) for pair in asked),
-        picked=tuple(sorted({row.place for pair in asked for row in pair})) or (0,),
+        picked=tuple(
+            sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
+        ),
         sentences=tuple(
             (one.place, other.place, _verdict(section, grid, one, other))
             for one, other in itertools.combinations(rows, 2)
@@ -285,6 +287,7 @@ def _data(
     words = dict.fromkeys(pair.words(side) for pair in judgement.pairs for side in (pair.first, pair.second))
     numbers = {text: number for number, text in enumerate(words)}  # many pairs share their words
     return {
+        "task": clean(section.task),
         "horizon": section.horizon,
         "entries": [row.entry.index for row in rows],
         "names": [row.name for row in rows],

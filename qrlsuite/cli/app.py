@@ -51,6 +51,7 @@ BUILT_IN = {
             "Rank entries by significant outperformance.",
             f"{_ROOM}.leaderboard:leaderboard",
         ),
+        LazyCommand("view", "Show results in a browser while runs go on.", f"{_ROOM}.view:view"),
         LazyCommand("compare", "Say which of two entries needs fewer steps.", f"{_ROOM}.compare:compare"),
         LazyCommand(
             "plot",

@@ -21,8 +21,8 @@ SMALL = {
 }
 """What is appended to a command, so that it takes seconds; the last of two equal options counts."""
 CIRCUIT = ("qubits=2", "layers=1", "--seeds", "1")
-ELSEWHERE = {"doctor"}
-"""Imports every package anew, which tests/cli/test_doctor.py does."""
+ELSEWHERE = {"doctor", "view"}
+"""The first imports every package anew, the second ends with Ctrl-C: see cli/test_doctor.py, leaderboard/test_live.py."""
 
 
 def commands(page: str = "docs/start.md", section: str = "Every command once") -> list[list[str]]:
