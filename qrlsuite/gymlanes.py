@@ -41,8 +41,9 @@ class GymLanes(LaneEnv):
     random in the episode comes from there. Observations are flattened as `gymnasium.spaces.flatten` does it,
     so discrete ones are one-hot, and the parts of a Dict or Tuple follow each other in its order. Actions have the
     shape and type of their space, see `qrlsuite.actions`. At an episode's end `infos["final_info"]` holds `score` (L,)
-    where the environment's `info` does. Where its `info` holds an `action_mask` (choices,), 1 for what can be chosen,
-    `infos["action_mask"]` is that of the returned observations (L, choices).
+    where the environment's `info` does, and `metrics`, (L,) by name, where that is a dict of numbers. Where `info`
+    holds an `action_mask` (choices,), 1 for what can be chosen, `infos["action_mask"]` is that of the returned
+    observations (L, choices).
 
     Without autoreset, a lane whose episode has ended stays where it is: its steps return the last observation,
     reward 0, and neither termination nor truncation.
@@ -295,13 +296,21 @@ class GymLanes(LaneEnv):
             "final_info": {},
             "_final_info": done.copy(),
         }
+        measured = {name for info in last.values() for name in info.get("metrics", {})}
+        if measured:
+            infos["final_info"]["metrics"] = {
+                name: np.full(self.num_envs, np.nan) for name in sorted(measured)
+            }
+            for lane, info in last.items():
+                for name, value in info.get("metrics", {}).items():
+                    infos["final_info"]["metrics"][name][lane] = value
         scored = {lane: info["score"] for lane, info in last.items() if "score" in info}
         if scored:
             score = np.full(self.num_envs, np.nan)
             score[list(scored)] = list(scored.values())
             present = np.zeros(self.num_envs, dtype=np.bool_)
             present[list(scored)] = True
-            infos["final_info"] = {"score": score, "_score": present}
+            infos["final_info"] |= {"score": score, "_score": present}
         self._ended |= done
         if self.autoreset:
             for lane in last:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite import specs
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import EnvironmentFailure, PluginError
 from qrlsuite.experiment.task import ScoreSection
@@ -23,6 +24,8 @@ class MeteredEnv(LaneEnv):
         Undiscounted return of every lane's unfinished episode (num_envs,).
     observe:
         Called with the observations (num_envs, ...) that every step returns, unless None.
+    measured:
+        By name, of every metric that an episode's end had since `take_metrics` was last called: lanes and values.
     finished:
         (lane, return, score) of every episode that ended since `take_finished` was last called.
     """
@@ -44,6 +47,7 @@ class MeteredEnv(LaneEnv):
         self.unflattened_space = inner.unflattened_space
         self.returns = np.zeros(inner.num_envs)
         self.observe: Callable[[NDArray[np.float32]], None] | None = None
+        self.measured: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {}
         self.finished: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
 
     def reset(
@@ -75,6 +79,7 @@ class MeteredEnv(LaneEnv):
         if ended.size:
             self.finished.append((ended, self.returns[ended].copy(), self._scores(ended, infos)))
             self.returns[ended] = 0.0
+            self._measure(ended, infos)
         self.tick()
         return observations, rewards, terminated, truncated, infos
 
@@ -102,6 +107,26 @@ class MeteredEnv(LaneEnv):
                 f"environment '{self.environment_name}' gave a score outside [0, 1]: {scores[:5].tolist()}"
             )
         return scores
+
+    def _measure(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> None:
+        """Keep the metrics of the episodes that have just ended in the lanes `ended`."""
+        for name, values in infos.get("final_info", {}).get("metrics", {}).items():
+            found = np.asarray(values, np.float64)[ended]
+            known = ~np.isnan(found)
+            if not specs.NAME.fullmatch(str(name)) or np.isinf(found).any():
+                raise EnvironmentFailure(
+                    f"environment '{self.environment_name}': info['metrics'] of an episode has {str(name)[:40]!r} "
+                    f"= {found[0]:g}: names are like 'constraint-violations', and values finite"
+                )
+            self.measured.setdefault(str(name), []).append((ended[known], found[known]))
+
+    def take_metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Return, by name, lanes and values of the metrics of episodes that ended, and forget them."""
+        measured, self.measured = self.measured, {}
+        return {
+            name: (np.concatenate([lanes for lanes, _ in parts]), np.concatenate([each for _, each in parts]))
+            for name, parts in sorted(measured.items())
+        }
 
     def take_finished(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Return lanes, returns and scores of the episodes finished since the last call, and forget them."""

@@ -13,6 +13,7 @@ import functools
 import inspect
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -212,12 +213,15 @@ class Episodes:
         Steps of each lane's episode (lanes,).
     rounds:
         Steps that every lane made: all lanes go on until the last episode has ended.
+    metrics:
+        By name, what the environment measured (lanes,), NaN where it did not.
     """
 
     returns: Floats
     scores: Floats
     lengths: NDArray[np.int64]
     rounds: int
+    metrics: dict[str, Floats]
 
 
 def informed(policy: Policy) -> Callable[[NDArray[np.float32], NDArray[np.bool_], Infos], NDArray[Any]]:
@@ -256,6 +260,8 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         If the environment fails, or an episode does not end within `MAX_EPISODE_STEPS`.
     """
     envs.take_finished()
+    envs.take_metrics()
+    metrics: dict[str, Floats] = {}
     observations, infos = envs.reset()
     policy = informed(begin())
     begins = np.ones(envs.num_envs, dtype=np.bool_)
@@ -271,9 +277,13 @@ def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
         first = lanes[unfinished[lanes]]
         returns[first], scores[first] = sums[unfinished[lanes]], final_scores[unfinished[lanes]]
         lengths[first] = played
+        for name, (where, values) in envs.take_metrics().items():
+            own = metrics.setdefault(name, np.full(envs.num_envs, np.nan))
+            new = unfinished[where]
+            own[where[new]] = values[new]
         unfinished[lanes] = False
         if not unfinished.any():
-            return Episodes(returns, scores, lengths, played)
+            return Episodes(returns, scores, lengths, played, metrics)
     raise EnvironmentFailure(
         f"environment '{envs.environment_name}': an episode did not end within {MAX_EPISODE_STEPS} steps; "
         "give it a time limit"
@@ -396,6 +406,9 @@ class Epoch:
         was none.
     scores:
         Validation scores (S, episodes).
+    measured:
+        By name, the means over the validation's episodes of what the environment measures, `info["metrics"]` at their
+        ends, (S,) each; NaN where it did not.
     executions:
         Circuit executions of each seed by name, validation included; empty without circuits.
     seconds:
@@ -407,6 +420,7 @@ class Epoch:
     number: int
     metrics: dict[str, Floats]
     scores: Floats
+    measured: dict[str, Floats]
     executions: list[dict[str, int]]
     seconds: dict[str, float]
     diverged: NDArray[np.bool_]
@@ -539,7 +553,14 @@ class Trainer:
             seconds["cpu"] = time.process_time() - processor
         self.epoch += 1
         scores = episodes.scores.reshape(self.S, self.V)
-        return Epoch(self.epoch, metrics, scores, executions, seconds, self._diverged(metrics))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing is NaN
+            measured = {
+                name: np.nanmean(values.reshape(self.S, self.V), axis=1)
+                for name, values in episodes.metrics.items()
+            }
+        diverged = self._diverged(metrics)
+        return Epoch(self.epoch, metrics, scores, measured, executions, seconds, diverged)
 
     def _diverged(self, metrics: dict[str, Floats]) -> NDArray[np.bool_]:
         """Return, per seed, whether a number of its policy is not finite or a metric is infinite (NaN: no value)."""
@@ -609,6 +630,7 @@ class Trainer:
     def _training_episodes(self) -> tuple[Floats, Floats]:
         """Return mean return and score (S,) of the training episodes that ended in this epoch; NaN without any."""
         lanes, returns, scores = self.envs.take_finished()
+        self.envs.take_metrics()
         owners = lanes // self.E
         counts = np.bincount(owners, minlength=self.S)
         with np.errstate(invalid="ignore"):

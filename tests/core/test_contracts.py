@@ -15,9 +15,11 @@ from torch import Tensor, nn
 
 from qrlsuite import specs
 from qrlsuite.actions import draw
+from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.training.trainer import Trainer, count_parameters
+from qrlsuite.training.group import lines_of
+from qrlsuite.training.trainer import Trainer, count_parameters, play_episodes
 from tests.environments.strangers import HERE
 
 ASKED: list[tuple[Any, ...]] = []
@@ -138,3 +140,23 @@ def test_statistics_standardize_the_observation_and_leave_the_action() -> None:
     (observed,), (both,) = statistics(nn.Identity(), (x[..., :3],)), statistics(nn.Identity(), (x,))
     assert torch.equal(both, torch.cat([observed, x[..., 3:]], 2))
     assert not torch.equal(observed, x[..., :3])
+
+
+def test_what_an_environment_measures_is_recorded() -> None:
+    """The means over a validation's episodes: their lengths, and of late ones 1; nothing of those that are not."""
+    trainer = Trainer(entry("measured=steps-taken"), [0, 1])
+    trainer.start()
+    epoch = trainer.train_epoch()
+    trainer.validation.seed_lanes([streams.numpy("validation", 1) for streams in trainer.streams])
+    episodes = play_episodes(trainer.validation, lambda: trainer.act)
+    lengths = episodes.lengths.reshape(2, -1)
+    np.testing.assert_array_equal(epoch.measured["steps-taken"], lengths.mean(1))
+    np.testing.assert_array_equal(epoch.measured["late"], np.where((lengths > 8).any(1), 1.0, np.nan))
+    for line, steps in zip(lines_of(epoch), lengths.mean(1)):
+        assert line["measured.steps-taken"] == steps
+    wrong = Trainer(entry("measured=Steps taken"), [0])
+    wrong.start()
+    with pytest.raises(
+        EnvironmentFailure, match=r"info\['metrics'\] of an episode has 'Steps taken' = .*: names are like"
+    ):
+        wrong.train_epoch()

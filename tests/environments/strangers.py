@@ -17,15 +17,22 @@ class Walk(gymnasium.Env[Any, Any]):
     """A random walk of random length.
 
     What it shows depends on `kind`, what it takes on `acts`; `start` shifts its actions. With `masked`, action 0 cannot
-    be chosen at even steps, and with `masked = "all"` none ever.
+    be chosen at even steps, and with `masked = "all"` none ever. The steps are a metric of the name `measured`; late
+    episodes have another.
     """
 
     def __init__(
-        self, kind: str = "box", start: int = 0, scored: bool = True, acts: str = "discrete", masked: str = ""
+        self,
+        kind: str = "box",
+        start: int = 0,
+        scored: bool = True,
+        acts: str = "discrete",
+        masked: str = "",
+        measured: str = "",
     ) -> None:
         self.kind = kind
         self.scored = scored
-        self.masked = masked
+        self.masked, self.measured = masked, measured
         self.action_space: Any = {
             "discrete": spaces.Discrete(3, start=start),
             "multi-discrete": spaces.MultiDiscrete([3, 2], start=[start, 0]),
@@ -63,7 +70,9 @@ class Walk(gymnasium.Env[Any, Any]):
         self.steps += 1
         self.position += float(self.np_random.normal()) + float(np.sum(action))
         ended = self.steps == self.length
-        info = {"score": self.steps / 12} if ended and self.scored else {}
+        info: dict[str, Any] = {"score": self.steps / 12} if ended and self.scored else {}
+        if ended and self.measured:
+            info["metrics"] = {self.measured: self.steps, **({"late": 1.0} if self.steps > 8 else {})}
         return self._observe(), self.position, ended, False, {**info, **self._info()}
 
     def _observe(self) -> Any:
