@@ -16,7 +16,10 @@ from qrlsuite.errors import OptionError
 from qrlsuite.options import Setting, parse_setting, parse_value
 
 PRESET = "preset"
-"""The one name that is no option: `preset=FILE.toml`, or a preset of the task."""
+"""A name that is no option: `preset=FILE.toml`, or a preset of the task."""
+
+START = "from"
+"""The other one: `from=TASK/ENTRY:EPOCHS`, the entry and epoch of the agents with which training begins."""
 
 _QUOTED = r'"(?:\\.|[^"\\])*"' + r"|'(?:\\.|[^'\\])*'"
 _PIECE = re.compile(_QUOTED + r"|.", re.DOTALL)
@@ -29,7 +32,7 @@ class Written:
 
     Attributes
     ----------
-    algorithm, preset:
+    algorithm, preset, start:
         None where they are not written.
     """
 
@@ -37,6 +40,7 @@ class Written:
     algorithm: str | None = None
     settings: tuple[Setting, ...] = ()
     preset: str | None = None
+    start: str | None = None
 
     def given(
         self, algorithm: str | None = None, settings: tuple[Setting, ...] = (), preset: str | None = None
@@ -72,12 +76,15 @@ def parse_entry(text: str) -> Written:
         raise OptionError(
             f"entry '{text}': write [ALGORITHM] MODEL NAME=VALUE ..., for example 'mlp width=64'"
         )
-    presets = [setting for setting in settings if (setting.side, setting.name) == (None, PRESET)]
+    own = {
+        each.name: str(each.value) for each in settings if each.side is None and each.name in (PRESET, START)
+    }
     return Written(
         model=names[-1],
         algorithm=names[0] if len(names) == 2 else None,
-        settings=tuple(setting for setting in settings if setting not in presets),
-        preset=str(presets[-1].value) if presets else None,
+        settings=tuple(each for each in settings if each.side is not None or each.name not in own),
+        preset=own.get(PRESET),
+        start=own.get(START),
     )
 
 

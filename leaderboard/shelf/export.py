@@ -46,6 +46,11 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         raise QrlSuiteError(f"{entry.folder} is a published entry already")
     store = EntryStore(entry.folder)
     built = store.entry()
+    if built.start is not None:
+        raise QrlSuiteError(
+            f"'{entry.label}' begins with the agents of another entry, so nobody could train its seeds again from what "
+            "is published: it cannot be exported"
+        )
     codes.require_installed(store, entry.seeds, identity.of(built))
     record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
     folder = out / entry.task / built.name

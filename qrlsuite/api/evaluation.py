@@ -305,10 +305,13 @@ def find(runs: Path, name: str, task: str | None = None, published: bool = False
     placed = (Path(name) / "entry.json").exists() or (slash and "=" not in before)
     try:
         copies = collect.read_copies(runs, name, published, [] if placed or task is None else [task])
-    except UnknownNameError:
+    except UnknownNameError as error:
         if placed or task is None:
             raise
-        other = collect.read_copies(runs, name, published, [])[0].task
+        try:
+            other = collect.read_copies(runs, name, published, [])[0].task
+        except UnknownNameError:
+            raise error from None
         raise UnknownNameError(
             f"task '{task}' has no entry '{name}' in {runs}; to let agents play it that were trained on '{other}', "
             f"write '{other}/{name}'"

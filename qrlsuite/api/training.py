@@ -36,6 +36,7 @@ def train(
     algorithm: str | None = None,
     options: Mapping[str, Any] | None = None,
     preset: str | None = None,
+    start: str | None = None,
     seeds: Seeds | None = None,
     epochs: int | None = None,
     engine: str | Where = "local",
@@ -63,6 +64,9 @@ def train(
         Options by name: `{"qubits": 6, "algorithm.gamma": 0.9, "environment.degree": 4}`.
     preset:
         One of the task's presets of settings, or a preset file's path.
+    start:
+        An entry with trained agents, of the results folder or published: seed k begins with the agent of seed k, and
+        its optimizer and all else are fresh. It is part of the entry, which never shares seeds with one without.
     seeds:
         A number (100: seeds 0 to 99), the seeds themselves, or text ('0:20'); None takes the task's protocol.
     epochs:
@@ -112,7 +116,7 @@ def train(
     """
     entry = resolve_entry(task, model, algorithm, from_mapping(options), preset, runs)
     where = where_of(engine, workers, device, fresh, same)
-    done = train_entry(entry, where, seeds, epochs, budget, track, runs, progress)
+    done = train_entry(entry, where, seeds, epochs, budget, track, runs, progress, start=start)
     if done.submitted is not None and progress:
         print(done.submitted, file=sys.stderr)
     return collect.read(done.work.store)
@@ -151,6 +155,7 @@ def train_entry(
     runs: str | PathLike[str],
     progress: bool,
     confirmed: bool = True,
+    start: str | None = None,
 ) -> missing.Training:
     """Train the missing seeds of an entry: `train`, and the command `run`.
 
@@ -161,6 +166,10 @@ def train_entry(
     """
     seed_numbers = None if seeds is None else read_seeds(seeds)
     check_positive("epochs", epochs)
+    if start is not None:
+        from qrlsuite.api.warm import begin_with  # torch
+
+        entry = begin_with(entry, Path(runs), start, seed_numbers)
     with trackers.asking([track] if isinstance(track, str) else list(track)):
         return missing.run(
             Path(runs), entry, where, seed_numbers, epochs, budget, confirmed, quiet=not progress

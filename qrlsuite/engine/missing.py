@@ -215,6 +215,8 @@ def train(
         if limit is not None and time.monotonic() - began >= limit:
             raise _TimeIsUp
 
+    if work.entry.start is not None:  # what is missing is said before anything is trained
+        work.store.initial([seed for group in work.groups if group.epoch == 0 for seed in group.seeds])
     display.deadline = None if limit is None else began + limit
     code = identity.of(work.entry)
     codes.require(work.store, code)

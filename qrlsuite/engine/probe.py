@@ -40,7 +40,7 @@ from qrlsuite.results import probes
 from qrlsuite.results.checkpoint import Arrays
 from qrlsuite.results.claims import Claim, SeedsClaimedError, acquire
 from qrlsuite.results.probes import DIFFERS, EQUAL, NOT_PROBED
-from qrlsuite.results.store import EntryStore
+from qrlsuite.results.store import EntryStore, read_arrays
 from qrlsuite.training.remote_task import pack, unpack
 
 if TYPE_CHECKING:
@@ -120,8 +120,15 @@ def difference(together: Side, alone: Side) -> str:
     return f"the state '{name}' after epoch {len(together.lines)}" if name else ""
 
 
-def train(entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu") -> Side:
+def train(
+    entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu", start: Path | None = None
+) -> Side:
     """Train seeds from nothing until the parameters of the middle one have changed, for some epochs at most.
+
+    Parameters
+    ----------
+    start:
+        The file of the agent with which all of them begin, where the entry begins with agents.
 
     Raises
     ------
@@ -132,7 +139,8 @@ def train(entry: Entry, seeds: Sequence[int], epochs: int, device: str = "cpu") 
     from qrlsuite.training.trainer import Trainer
 
     trainer = Trainer(entry, seeds, device)
-    trainer.start()
+    first = {} if start is None else read_arrays(start)
+    trainer.start({name: np.stack([value] * len(seeds)) for name, value in first.items()})
     recorder = Recorder(trainer)
     for _ in range(epochs):
         lines = lines_of(trainer.train_epoch())
@@ -145,7 +153,9 @@ class _ProbeFailed(Exception):
     """The fresh process ended without an answer, for a reason that says nothing about seeds."""
 
 
-def in_fresh_process(entry: Entry, seeds: Sequence[int], epochs: int, device: str) -> tuple[Side, float]:
+def in_fresh_process(
+    entry: Entry, seeds: Sequence[int], epochs: int, device: str, start: Path | None = None
+) -> tuple[Side, float]:
     """Do what `train` does in a process that has run nothing else; returns its processor time, too.
 
     Raises
@@ -155,7 +165,13 @@ def in_fresh_process(entry: Entry, seeds: Sequence[int], epochs: int, device: st
     _ProbeFailed
         If the process was killed, or cannot train for another reason: it finds no such device, say.
     """
-    task: dict[str, Any] = {"entry": entry.record(), "seeds": list(seeds), "epochs": epochs, "device": device}
+    task: dict[str, Any] = {
+        "entry": entry.record(),
+        "seeds": list(seeds),
+        "epochs": epochs,
+        "device": device,
+        "start": start and str(start),
+    }
     task["plugins"] = []
     command = [sys.executable, "-P", "-m", "qrlsuite.engine.probe"]  # -P: as workers are started
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as output:
@@ -192,9 +208,14 @@ class Probe:
         The middle one of the group.
     claim:
         With which this process keeps others from making it, too.
+    start:
+        The file of the agent with which the seed begins, where the entry begins with agents.
     """
 
-    def __init__(self, entry: Entry, seed: int, epochs: int, device: str, claim: Claim) -> None:
+    def __init__(
+        self, entry: Entry, seed: int, epochs: int, device: str, claim: Claim, start: Path | None = None
+    ) -> None:
+        self.start = start
         self.entry, self.seed, self.device, self.claim = entry, seed, device, claim
         self.epochs = min(epochs, MOST_EPOCHS)
         self._recorder: Recorder | None = None
@@ -244,7 +265,7 @@ class Probe:
                 sides.append(self._recorder.side)  # the group itself
                 continue
             try:
-                side, seconds = in_fresh_process(self.entry, seeds, self.epochs, self.device)
+                side, seconds = in_fresh_process(self.entry, seeds, self.epochs, self.device, self.start)
             except PluginError as error:
                 if self._recorder is None and not sides:  # it fails in company, too
                     raise _ProbeFailed(str(error)) from error
@@ -282,7 +303,8 @@ def prepare(parts: Sequence[tuple[EntryStore, Sequence[int]]], epochs: int, devi
         claim = acquire(EntryStore(store.path / _FOLDER), [0])
     except SeedsClaimedError:
         return None
-    return Probe(entry, seed, epochs, device, claim)
+    start = None if entry.start is None else store.start_of(seed).absolute()
+    return Probe(entry, seed, epochs, device, claim, start)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -298,7 +320,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         for path in task["plugins"]:
             own.load(path)
-        side = train(from_record(task["entry"], "the probe"), task["seeds"], task["epochs"], task["device"])
+        start = None if task["start"] is None else Path(task["start"])
+        entry = from_record(task["entry"], "the probe")
+        side = train(entry, task["seeds"], task["epochs"], task["device"], start)
         header |= {"lines": side.lines, "changed": side.changed}
         arrays = side.arrays
     except (PluginError, EnvironmentFailure) as error:

@@ -7,6 +7,7 @@ engine, workers or versions. More epochs extend an entry, more seeds widen it. A
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import cached_property
@@ -25,6 +26,8 @@ from qrlsuite.options import Setting
 EXTERNAL = "external"
 """What the algorithm of entries is called whose curves another program made; so is their task's environment."""
 
+_START = re.compile(r"[a-z0-9][a-z0-9+._-]*/[a-z0-9][a-z0-9+._@-]*:[1-9]\d{0,8}", re.ASCII)
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -38,6 +41,9 @@ class Entry:
         How the settings were found, where their preset says so; not part of the identity either.
     plan:
         Hash of the study with looks that trains it, where one does; not part of the identity either.
+    start:
+        `TASK/ENTRY:EPOCHS`, where training begins with the agents of another entry after so many epochs, seed k with
+        that of seed k; part of the identity.
     """
 
     task: Task
@@ -48,6 +54,7 @@ class Entry:
     preset: str | None
     tuning: dict[str, Any] | None = field(default=None, compare=False)
     plan: str | None = field(default=None, compare=False)
+    start: str | None = None
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -58,6 +65,7 @@ class Entry:
             "algorithm_options": options.identity(self.algorithm_options),
             "model": self.model.name,
             "model_options": options.identity(self.model_options),
+            **({} if self.start is None else {notation.START: self.start}),
         }
 
     @cached_property
@@ -99,7 +107,7 @@ class Entry:
         }
         words = [self.algorithm.name, self.model.name]
         for side, other in (("model", "algorithm"), ("algorithm", "model")):
-            taken = {notation.PRESET} | {
+            taken = {notation.PRESET, notation.START} | {
                 name
                 for each in (own[other], self.task.environment_options)
                 for name in options.field_names(type(each))
@@ -108,6 +116,8 @@ class Entry:
                 if value != usual[side].get(name) or (side == "model" and index == 0):
                     full = f"{side}.{name}" if name in taken else name
                     words.append(notation.write_setting(full, value))
+        if self.start is not None:
+            words.append(notation.write_setting(notation.START, self.start))
         return " ".join(words)
 
     def _usual_algorithm_options(self) -> options.Values:
@@ -190,6 +200,10 @@ def resolve(
         raise OptionError(
             f"'{EXTERNAL} {written.model}' has curves that another program made: they can be compared, not trained"
         )
+    if written.start is not None and not _START.fullmatch(written.start):
+        raise OptionError(
+            f"{notation.START}={written.start}: write TASK/ENTRY:EPOCHS, or run it with --from ENTRY"
+        )
     task, model = load(task_name), registry.get(specs.ModelSpec, written.model)
     file = _preset_file(written)
     spec = registry.get(
@@ -217,6 +231,7 @@ def resolve(
         model_options=model_options,
         preset=source.name,
         tuning=source.record(values),
+        start=written.start,
     )
 
 
@@ -358,7 +373,9 @@ def from_record(record: Mapping[str, Any], source: str) -> Entry:
         file = TaskFile.model_validate(record["task_file"])
         names = [str(record["task_name"]), str(identity["algorithm"]), str(identity["model"])]
         values = dict(identity["algorithm_options"]), dict(identity["model_options"])
-        preset, expected = record["preset"], record["hash"]
+        preset, expected, start = record["preset"], record["hash"], identity.get(notation.START)
+        if start is not None and not _START.fullmatch(start):
+            raise ValueError(f"{notation.START} is {str(start)[:80]!r}")
     except (KeyError, TypeError, ValueError, pydantic.ValidationError) as error:
         raise StoreError(f"{source} is not an entry's record: {type(error).__name__}: {error}") from None
     task = Task(file, source)
@@ -373,6 +390,7 @@ def from_record(record: Mapping[str, Any], source: str) -> Entry:
         preset=preset,
         tuning=record.get("tuning"),
         plan=record.get("plan"),
+        start=start,
     )
     if entry.hash != expected:
         raise StoreError(

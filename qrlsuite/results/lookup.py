@@ -131,7 +131,9 @@ def _written(among: Sequence[N], text: str) -> list[N]:
         written = notation.parse_entry(rest)
         same_task = [e for e in among if task in ("", e.task)]
         if written.preset is None:
-            return [e for e in same_task if _same(written, e.label)] if written.settings else []
+            return (
+                [e for e in same_task if _same(written, e.label)] if written.settings or written.start else []
+            )
         names = {task: resolve(task, written).name for task in {e.task for e in same_task}}
         return [e for e in same_task if e.name == names[e.task]]
     except QrlSuiteError:
@@ -148,6 +150,7 @@ def _same(written: notation.Written, label: str) -> bool:
     return (
         written.algorithm in (None, known.algorithm)
         and written.model == known.model
+        and written.start == known.start
         and next(options) == next(options)
     )
 

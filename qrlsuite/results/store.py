@@ -6,6 +6,7 @@
                                   epochs.parquet  the same once it has finished
                                   timings.jsonl everything that may differ between two equal runs
                                   final.safetensors  the trained agent
+                        start/            agents with which seeds begin, of an entry that begins with some
                         groups/<id>/checkpoint.safetensors, progress.json
                         claims/<id>.json        who is working on which seeds
                 <entry>@1a2b3c4d/               seeds of other code (`qrlsuite.results.codes`)
@@ -597,6 +598,7 @@ class EntryStore:
         self.groups = path / "groups"
         self.claims = path / "claims"
         self.evaluations = path / "evaluations"
+        self.start = path / "start"
 
     @property
     def mark(self) -> str:
@@ -723,6 +725,33 @@ class EntryStore:
         """Return the seeds that have a folder, sorted; `seed-00007` is none, for seed 7 has `seed-0007`."""
         matches = [_SEED_FOLDER.fullmatch(child.name) for child in self.path.iterdir() if child.is_dir()]
         return sorted(int(match.group(1)) for match in matches if match)
+
+    def start_of(self, seed: int) -> Path:
+        """Return the file of the agent with which a seed's training begins, where its entry begins with agents."""
+        return self.start / f"seed-{seed:04d}.safetensors"
+
+    def initial(self, seeds: Sequence[int]) -> Arrays:
+        """Return the agents with which the training of seeds begins, seed-first by name.
+
+        Raises
+        ------
+        StoreError
+            If one is not there, or damaged.
+        """
+        agents = []
+        for seed in seeds:
+            path = self.start_of(seed)
+            try:
+                agents.append(read_arrays(path))
+            except FileNotFoundError:
+                raise StoreError(
+                    f"{path} is missing, the agent with which seed {seed} begins: run it with --from ENTRY"
+                ) from None
+            require_finite(agents[-1], path)
+        try:
+            return {name: np.stack([agent[name] for agent in agents]) for name in (agents or [{}])[0]}
+        except (KeyError, ValueError):
+            raise StoreError(f"{self.start} holds agents of different models: restore it") from None
 
     def finished(self, seeds: Iterable[int], epochs: int) -> set[int]:
         """Return which of the seeds have completed that many epochs."""

@@ -95,7 +95,9 @@ class GroupFiles:
         self.saved_epoch = 0
 
     def resume(self) -> tuple[int, checkpoint.Arrays]:
-        """Return the epoch and the state of the newest checkpoint, 0 and nothing without one; cut what is newer.
+        """Return the epoch and the state of the newest checkpoint; cut what is newer.
+
+        Without one, the epoch is 0, and the state what `Trainer.start` takes: nothing, or the agents to begin with.
 
         Raises
         ------
@@ -117,6 +119,8 @@ class GroupFiles:
                     "seed's folder to start again"
                 )
         self.saved_epoch = epoch
+        if epoch == 0 and self.entry.start is not None:
+            arrays = self.store.initial(self.seeds)
         return epoch, arrays
 
     def begin(self, epoch: int, parameters: Mapping[str, int], origin: Mapping[str, Any]) -> None:
@@ -367,14 +371,14 @@ class GroupRun:
         where = ", ".join(str(files.store.path) for files in self.files)
         if any((own, arrays.keys()) != (epoch, first.keys()) for own, arrays in states):
             raise StoreError(f"{where}: these entries are at different epochs, or of different versions")
-        if epoch:
-            try:
-                joined = {name: np.concatenate([arrays[name] for _, arrays in states]) for name in first}
+        try:
+            joined = {name: np.concatenate([arrays[name] for _, arrays in states]) for name in first}
+            if epoch:
                 self.trainer.restore(epoch, joined)
-            except (StoreError, ValueError) as error:
-                raise StoreError(f"{where}: {error}") from error
-        else:
-            self.trainer.start()
+        except (StoreError, ValueError) as error:
+            raise StoreError(f"{where}: {error}") from error
+        if not epoch:
+            self.trainer.start(joined)
         self.progress.epoch = self.trainer.epoch
         parameters = self.trainer.models.trained()
         origin = provenance.of(self.trainer.entry, self.trainer.device)

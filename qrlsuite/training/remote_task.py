@@ -8,7 +8,7 @@ Of a task:
 
     token           of this task alone: its answer has the same
     entry           what is trained, as `entry.json` has it
-    seeds, epoch    the group, and the epoch of the checkpoint; at epoch 0 there is none
+    seeds, epoch    the group, and the epoch of the checkpoint; at epoch 0 there is none, or the agents to begin with
     epochs          where to stop
     seconds         how long to train; one epoch is trained at least
     device          `cpu`, `cuda` or `cuda:1`
@@ -205,7 +205,7 @@ def _trained(header: Mapping[str, Any], seeds: list[int], arrays: Arrays) -> tup
         if header["epoch"]:
             trainer.restore(header["epoch"], arrays)
         else:
-            trainer.start()
+            trainer.start(arrays)
         trainer.models.compile_circuits()
         began = time.monotonic()
         while trainer.epoch < header["epochs"]:

@@ -307,8 +307,10 @@ class ModelBuilder:
         streams: Sequence[Streams],
         statistics: RunningStatistics | None = None,
         fence: Fence | None = None,
+        initial: Mapping[int, Mapping[str, torch.Tensor]] | None = None,
     ) -> None:
         self.fence = fence or Fence(closed=False)
+        self.initial = initial or {}
         self.entries = [entry] * len(streams) if isinstance(entry, Entry) else list(entry)
         self.entry = self.entries[0]
         self.space = observed_space(envs)
@@ -346,6 +348,9 @@ class ModelBuilder:
                 together = population.stack(agents)
             else:
                 together = specs.resolve(spec.population)(agents, population.joined(options))
+            with torch.no_grad():
+                for name, value in self.initial.get(call, {}).items():
+                    together.state_dict()[name].copy_(value)
         if self.statistics is not None:
             self.statistics.attach(together)
         self.fence.watch(together, f"model '{spec.name}', forward")
@@ -489,16 +494,23 @@ class Trainer:
         if self.envs.inner.running_statistics:
             self.statistics = RunningStatistics(self.S, self.E, size, self.device)
             self.envs.observe = self.statistics.observe
-        self.models = ModelBuilder(entries, self.envs, self.streams, self.statistics, self.fence)
-        with _building(entry.algorithm):
-            factory = specs.resolve(entry.algorithm.factory)
-            own_options = population.joined([each.algorithm_options for each in entries])
+        self._entries = entries
+        self._build({})
+
+    def _build(self, initial: Mapping[int, Mapping[str, torch.Tensor]]) -> None:
+        """Build networks and algorithm; `initial` has what the networks begin with, by their number."""
+        self.models = ModelBuilder(
+            self._entries, self.envs, self.streams, self.statistics, self.fence, initial
+        )
+        with _building(self.entry.algorithm):
+            factory = specs.resolve(self.entry.algorithm.factory)
+            own_options = population.joined([each.algorithm_options for each in self._entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
         self._informed = asks_for_more(self.algorithm.act)
         if not self._informed and any(population.remembers(module) for module in self.models.built):
             raise OptionError(
-                f"model '{entry.model.name}' remembers what it saw in an episode, and algorithm "
-                f"'{entry.algorithm.name}' would make it forget: {_that_remember(entry.model.name)}"
+                f"model '{self.entry.model.name}' remembers what it saw in an episode, and algorithm "
+                f"'{self.entry.algorithm.name}' would make it forget: {_that_remember(self.entry.model.name)}"
             )
 
     @functools.cached_property
@@ -508,10 +520,55 @@ class Trainer:
         envs.inner.autoreset = False
         return envs
 
-    def start(self) -> None:
-        """Begin at epoch 0: every training environment gets the stream that its seed and place determine."""
+    def start(self, initial: Arrays | None = None) -> None:
+        """Begin at epoch 0: every training environment gets the stream that its seed and place determine.
+
+        Parameters
+        ----------
+        initial:
+            Trained agents to begin with, seed-first, as `policy` returns them. All else is fresh: optimizers, buffers,
+            counters, and networks that do not act. Nothing of them, or None: as each seed draws its own.
+
+        Raises
+        ------
+        StoreError
+            If they are not agents of this entry's model.
+        OptionError
+            If the algorithm keeps what it acts with outside of its networks, or observations are standardized by
+            running statistics.
+        """
+        if initial:
+            self._build(self._places(initial))
         self.seed_environments()
         self.algorithm.start()
+
+    def _places(self, initial: Arrays) -> dict[int, dict[str, torch.Tensor]]:
+        """Return the numbers of trained agents by the network that they belong to, and their names there."""
+        if self.statistics is not None:
+            raise OptionError(
+                f"'{self.entry.label}': observations of '{self.entry.task.name}' are standardized by running "
+                "statistics, which training does not begin with: no agent to begin with is taken"
+            )
+        known = {
+            tensor.data_ptr(): (call, name)
+            for call, model in enumerate(self.models.built)
+            for name, tensor in model.state_dict().items()
+        }
+        places: dict[int, dict[str, torch.Tensor]] = {}
+        for name, tensor in self.algorithm.policy_state().items():
+            if not (tensor.is_floating_point() or tensor.is_complex()) or tensor.numel() == 0:
+                continue  # counters begin anew
+            if tensor.data_ptr() not in known:
+                raise OptionError(
+                    f"algorithm '{self.entry.algorithm.name}' keeps '{name}' outside of its networks: it cannot begin "
+                    "with trained agents"
+                )
+            value = initial.get(name)
+            if value is None or value.size != tensor.numel():
+                raise StoreError(f"the agents to begin with do not fit the entry's model: '{name}'")
+            call, own = known[tensor.data_ptr()]
+            places.setdefault(call, {})[own] = torch.from_numpy(value).reshape(tensor.shape)
+        return places
 
     def seed_environments(self) -> None:
         """Give every training environment its stream of epoch 0, from the beginning."""

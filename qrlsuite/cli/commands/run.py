@@ -75,6 +75,14 @@ def run(
             help=f"A small budget: {QUICK_SEEDS} seeds, {QUICK_EPOCHS} epochs, {QUICK_QUBITS} qubits.",
         ),
     ] = False,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="ENTRY",
+            help="Begin with the trained agents of this entry, seed k with that of seed k; [TASK/]ENTRY, or a folder.",
+        ),
+    ] = None,
     budget: BudgetOption = None,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
@@ -107,6 +115,7 @@ def run(
         runs,
         progress=not json_output,
         confirmed=yes,
+        start=start,
     )
     if json_output:
         typer.echo(json.dumps({"submitted": done.submitted} if done.submitted else done.summary()))

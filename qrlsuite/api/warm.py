@@ -1,0 +1,68 @@
+"""Begins the training of an entry with the trained agents of another one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from safetensors.numpy import save as encode
+
+from qrlsuite.api.evaluation import find
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment.entry import Entry
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import Arrays, EntryStore, write_atomically
+from qrlsuite.training import evaluation
+from qrlsuite.training.trainer import Trainer
+
+
+def begin_with(entry: Entry, runs: Path, name: str, seeds: Sequence[int] | None = None) -> Entry:
+    """Return an entry whose seeds begin with trained agents, which are put into its folder: seed k with that of seed k.
+
+    Parameters
+    ----------
+    entry:
+        What is to be trained.
+    name:
+        The entry of the agents: one of the same task, `TASK/ENTRY`, or a folder; of the results folder, or published.
+    seeds:
+        Those that are to be trained; None takes those of the task's protocol. Agents that are there stay.
+
+    Raises
+    ------
+    UnknownNameError
+        If no entry, or several, have the name.
+    StoreError
+        If it has no agents, they have other parameters than the model, or a file cannot be written.
+    OptionError
+        If a seed has no agent, or the algorithm cannot begin with agents.
+    """
+    source = find(runs, name, entry.task.name, published=True)
+    agents, _, _ = evaluation.best_runs(source, max(1, len(source.seeds())))
+    first = source.seed(agents[0])
+    _require_fit(entry, agents[0], first.parameters(), first.agent)
+    trained = evaluation.trained_entry(source)
+    epochs = int((first.record() or {})["epochs"])
+    start = f"{trained.task.name}/{trained.name}{source.mark}:{epochs}"
+    begun = replace(entry, start=start)
+    store = EntryStore.find(runs, begun)
+    requested = range(entry.task.file.protocol.seeds) if seeds is None else seeds
+    wanted = [seed for seed in requested if not store.start_of(seed).exists()]
+    if absent := sorted(set(wanted) - set(agents)):
+        there = format_seeds(sorted(agents))
+        raise OptionError(
+            f"--from: '{start}' has the agents of seeds {there}, and none for {format_seeds(absent)}: --seeds {there}"
+        )
+    if wanted:
+        EntryStore.create(runs, begun)
+    for seed in wanted:
+        write_atomically(store.start_of(seed), encode(source.seed(seed).parameters()))
+    return begun
+
+
+def _require_fit(entry: Entry, seed: int, agent: Arrays, path: Path) -> None:
+    """Begin with one agent, to see whether that can be done."""
+    trainer = Trainer(entry, [seed])
+    evaluation.require_fitting(trainer, agent, path)
+    trainer.start({name: value[None] for name, value in agent.items()})
