@@ -22,7 +22,7 @@ SMALL = {
 """What is appended to a command, so that it takes seconds; the last of two equal options counts."""
 CIRCUIT = ("qubits=2", "layers=1", "--seeds", "1")
 ELSEWHERE = {"doctor", "view"}
-"""The first imports every package anew, the second ends with Ctrl-C: see cli/test_doctor.py, leaderboard/test_live.py."""
+"""`doctor` imports every package anew, and `view` ends with Ctrl-C: cli/test_doctor.py, leaderboard/test_live.py."""
 
 
 def commands(page: str = "docs/start.md", section: str = "Every command once") -> list[list[str]]:
