@@ -93,7 +93,7 @@ def import_points(
     known = _known_task(name, runs)
     if known is None:
         step = every or _grid_of(points.values())
-        curves = {run: _on_grid(own, step, run, f"--every {_first(points)}") for run, own in points.items()}
+        curves = {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
         file = _new_task(name, step, curves, maximum, given)
         definition = _definition(file)
     else:
@@ -127,16 +127,14 @@ def _require_options(maximum: float | None, thresholds: Sequence[float], every: 
         If an option has a value that it cannot have.
     """
     if maximum is not None and not (math.isfinite(maximum) and maximum > 0):
-        raise OptionError(f"--maximum {maximum}: give the best possible score, a number above 0")
+        raise OptionError(f"maximum={maximum}: give the best possible score, a number above 0")
     levels = sorted(float(level) for level in thresholds)
     if not all(map(math.isfinite, levels)) or len(set(levels)) < len(levels):
-        raise OptionError(
-            f"--thresholds {','.join(f'{level:g}' for level in levels)}: give numbers, each once"
-        )
+        raise OptionError(f"thresholds={','.join(f'{level:g}' for level in levels)}: give numbers, each once")
     if maximum is not None and levels and not 0 < levels[0] <= levels[-1] <= maximum:
-        raise OptionError(f"--thresholds: give scores above 0, up to --maximum {maximum:g}")
+        raise OptionError(f"thresholds: give scores above 0, up to maximum={maximum:g}")
     if every is not None and every < 1:
-        raise OptionError(f"--every {every}: give a number of environment steps, 1 or more")
+        raise OptionError(f"every={every}: give a number of environment steps, 1 or more")
     return levels
 
 
@@ -191,9 +189,7 @@ def _on_grid(own: Points, every: int, run: Run, instead: str) -> NDArray[np.floa
     if last < every:
         raise FileError(f"{of_run} ends at step {last}, before the first grid point at {every}")
     if last // every > _MOST_GRID_POINTS:
-        raise FileError(
-            f"{of_run} has {last // every:,} grid points: --every {math.ceil(last / GRID_POINTS)}"
-        )
+        raise FileError(f"{of_run} has {last // every:,} grid points: every={math.ceil(last / GRID_POINTS)}")
     grid = every * np.arange(1, last // every + 1)
     return own.scores[np.searchsorted(own.steps, grid, side="right") - 1]
 
@@ -214,8 +210,8 @@ def _new_task(
     """
     if maximum is None and not thresholds:
         raise OptionError(
-            f"'{printable(name)}' is a new task: say what a good score is with --maximum BEST (the best possible), "
-            "--thresholds A,B,... (scores that count as reached), or --task TASK of the suite"
+            f"'{printable(name)}' is a new task: say what a good score is with maximum=BEST (the best possible), "
+            "thresholds=A,B,... (scores that count as reached), or --task TASK of the suite"
         )
     ranking: dict[str, Any] = {"thresholds": thresholds, "reference": {"threshold": (thresholds or [0])[-1]}}
     if maximum is not None:
@@ -276,21 +272,21 @@ def _require_same_options(
     """
     step, ranking = file.protocol.interactions, file.ranking
     if every not in (None, step):
-        raise OptionError(f"--every {every}: task '{file.name}' has a grid of {step} steps; leave it out")
+        raise OptionError(f"every={every}: task '{file.name}' has a grid of {step} steps; leave it out")
     best = file.score.max_return if file.environment.name == EXTERNAL else None
     if best is not None and maximum not in (None, best):
         raise OptionError(
-            f"--maximum {maximum:g}: task '{file.name}' has {best:g}; give this one another --task NAME"
+            f"maximum={maximum:g}: task '{file.name}' has {best:g}; give this one another --task NAME"
         )
     if maximum is not None and ranking.thresholds is not None:
         raise OptionError(
-            f"--maximum {maximum:g}: task '{file.name}' has thresholds on the score itself; leave it out"
+            f"maximum={maximum:g}: task '{file.name}' has thresholds on the score itself; leave it out"
         )
     scale = 1.0 if ranking.epsilons is None else file.score.max_return or maximum or 1.0
     own = sorted(scale * level for level in ranking.grid.thresholds)
     if thresholds and not (len(own) == len(thresholds) and np.allclose(own, thresholds)):
         raise OptionError(
-            f"--thresholds: task '{file.name}' has {', '.join(f'{level:g}' for level in own)}; leave them out"
+            f"thresholds: task '{file.name}' has {', '.join(f'{level:g}' for level in own)}; leave them out"
         )
 
 
@@ -310,13 +306,13 @@ def _scores(
     except StoreError:
         low, high = float(curve.min()), float(curve.max())
         of_best = (
-            "1, as the task has it (--maximum is what counts as 1)"
+            "1, as the task has it (maximum is what counts as 1)"
             if best is None
             else f"{best:g}, the maximum"
         )
         raise FileError(
             f"{source}: '{run[0]}', seed {run[1]}: scores from {low:g} to {high:g} are not between 0 and {of_best}; "
-            "a new task with --thresholds alone takes any"
+            "a new task with thresholds alone takes any"
         ) from None
     return scores
 
@@ -371,7 +367,7 @@ def _write(
         before = store.record()["imported"].get("maximum")
         if before != told["maximum"]:
             raise OptionError(
-                f"--maximum: '{entry}' was imported with {before}: seeds of one entry have one scale"
+                f"maximum: '{entry}' was imported with {before}: seeds of one entry have one scale"
             )
     else:
         write_json(store.path / "entry.json", record)

@@ -255,7 +255,7 @@ def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str
     wrong = [name for name in wanted if list(names).count(name) != 1]
     if wrong:
         here = listed([ascii(name)[1:-1][:40] for name in names]) or "none"
-        other = "; --metric NAME reads another column as the score" if wrong == [COLUMNS[3]] else ""
+        other = "; metric=NAME reads another column as the score" if wrong == [COLUMNS[3]] else ""
         raise FileError(f"{source}: expected the columns {', '.join(wanted)}, each once; found {here}{other}")
     return wanted
 

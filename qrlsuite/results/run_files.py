@@ -106,7 +106,7 @@ def read(paths: Sequence[Path], metric: str | None = None) -> Curve:
         names = listed([path.name for path in paths])
         raise FileError(f"{paths[0].parent}: {names} are of one run: name one of them")
     if metric is not None and not _streamed(paths[0]):
-        raise FileError(f"{paths[0]}: --metric {metric}: files of Stable-Baselines3 have one score")
+        raise FileError(f"{paths[0]}: metric={metric}: files of Stable-Baselines3 have one score")
     return reader(paths, metric)
 
 
@@ -358,7 +358,7 @@ def _chosen(found: Mapping[str, Mapping[int, float]], metric: str | None, path: 
     name = metric or next((name for name in METRICS if found.get(name)), "")
     if not found.get(name):
         here = listed([ascii(each)[1:-1][:60] for each in sorted(found)]) or "none"
-        raise FileError(f"{path}: name the scalar that is the score with --metric; found {here}")
+        raise FileError(f"{path}: name the scalar that is the score with metric=NAME; found {here}")
     return sorted(found[name].items())
 
 

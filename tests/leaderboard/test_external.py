@@ -62,7 +62,7 @@ def qrlsuite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., A
 def test_from_csv_to_a_verdict_and_a_picture_in_three_commands(
     csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
 ) -> None:
-    imported = qrlsuite("import", csv, "--maximum", 100)
+    imported = qrlsuite("import", csv, "maximum=100")
     assert "external fast lr=0.1 on external: imported seeds 0:20" in imported.output
     assert "grid: every 1000 steps, the last score at or before" in imported.output
     assert "scores over 100; thresholds 0.6, 0.7, 0.8, 0.9; horizon 10000 steps" in imported.output
@@ -76,7 +76,7 @@ def test_from_csv_to_a_verdict_and_a_picture_in_three_commands(
 def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
     csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
 ) -> None:
-    qrlsuite("import", csv, "--maximum", 100)
+    qrlsuite("import", csv, "maximum=100")
     board = qrlsuite("leaderboard").output
     assert "curves that other programs made, and nobody here can train or check again: external fast" in board
     [fast] = [line for line in board.splitlines() if "fast lr=0.1" in line and "█" in line]
@@ -98,7 +98,7 @@ def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
 def test_external_entries_are_not_trained_evaluated_or_published(
     csv: Path, qrlsuite: Callable[..., Any]
 ) -> None:
-    qrlsuite("import", csv, "--maximum", 100)
+    qrlsuite("import", csv, "maximum=100")
     for words, message in (
         (("export", "fast"), "can be compared, not trained, evaluated or published"),
         (("evaluate", "fast"), "hold learning curves and no trained parameters"),
@@ -109,8 +109,8 @@ def test_external_entries_are_not_trained_evaluated_or_published(
 
 
 def test_power_and_rliable_take_them(qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path) -> None:
-    qrlsuite("import", csv, "--maximum", 100)
-    qrlsuite("import", csv, "--maximum", 100, "--task", "another")
+    qrlsuite("import", csv, "maximum=100")
+    qrlsuite("import", csv, "maximum=100", "--task", "another")
     scores = qrlsuite("export", "--out", "scores.npz", "--task", "external", "--task", "another")
     assert "fast lr=0.1: 20 runs, 2 tasks" in scores.output, scores.exception
     needs = json.loads(
@@ -158,7 +158,7 @@ def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:
     file = entry.task_file
     assert entry.steps_per_epoch == file.protocol.interactions
     assert entry.curves[0, -1] == 250 / (file.score.max_return or 1)
-    with pytest.raises(OptionError, match="--every 7: task 'cartpole' has a grid of"):
+    with pytest.raises(OptionError, match="every=7: task 'cartpole' has a grid of"):
         api.import_curves(runs, steps=[900, 2000], task="cartpole", every=7, runs=tmp_path)
     with pytest.raises(QrlSuiteError, match="are not between 0 and 1"):
         api.import_curves({"a": ([0], [[5.0]])}, steps=[2000], task="beam6g", runs=tmp_path)
@@ -206,7 +206,7 @@ BAD = {
         "name,seed,step,reward\n",
         "expected the columns entry, seed, step, score, each once; found name, seed",
     ),
-    "no score": ("entry,seed,step,r\n", "--metric NAME reads another column as the score"),
+    "no score": ("entry,seed,step,r\n", "metric=NAME reads another column as the score"),
     "empty": ("", "found none"),
     "no rows": (GOOD, "there is no score after step 0"),
     "only before training": (GOOD + "a,0,0,1\n", "there is no score after step 0"),
@@ -238,12 +238,12 @@ def test_bad_csv_is_refused_and_nothing_is_written(case: str, tmp_path: Path) ->
 
 def test_what_a_good_score_is_has_to_be_said(csv: Path, tmp_path: Path) -> None:
     for options, message in (
-        ({}, "'external' is a new task: say what a good score is with --maximum"),
-        ({"maximum": -1.0}, "--maximum -1.0: give the best possible score"),
-        ({"maximum": 10.0, "thresholds": [20]}, "up to --maximum 10"),
+        ({}, "'external' is a new task: say what a good score is with maximum"),
+        ({"maximum": -1.0}, "maximum=-1.0: give the best possible score"),
+        ({"maximum": 10.0, "thresholds": [20]}, "up to maximum=10"),
         ({"thresholds": [20, 20]}, "give numbers, each once"),
         ({"maximum": 100.0, "task": "../up"}, "--task ../up: name"),
-        ({"maximum": 100.0, "every": 0}, "--every 0"),
+        ({"maximum": 100.0, "every": 0}, "every=0"),
     ):
         with pytest.raises(QrlSuiteError, match=message):
             api.import_curves(csv, runs=tmp_path / "runs", **options)
@@ -316,7 +316,7 @@ def test_event_files_of_tensorboard(sb3: Path) -> None:
     np.testing.assert_allclose(found["small", 1].scores, evaluated["results"].mean(axis=1), rtol=1e-6)
     assert points.read_files(events, "rollout/ep_rew_mean")["small", 1].steps.tolist() == [64, 128, 192, 256]
     with pytest.raises(
-        QrlSuiteError, match=r"name the scalar that is the score with --metric; found .*eval/mean_reward"
+        QrlSuiteError, match=r"name the scalar that is the score with metric=NAME; found .*eval/mean_reward"
     ):
         points.read_files(events, "reward")
     torn = events[0].parent / "events.out.tfevents.torn"
@@ -419,9 +419,9 @@ def test_files_and_folders_are_told_apart(qrlsuite: Callable[..., Any], csv: Pat
     for words, message in (
         (("empty",), "holds no entry"),
         (("empty", csv), "import folders and files by commands of their own"),
-        (("empty", "--maximum", 3), "--maximum is for files with curves"),
+        (("empty", "maximum=3"), "maximum is for files with curves"),
         (("notes.txt",), "give a csv file with the columns entry,seed,step,score"),
         (("none.csv",), "none.csv cannot be read: No such file or directory"),
-        ((csv, "--thresholds", "high"), "--thresholds high: write numbers"),
+        ((csv, "thresholds=high"), "thresholds=high: write numbers"),
     ):
         assert message in str(qrlsuite("import", *words).exception), words

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from qrlsuite import api
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import external, importing, published_studies
 from qrlsuite.leaderboard.shelf.importing import Imported
-from qrlsuite.results import points
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
 
 
 def import_entries(
-    paths: Annotated[
-        list[Path],
+    words: Annotated[
+        list[str],
         typer.Argument(
-            metavar="PATH...",
+            metavar="PATH... [OPTION=VALUE]...",
             help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with the curves "
             "of other programs: csv (entry,seed,step,score), monitor.csv or evaluations.npz of Stable-Baselines3, "
-            "event files of TensorBoard, *.wandb.",
+            "event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best possible score, of which "
+            "scores become fractions; metric=NAME, the column or scalar that is the score; for a new task "
+            "thresholds=A,B,..., scores that count as reached, and every=STEPS between grid points.",
         ),
     ],
     task: Annotated[
@@ -34,32 +36,6 @@ def import_entries(
         typer.Option(
             "--task", help="Of files: a task of the suite, or the name of a new one; default: external."
         ),
-    ] = None,
-    maximum: Annotated[
-        float | None,
-        typer.Option(
-            "--maximum",
-            metavar="BEST",
-            help="Of files: the best possible score; scores become fractions of it.",
-        ),
-    ] = None,
-    thresholds: Annotated[
-        str | None,
-        typer.Option(
-            "--thresholds", metavar="A,B,...", help="Of files: scores that count as reached, for a new task."
-        ),
-    ] = None,
-    every: Annotated[
-        int | None,
-        typer.Option(
-            "--every",
-            metavar="STEPS",
-            help="Of files: environment steps between grid points, for a new task.",
-        ),
-    ] = None,
-    metric: Annotated[
-        str | None,
-        typer.Option("--metric", metavar="NAME", help="Of files: the column or scalar that is the score."),
     ] = None,
     runs: RunsOption = Path("runs"),
     json_output: JsonOption = False,
@@ -72,27 +48,20 @@ def import_entries(
     Curves of other programs become external entries, which can be compared and drawn as any. At every grid point
     stands the last score at or before it. A path names a run: logs/small/seed-3/evaluations.npz is seed 3 of `small`.
 
-    Examples: qrlsuite import /mnt/cluster/runs; qrlsuite import curves.csv --maximum 500
+    Examples: qrlsuite import /mnt/cluster/runs; qrlsuite import curves.csv maximum=500
     """
+    paths, options = _divide(words)
     files = [path for path in paths if not path.is_dir()]
-    of_files = {
-        "--task": task,
-        "--maximum": maximum,
-        "--thresholds": thresholds,
-        "--every": every,
-        "--metric": metric,
-    }
+    given = [*(["--task"] if task is not None else []), *options]
     if files and len(files) < len(paths):
         raise OptionError("import folders and files by commands of their own")
-    if not files and (given := [name for name, value in of_files.items() if value is not None]):
+    if not files and given:
         raise OptionError(
             f"{given[0]} is for files with curves; a folder of this suite says it itself: leave it out"
         )
-    if files:
-        found = points.read_files(files, metric)
-        taken = external.import_points(found, runs, task, maximum, _numbers(thresholds), every)
+    taken = api.import_curves(files, task=task, runs=runs, **options) if files else None
     done = []
-    for each in taken if files else (each for path in paths for each in _taken(path, runs)):
+    for each in taken or (each for path in paths for each in _taken(path, runs)):
         done.append(each)
         if json_output:
             continue
@@ -118,9 +87,36 @@ def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
         yield from (importing.import_seeds(source, runs) for source in importing.sources(folder))
 
 
-def _numbers(text: str | None) -> Sequence[float]:
-    """Read the numbers of `--thresholds`."""
+def _divide(words: Sequence[str]) -> tuple[list[Path], dict[str, Any]]:
+    """Divide words into paths and options; a path may have a `=` in it, too."""
+    options: dict[str, Any] = {}
+    paths = []
+    for word in words:
+        name, equals, text = word.partition("=")
+        if equals and name in OPTIONS:
+            options[name] = _value(word, text, OPTIONS[name])
+        else:
+            paths.append(Path(word))
+    if not paths:
+        raise OptionError("import what? give a folder or files: qrlsuite import curves.csv maximum=500")
+    return paths, options
+
+
+def _value(word: str, text: str, kind: Callable[[str], Any]) -> Any:
     try:
-        return [float(word) for word in text.split(",")] if text is not None else []
+        return kind(text)
     except ValueError:
-        raise OptionError(f"--thresholds {text}: write numbers, such as --thresholds 100,200") from None
+        raise OptionError(f"{word}: write {'numbers' if kind is _numbers else 'a number'}") from None
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split(",")]
+
+
+OPTIONS: dict[str, Callable[[str], Any]] = {
+    "maximum": float,
+    "thresholds": _numbers,
+    "every": int,
+    "metric": str,
+}
+"""Options of files, by name, and how they are read."""

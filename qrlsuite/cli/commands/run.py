@@ -11,7 +11,7 @@ import typer
 from qrlsuite import options, registry, specs
 from qrlsuite.api.arguments import where_of
 from qrlsuite.api.training import resolve_entry, train_entry
-from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of
+from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of, split_settings
 from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
@@ -43,7 +43,7 @@ def run(
         typer.Argument(
             metavar="[ENTRY]",
             help="[ALGORITHM] MODEL [NAME=VALUE ...] [preset=FILE], as boards print it: mlp width=16, or ppo mlp. "
-            "--model and --set say the same.",
+            "With --model, options alone.",
         ),
     ] = None,
     model: Annotated[
@@ -125,11 +125,12 @@ def run(
 
 def _written(words: list[str], model: str | None, settings: list[str], quick: bool) -> Written:
     """Read the entry, given as arguments or by --model, and what --set and --quick add."""
-    if bool(words) == (model is not None):
+    if model is not None and not split_settings(words)[0]:
+        words, model = [model, *words], None
+    if not words or model is not None:
         problem = f"'{' '.join(words)}' and --model {model}: give one of them" if words else "name a model"
         raise OptionError(f"{problem}, for example: qrlsuite run mlp width=16 --task beam6g")
-    text = " ".join(words) or str(model)
-    written = parse_entry(text).given(settings=tuple(map(options.parse_setting, settings)))
+    written = parse_entry(" ".join(words)).given(settings=tuple(map(options.parse_setting, settings)))
     if not quick or any(setting.name == "qubits" for setting in written.settings):
         return written
     names = options.field_names(specs.resolve(registry.get(specs.ModelSpec, written.model).options))
