@@ -16,7 +16,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from types import SimpleNamespace
 from typing import Any, Generic, TypeVar
@@ -93,6 +93,8 @@ class Registry:
     strict: bool = False
     own: Any = None
     """What `qrlsuite.own` keeps of the plugins that were loaded by path."""
+    on_backends: list[Registered[specs.ModelSpec]] = field(default_factory=list)
+    """The models for every circuit backend."""
 
     def of(self, kind: type[S]) -> Mapping[str, Registered[S]]:
         """Return what is registered of a kind, by name."""
@@ -177,14 +179,36 @@ class Registry:
         """Add what was registered; returns its names by kind in the plural."""
         registered: dict[str, list[str]] = {}
         for each in new:
-            registered.setdefault(each.spec.kinds, []).append(each.spec.name)
-            self._add(each)
+            for one in self._with_models(each):
+                registered.setdefault(one.spec.kinds, []).append(one.spec.name)
+                self._add(one)
         return registered
 
+    def _with_models(self, new: Registered[Any]) -> list[Registered[Any]]:
+        """Return a spec, and with a circuit backend the models on it; a model for each backend is one on each."""
+        backends = self.of(specs.CircuitBackendSpec)
+        if isinstance(new.spec, specs.CircuitBackendSpec):
+            made = [replace(each, spec=each.spec.on(new.spec)) for each in self.on_backends]
+            return [new, *(each for each in made if each.spec.name not in self.of(specs.ModelSpec))]
+        if not isinstance(new.spec, specs.ModelSpec) or not new.spec.backends:
+            return [new]
+        self.on_backends.append(new)
+        return [replace(new, spec=new.spec.on(each.spec)) for each in backends.values()]
+
     def remove(self, distribution: str) -> None:
-        """Forget all that a distribution has registered, and its hooks."""
-        for entries in self.entries.values():
+        """Forget all that a distribution has registered, the models on its circuit backends, and its hooks."""
+        gone = [each.spec for each in self if each.distribution == distribution]
+        lost = {
+            each.spec.on(spec).name
+            for spec in gone
+            if isinstance(spec, specs.CircuitBackendSpec)
+            for each in self.on_backends
+        }
+        self.on_backends = [each for each in self.on_backends if each.distribution != distribution]
+        for kind, entries in self.entries.items():
             for name in [name for name, each in entries.items() if each.distribution == distribution]:
+                del entries[name]
+            for name in lost & entries.keys() if kind is specs.ModelSpec else ():
                 del entries[name]
         for name, plugin in self.manager.list_name_plugin():
             if plugin is not None and name.startswith(f"{distribution}:"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from qrlsuite.errors import PluginError, UnknownNameError, nearest
@@ -20,14 +20,15 @@ WHOLE_NAME = f"^(?:{NAME.pattern})$"
 
 
 def resolve(reference: str) -> Any:
-    """Import what a reference `"package.module:Name"` points at.
+    """Import what a reference `"package.module:Name"` points at; `"package.module:Name[key]"` is `Name["key"]`.
 
     Raises
     ------
     PluginError
         If the reference is malformed, the module cannot be imported or the name is not in it.
     """
-    module_name, separator, attribute = reference.partition(":")
+    module_name, separator, attribute = reference.removesuffix("]").partition(":")
+    attribute, bracket, key = attribute.partition("[")
     if not separator or not module_name or not attribute:
         raise PluginError(f"reference {reference!r} should read 'package.module:Name'")
     try:
@@ -35,9 +36,10 @@ def resolve(reference: str) -> Any:
     except ImportError as error:
         raise PluginError(f"reference {reference!r} cannot be imported: {error}") from error
     try:
-        return getattr(module, attribute)
+        found = getattr(module, attribute)
     except AttributeError:
         raise PluginError(f"reference {reference!r}: module '{module_name}' has no '{attribute}'") from None
+    return found[key] if bracket else found
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +170,9 @@ class ModelSpec(NumericSpec):
         fit is refused before it is trained. None where it is unknown.
     faster:
         Name of a model that computes the same function much faster; recommended where training takes hours.
+    backends:
+        Whether it is a model for each circuit backend, of plugins too: registered as `NAME-BACKEND`, with the options
+        `options["BACKEND"]`, which `qrlsuite.circuit.options_on` makes.
     """
 
     kind, kinds = "model", "models"
@@ -178,6 +183,7 @@ class ModelSpec(NumericSpec):
     population: str | None = None
     memory: str | None = None
     faster: str | None = None
+    backends: bool = False
 
     def __post_init__(self) -> None:
         Spec.__post_init__(self)
@@ -185,6 +191,18 @@ class ModelSpec(NumericSpec):
             raise PluginError(
                 f"model '{self.name}': family {self.family!r} is neither 'classical' nor 'quantum'"
             )
+
+    def on(self, backend: CircuitBackendSpec) -> ModelSpec:
+        """Return the model of one circuit backend."""
+        name = f"{self.name}-{backend.name}"
+        return replace(
+            self,
+            name=name,
+            summary=f"{self.summary} on {backend.name}: {backend.summary.partition(';')[0]}",
+            options=f"{self.options}[{backend.name}]",
+            faster=None if name == self.faster else self.faster,
+            backends=False,
+        )
 
 
 @dataclass(frozen=True, slots=True)

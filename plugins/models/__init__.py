@@ -7,22 +7,10 @@ from collections.abc import Callable
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import ModelSpec
 
-CIRCUITS = {
-    "native": "in the suite's own batched simulator; the fast one",
-    "pennylane": "on any PennyLane device",
-    "qiskit": "on Qiskit primitives: exact, with shots, or with noise",
-}
-
-MEMORY = {
-    "native": "qrlsuite.plugins.models.vqc:native_memory",
-    "pennylane": "qrlsuite.plugins.models.vqc:pennylane_memory",
-}
-"""What is known of the states that a simulator keeps."""
-
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru` and the `vqc-*` models."""
+    """Register `mlp`, `fourier`, `gru`, and `vqc-BACKEND` for each circuit backend."""
     register(
         ModelSpec(
             name="mlp",
@@ -55,21 +43,16 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             memory="qrlsuite.plugins.models.gru:memory",
         )
     )
-    for backend, summary in CIRCUITS.items():
-        options = {
-            "native": "VQCNativeOptions",
-            "pennylane": "VQCPennyLaneOptions",
-            "qiskit": "VQCQiskitOptions",
-        }[backend]
-        register(
-            ModelSpec(
-                name=f"vqc-{backend}",
-                summary=f"Hybrid variational quantum circuit {summary}",
-                family="quantum",
-                options=f"qrlsuite.plugins.models.vqc:{options}",
-                build="qrlsuite.plugins.models.vqc:build",
-                population="qrlsuite.plugins.models.vqc:population",
-                memory=MEMORY.get(backend),
-                faster=None if backend == "native" else "vqc-native",
-            )
+    register(
+        ModelSpec(
+            name="vqc",
+            summary="Hybrid variational quantum circuit",
+            family="quantum",
+            options="qrlsuite.plugins.models.vqc:VQCOptions",
+            build="qrlsuite.plugins.models.vqc:build",
+            population="qrlsuite.plugins.models.vqc:population",
+            memory="qrlsuite.plugins.models.vqc:memory",
+            faster="vqc-native",
+            backends=True,
         )
+    )

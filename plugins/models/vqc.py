@@ -6,7 +6,7 @@ whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3
 layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as in earlier work on CartPole (Jerbi
 et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
 
-One module serves all backends; the three models differ in which backend computes the circuit.
+One module serves all backends; the models differ in which backend computes the circuit.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite import registry, specs
-from qrlsuite.circuit import Circuit, CircuitBackend, ansatz, create_backend
+from qrlsuite.circuit import Circuit, CircuitBackend, ExecutionCounter, ansatz, create_backend, options_on
 from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
-from qrlsuite.plugins.circuits.options import NativeOptions, PennyLaneOptions, QiskitOptions
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
@@ -41,7 +40,7 @@ OptionValue = bool | int | float | str
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class VQCOptions:
-    """Options of every hybrid circuit model."""
+    """Options of every hybrid circuit model; `VQCOptions["native"]` are those of `vqc-native`, with its backend's."""
 
     backend: ClassVar[str]
     passes_on: ClassVar[tuple[str, ...]] = ("gate",)
@@ -110,6 +109,9 @@ class VQCOptions:
         ):  # an ansatz that cannot be found is refused by `check`, in better words
             return values
 
+    def __class_getitem__(cls, backend: str) -> type[VQCOptions]:
+        return options_on(cls, backend)
+
     def check(self) -> None:
         """Build the circuit once, so that one that cannot be built is refused before anything is trained.
 
@@ -132,68 +134,6 @@ class VQCOptions:
             )
         if circuit.mean_field and not registry.get(specs.CircuitBackendSpec, self.backend).mean_field:
             raise OptionError(mean_field_refusal(self.backend))
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class VQCPennyLaneOptions(PennyLaneOptions, VQCOptions):
-    """Options of `vqc-pennylane`."""
-
-    backend: ClassVar[str] = "pennylane"
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class VQCQiskitOptions(QiskitOptions, VQCOptions):
-    """Options of `vqc-qiskit`."""
-
-    backend: ClassVar[str] = "qiskit"
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class VQCNativeOptions(NativeOptions, VQCOptions):
-    """Options of `vqc-native`."""
-
-    backend: ClassVar[str] = "native"
-
-
-class ExecutionCounter:
-    """Circuit executions of each agent; the agents of a population do the same number.
-
-    Deep copies of a model (target networks) share their original's counter.
-
-    Attributes
-    ----------
-    forward:
-        Circuits executed in forward passes: one per input.
-    gradient:
-        Circuits executed for gradients, where shots or noise are simulated. Exact simulators differentiate otherwise;
-        so that entries can be compared, theirs are the circuits that the parameter-shift rule would need for the
-        gradients taken, as on hardware: per input two for every variable angle of an uncontrolled rotation, four for
-        one of a controlled rotation.
-    per_gradient:
-        The number of these circuits for the gradient at one input.
-    """
-
-    def __init__(self, shots: int | None, per_gradient: int, mean_field: bool = False) -> None:
-        self.mean_field = mean_field
-        self.shots = shots
-        self.per_gradient = per_gradient
-        self.forward = 0
-        self.gradient = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counts: `forward`, `parameter_shift`, and with finite shots the `shots` of both together.
-
-        None of a mean-field approximation, which is no circuit and executes none.
-        """
-        if self.mean_field:
-            return {}
-        counts = {"forward": self.forward, "parameter_shift": self.gradient}
-        if self.shots is not None:
-            counts["shots"] = self.shots * (self.forward + self.gradient)
-        return counts
-
-    def _backward(self, inputs: int) -> None:
-        self.gradient += inputs * self.per_gradient
 
 
 class _Runner:
@@ -279,9 +219,20 @@ class _Hybrid(nn.Module):
         return self._runner.executions
 
     @property
+    def description(self) -> Circuit:
+        """The circuit."""
+        return self._runner.circuit
+
+    @property
     def simulator(self) -> bool:
         """Whether the circuits are only simulated; else executions may cost money."""
         return bool(getattr(self._runner.backend, "simulator", True))
+
+    def compile_circuits(self) -> None:
+        """Let the circuit's backend compile what the first pass would, if it has a way to."""
+        compile_for = getattr(self._runner.backend, "compile_for", None)
+        if compile_for is not None and self.simulator:
+            compile_for(next(self.output.parameters()))
 
     def circuit_states(self, x: Tensor) -> Tensor:
         """Return the circuit's final states (S, B, 2^n) for observations (S, B, in); qubit 0 is the highest bit."""
@@ -311,7 +262,7 @@ class _Hybrid(nn.Module):
         executions, inputs = runner.executions, x.shape[1]
         executions.forward += inputs
         if values.requires_grad:
-            values.register_hook(lambda grad: executions._backward(inputs))  # type: ignore[no-untyped-call]
+            values.register_hook(lambda grad: executions.count_backward(inputs))  # type: ignore[no-untyped-call]
         values = ACTIVATIONS[options.activation_out](values)
         if options.linear:
             return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
@@ -359,12 +310,6 @@ class VQCPopulation(_Hybrid):
         super().__init__(
             runner, {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
         )
-
-    def compile_circuits(self) -> None:
-        """Let the circuit's backend compile what the first pass would, if it has a way to."""
-        compile_for = getattr(self._runner.backend, "compile_for", None)
-        if compile_for is not None and self.simulator:
-            compile_for(next(self.output.parameters()))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
@@ -451,7 +396,13 @@ def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:
     return VQCPopulation(modules, options)
 
 
-def native_memory(options: VQCNativeOptions, agents: int, batch: int, copies: int) -> int:
+def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
+    """Return the bytes of the states that a simulator keeps, 0 where nothing is known of it."""
+    of_states = {"native": _native_memory, "pennylane": _pennylane_memory}.get(options.backend)
+    return 0 if of_states is None else of_states(options, agents, batch, copies)
+
+
+def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
     """Return the bytes of 2^n complex amplitudes, 8 each (16 in float64), of every sample, where they are kept.
 
     Three of the simulator's working states, of 128 bytes per amplitude, come on top.
@@ -463,7 +414,7 @@ def native_memory(options: VQCNativeOptions, agents: int, batch: int, copies: in
     return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
 
 
-def pennylane_memory(options: VQCPennyLaneOptions, agents: int, batch: int, copies: int) -> int:
+def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int:
     """Return the bytes of the states behind every gate, 64 layers n 2^n per sample, where PennyLane backpropagates."""
     backprop = options.diff_method in ("auto", "backprop") and options.shots is None
     if not (_entangled(options) and backprop and options.device == "default.qubit"):

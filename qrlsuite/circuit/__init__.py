@@ -5,8 +5,9 @@ Importing this package imports numpy and nothing heavier; registry, torch and si
 
 from __future__ import annotations
 
-from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend, expectations
+from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend, expectations, options_on
 from qrlsuite.circuit.description import GATES, MAX_QUBITS, Angle, Circuit, Element, Operation, Parameter
+from qrlsuite.circuit.model import CircuitModel, ExecutionCounter
 
 __all__ = [
     "GATES",
@@ -14,10 +15,13 @@ __all__ = [
     "Angle",
     "Circuit",
     "CircuitBackend",
+    "CircuitModel",
     "Element",
+    "ExecutionCounter",
     "Operation",
     "Parameter",
     "ansatz",
     "create_backend",
     "expectations",
+    "options_on",
 ]

@@ -12,11 +12,12 @@ Registry, torch and simulators are imported when a function is called, not befor
 from __future__ import annotations
 
 import copy
+import functools
 import threading
 import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from qrlsuite.specs import CircuitBackendSpec
+
+
+Options = TypeVar("Options")
 
 
 class CircuitBackend(Protocol):
@@ -127,6 +131,46 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         raise PluginError(f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit")
     circuit.require_simulable()
     return circuit
+
+
+def options_on(own: type[Options], backend: str) -> type[Options]:
+    """Return the options of a circuit model and those of the backend that computes its circuits, as one class.
+
+    Parameters
+    ----------
+    own:
+        The model's, a frozen pydantic dataclass.
+    backend:
+        Name of the backend; the class variable `backend` of the result.
+
+    Raises
+    ------
+    UnknownNameError
+        If no backend has that name.
+    PluginError
+        If both classes have something of one name.
+    """
+    from qrlsuite import registry, specs
+
+    return _joined(own, specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options), backend)
+
+
+@functools.cache
+def _joined(own: type[Options], theirs: type[Any], backend: str) -> type[Options]:
+    from pydantic import ConfigDict
+    from pydantic.dataclasses import dataclass
+
+    from qrlsuite.options import field_names
+
+    names = {*field_names(own), *(name for name in vars(own) if not name.startswith("_"))}
+    if shared := sorted(names & set(dir(theirs)) | names & set(field_names(theirs))):
+        raise PluginError(
+            f"circuit backend '{backend}': '{shared[0]}' of its options is one of the model's: give it another name"
+        )
+    content = {"__module__": own.__module__, "__doc__": own.__doc__, "backend": backend}
+    made = type(f"{own.__name__}[{backend}]", (theirs, own), content)
+    joined: type[Options] = dataclass(frozen=True, config=ConfigDict(extra="forbid"))(made)
+    return joined
 
 
 def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBackend:

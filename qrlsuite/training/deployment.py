@@ -14,12 +14,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite import options, registry, specs
+from qrlsuite.circuit import CircuitModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry
@@ -67,8 +68,11 @@ def on_backend(entry: Entry, backend: str, values: Mapping[str, Any]) -> Entry:
     known = registry.load()
     for name in known.names(specs.ModelSpec):
         model = registry.get(specs.ModelSpec, name)
+        on_another = model.options.endswith("]") and not model.options.endswith(f"[{backend}]")
+        if model.build != entry.model.build or on_another:
+            continue
         cls = specs.resolve(model.options)
-        if model.build == entry.model.build and getattr(cls, "backend", None) == backend:
+        if getattr(cls, "backend", None) == backend:
             break
     else:
         raise OptionError(
@@ -142,9 +146,8 @@ class Deployment:
         self.entry = on_backend(entry, backend, values)
         self.seeds, self.validation, self.runs = best_runs(store, best)
         # Not the agents yet: what builds a population tries it out, which on a device executes circuits.
-        network: Any = first_network(self.entry)
-        self.simulator = bool(getattr(network, "simulator", True))
-        self.shots: int | None = network.executions.shots
+        network = cast(CircuitModel, first_network(self.entry))
+        self.simulator, self.shots = network.simulator, network.executions.shots
         self._store, self._device = store, device
         chosen = " ".join(f"{name}={value}" for name, value in values.items())
         self.name = f"{policy_name(store, on)} on {backend}{' ' if chosen else ''}{chosen}"

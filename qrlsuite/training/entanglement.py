@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from qrlsuite.circuit import CircuitModel
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import Task
@@ -152,17 +153,14 @@ def states_of(network: nn.Module, entry: Entry, x: Tensor, check: bool = False) 
     OptionError
         If the network has no circuit, or one whose qubits share no state.
     """
-    compute = getattr(network, "circuit_states", None)
-    circuit = getattr(getattr(network, "_runner", None), "circuit", None)
-    if compute is None or circuit is None:
+    if not isinstance(network, CircuitModel):
         raise OptionError(f"--entanglement: model '{entry.model.name}' of '{entry.label}' has no circuit")
-    if circuit.mean_field:
+    if network.description.mean_field:
         raise OptionError(f"--entanglement: '{entry.label}' drops all correlations, so nothing is entangled")
     if check:
         return x
     with torch.no_grad():
-        states: Tensor = compute(x)
-    return states
+        return network.circuit_states(x)
 
 
 def _play(

@@ -27,6 +27,7 @@ from torch import nn
 import qrlsuite
 from qrlsuite import actions as action_spaces
 from qrlsuite import population, registry, specs
+from qrlsuite.circuit import CircuitModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry
@@ -351,6 +352,11 @@ class ModelBuilder:
             with torch.no_grad():
                 for name, value in self.initial.get(call, {}).items():
                     together.state_dict()[name].copy_(value)
+        if hasattr(together, "executions") and not isinstance(together, CircuitModel):
+            raise PluginError(
+                f"model '{spec.name}' counts executions, but is no qrlsuite.circuit.CircuitModel: it lacks one of "
+                "`description`, `simulator`, `compile_circuits` and `circuit_states`"
+            )
         if self.statistics is not None:
             self.statistics.attach(together)
         self.fence.watch(together, f"model '{spec.name}', forward")
@@ -373,9 +379,9 @@ class ModelBuilder:
         return {**counts, "fixed": fixed} if fixed else counts
 
     @property
-    def circuits(self) -> list[Any]:
-        """The models that compile circuits."""
-        return [module for module in self.built if hasattr(module, "compile_circuits")]
+    def circuits(self) -> list[CircuitModel]:
+        """The networks with a circuit."""
+        return [module for module in self.built if isinstance(module, CircuitModel)]
 
     def compile_circuits(self) -> None:
         """Let models of circuits compile what their first pass would: no epoch's time, and no estimate, holds that."""
@@ -390,11 +396,9 @@ class ModelBuilder:
     def executions(self) -> dict[str, int]:
         """Return each agent's circuit executions so far, summed over its networks; empty without circuits."""
         total: dict[str, int] = {}
-        for module in self.built:
-            counter = getattr(module, "executions", None)
-            if counter is not None:
-                for name, count in counter.as_dict().items():
-                    total[name] = total.get(name, 0) + int(count)
+        for network in self.circuits:
+            for name, count in network.executions.as_dict().items():
+                total[name] = total.get(name, 0) + int(count)
         return total
 
 

@@ -42,6 +42,30 @@ def test_a_third_partys_model_is_found() -> None:
     assert found.get(specs.ModelSpec, "tp").distribution == "third-party"
 
 
+def test_a_model_for_every_circuit_backend_is_one_on_each_whichever_comes_first() -> None:
+    """A backend's plugin registers no model; where it does, that one stands."""
+    backend: dict[str, Any] = {"summary": "Exact; options: none", "options": "a:O", "factory": "a:F"}
+    for name in ("first", "later", "own"):
+        made = specs.CircuitBackendSpec(name=name, **backend)
+        plugin(f"tp_{name}", register_circuit_backends=lambda register, made=made: register(made))
+    waves, own = (
+        specs.ModelSpec(name="waves", backends=True, **MODEL),
+        specs.ModelSpec(name="waves-own", **MODEL),
+    )
+    plugin("tp_waves", register_models=lambda register: register(waves))
+    sys.modules["tp_own"].register_models = hookimpl(lambda register: register(own))
+    names = ("tp_first", "tp_waves", "tp_later", "tp_own")
+    found = registry.create(strict=True, points=points(*((name[3:], name) for name in names)))
+    models = found.of(specs.ModelSpec)
+    assert sorted(models) == ["waves-first", "waves-later", "waves-own"]
+    assert [models[name].distribution for name in sorted(models)] == ["waves", "waves", "own"]
+    assert (models["waves-later"].spec.options, models["waves-own"].spec.options) == ("a:B[later]", "a:B")
+    assert models["waves-later"].spec.summary == "One on later: Exact"
+    assert [each.registered.get("models") for each in found.plugins] == [
+        None, ["waves-first"], ["waves-later"], ["waves-own"]
+    ]  # fmt: skip
+
+
 def test_an_unknown_name_gets_the_nearest_match() -> None:
     with pytest.raises(UnknownNameError, match="unknown model 'mpl'; did you mean 'mlp'"):
         registry.load().get(specs.ModelSpec, "mpl")

@@ -134,7 +134,7 @@ def test_options_of_an_ansatz_are_covered_where_they_are_used(
 ) -> None:
     before = resolve(tiny_task, "vqc-native")
     upgrade()
-    changed = vqc.VQCNativeOptions(ansatz_options={"twirl": True})
+    changed = vqc.VQCOptions["native"](ansatz_options={"twirl": True})
     assert options.identity(changed)["ansatz_options"] == {"twirl": True}
     assert "twirl" not in str(before.identity)
 

@@ -2,14 +2,16 @@ import copy
 
 import pytest
 import torch
+from pydantic.dataclasses import dataclass
 
 from qrlsuite import options, population, registry, specs
 from qrlsuite.circuit import ansatz, create_backend
-from qrlsuite.errors import OptionError
+from qrlsuite.circuit.api import _joined
+from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.plugins.models import vqc
-from qrlsuite.plugins.models.vqc import VQCNativeOptions, VQCOptions, VQCPennyLaneOptions, VQCQiskitOptions
+from qrlsuite.plugins.models.vqc import VQCOptions
 
-CLASSES = {"pennylane": VQCPennyLaneOptions, "native": VQCNativeOptions, "qiskit": VQCQiskitOptions}
+CLASSES = {backend: VQCOptions[backend] for backend in ("pennylane", "native", "qiskit")}
 BACKENDS = [name for name in CLASSES if name in registry.load().names(specs.CircuitBackendSpec)]
 
 
@@ -258,7 +260,11 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
         assert set(options.field_names(CLASSES[name])) == own | set(
             options.field_names(resolve(backend_options))
         )
-    assert (VQCPennyLaneOptions().qubits, VQCPennyLaneOptions().layers, VQCPennyLaneOptions().ansatz) == (
+    assert (
+        VQCOptions["pennylane"]().qubits,
+        VQCOptions["pennylane"]().layers,
+        VQCOptions["pennylane"]().ansatz,
+    ) == (
         10,
         4,
         "iqp",
@@ -278,6 +284,25 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
 def test_bad_options_are_refused(values, message):
     with pytest.raises(OptionError, match=message):
         small(**values)
+
+
+def test_options_of_a_backend_join_those_of_the_model():
+    """Of two that have one name, it is not known which is meant."""
+
+    @dataclass
+    class Theirs:
+        bond: int = 1
+
+    @dataclass(frozen=True)
+    class Clash:
+        layers: int = 1
+
+    both = _joined(VQCOptions, Theirs, "mps")(bond=4, qubits=3)
+    assert (both.bond, both.qubits, both.backend) == (4, 3, "mps")
+    with pytest.raises(
+        PluginError, match="circuit backend 'mps': 'layers' of its options is one of the model's"
+    ):
+        _joined(VQCOptions, Clash, "mps")
 
 
 def test_ansatz_options_reach_the_ansatz():

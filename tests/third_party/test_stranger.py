@@ -137,7 +137,7 @@ def test_the_package_is_found_without_a_line_changed_in_the_suite(installed: Ins
         "ansatzes": {"rzz-ring"},
         "circuit_backends": {"damped"},
         "environments": {"channel-hop"},
-        "models": {"waves", "vqc-damped"},
+        "models": {"waves"},
         "rules": {"half"},
         "tasks": {"channel-hop"},
         "trackers": {"acme-log"},

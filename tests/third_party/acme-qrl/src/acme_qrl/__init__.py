@@ -28,16 +28,6 @@ def register_models(register):
             build="acme_qrl.model:build",
         )
     )
-    register(
-        specs.ModelSpec(
-            name="vqc-damped",
-            summary="hybrid circuit on the backend 'damped'",
-            family="quantum",
-            options="acme_qrl.backend:ModelOptions",
-            build="qrlsuite.plugins.models.vqc:build",
-            population="qrlsuite.plugins.models.vqc:population",
-        )
-    )
 
 
 @hookimpl

@@ -1,29 +1,17 @@
 """A circuit backend made of another: native's values, damped as by depolarizing noise."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from qrlsuite.circuit import create_backend
-from qrlsuite.plugins.models.vqc import VQCOptions
-
-STRENGTH = "probability per two-qubit gate of losing a value"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
     """Options of `damped`."""
 
-    strength: Annotated[float, Field(ge=0, le=1, description=STRENGTH)] = 0.0
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class ModelOptions(VQCOptions):
-    """Options of the model `vqc-damped`: those of every hybrid circuit, and the backend's."""
-
-    backend: ClassVar[str] = "damped"
-
-    strength: Annotated[float, Field(ge=0, le=1, description=STRENGTH)] = 0.0
+    strength: Annotated[float, Field(ge=0, le=1, description="probability per two-qubit gate of losing a value")] = 0.0
 
 
 class Damped:
