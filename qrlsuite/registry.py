@@ -197,19 +197,17 @@ class Registry:
 
     def remove(self, distribution: str) -> None:
         """Forget all that a distribution has registered, the models on its circuit backends, and its hooks."""
-        gone = [each.spec for each in self if each.distribution == distribution]
-        lost = {
-            each.spec.on(spec).name
-            for spec in gone
-            if isinstance(spec, specs.CircuitBackendSpec)
-            for each in self.on_backends
-        }
+        backends = [
+            each.spec
+            for each in self.of(specs.CircuitBackendSpec).values()
+            if each.distribution == distribution
+        ]
+        lost = [each.spec.on(backend) for each in self.on_backends for backend in backends]
         self.on_backends = [each for each in self.on_backends if each.distribution != distribution]
-        for kind, entries in self.entries.items():
-            for name in [name for name, each in entries.items() if each.distribution == distribution]:
-                del entries[name]
-            for name in lost & entries.keys() if kind is specs.ModelSpec else ():
-                del entries[name]
+        for entries in self.entries.values():
+            for name, each in list(entries.items()):
+                if each.distribution == distribution or each.spec in lost:
+                    del entries[name]
         for name, plugin in self.manager.list_name_plugin():
             if plugin is not None and name.startswith(f"{distribution}:"):
                 self.manager.unregister(plugin)
