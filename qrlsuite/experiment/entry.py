@@ -113,7 +113,14 @@ class Entry:
                 for name in options.field_names(type(each))
             }
             for index, (name, value) in enumerate(options.identity(own[side]).items()):
-                if value != usual[side].get(name) or (side == "model" and index == 0):
+                if value == usual[side].get(name) and not (side == "model" and index == 0):
+                    continue
+                if name == "ansatz_options" and value and not usual[side].get(name):
+                    other_names = {*taken, *options.field_names(type(own[side]))}
+                    for key, item in value.items():
+                        full = f"ansatz.{key}" if key in other_names else key
+                        words.append(notation.write_setting(full, item))
+                else:
                     full = f"{side}.{name}" if name in taken else name
                     words.append(notation.write_setting(full, value))
         if self.start is not None:
