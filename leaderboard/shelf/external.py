@@ -94,6 +94,7 @@ def import_points(
     if known is None:
         step = every or _grid_of(points.values())
         curves = {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
+        _require_reachable(curves, given)
         file = _new_task(name, step, curves, maximum, given)
         definition = _definition(file)
     else:
@@ -192,6 +193,17 @@ def _on_grid(own: Points, every: int, run: Run, instead: str) -> NDArray[np.floa
         raise FileError(f"{of_run} has {last // every:,} grid points: every={math.ceil(last / GRID_POINTS)}")
     grid = every * np.arange(1, last // every + 1)
     return own.scores[np.searchsorted(own.steps, grid, side="right") - 1]
+
+
+def _require_reachable(curves: Mapping[Run, NDArray[np.float64]], thresholds: list[float]) -> None:
+    """Refuse thresholds that every run is above from its first point on, as fractions of a maximum of 500 are."""
+    lowest = min(float(curve[0]) for curve in curves.values())
+    if thresholds and thresholds[-1] <= lowest:
+        highest = max(float(curve.max()) for curve in curves.values())
+        raise OptionError(
+            f"thresholds={','.join(f'{level:g}' for level in thresholds)}: every run is above them from its first "
+            f"point on. Write scores as the files have them, which lie between {lowest:g} and {highest:g}"
+        )
 
 
 def _new_task(

@@ -242,6 +242,7 @@ def test_what_a_good_score_is_has_to_be_said(csv: Path, tmp_path: Path) -> None:
         ({"maximum": -1.0}, "maximum=-1.0: give the best possible score"),
         ({"maximum": 10.0, "thresholds": [20]}, "up to maximum=10"),
         ({"thresholds": [20, 20]}, "give numbers, each once"),
+        ({"maximum": 100.0, "thresholds": [0.1, 0.2]}, "every run is above them .* which lie between"),
         ({"maximum": 100.0, "task": "../up"}, "--task ../up: name"),
         ({"maximum": 100.0, "every": 0}, "every=0"),
     ):
