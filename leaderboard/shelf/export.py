@@ -34,7 +34,8 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     force:
         Replace a published entry that has more seeds or more epochs.
     agents:
-        Write the trained agents, too: of all seeds whose parameters are there and finite numbers.
+        Write the trained agents, too: of all seeds whose parameters are there, finite, and of the last epoch of the
+        curves.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     codes.require_installed(store, entry.seeds, identity.of(built))
     record = {name: value for name, value in store.record().items() if name not in ("published", "code")}
     folder = out / entry.task / built.name
-    kept = _agents(store, entry.seeds) if agents else {}
+    kept = _agents(store, entry) if agents else {}
     if kept and not force and _add_agents(folder, entry, store, kept):
         return folder
     _refuse_smaller(folder, entry, force)
@@ -82,16 +83,22 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
     return folder
 
 
-def _agents(store: EntryStore, seeds: Sequence[int]) -> dict[int, Arrays]:
-    """Return the trained parameters by seed: of those that have some, and whose numbers are finite.
+def _agents(store: EntryStore, entry: EntryResults) -> dict[int, Arrays]:
+    """Return the trained parameters by seed: of runs that end where the curves do, and whose numbers are finite.
 
     Raises
     ------
     StoreError
         If a file is damaged.
     """
-    held = {seed: store.seed(seed).parameters() for seed in seeds if store.seed(seed).agent.exists()}
-    return {s: own for s, own in held.items() if all(np.isfinite(values).all() for values in own.values())}
+    ended = store.finished(entry.seeds, entry.curves.shape[1])
+    held: dict[int, Arrays] = {}
+    for seed in (store.seed(seed) for seed in entry.seeds if seed in ended):
+        longer = int((seed.record() or {})["epochs"]) > entry.curves.shape[1]
+        agent = seed.parameters() if seed.agent.exists() and not longer else {}
+        if agent and all(np.isfinite(values).all() for values in agent.values()):
+            held[seed.seed] = agent
+    return held
 
 
 def _add_agents(folder: Path, entry: EntryResults, store: EntryStore, agents: Mapping[int, Arrays]) -> bool:

@@ -140,11 +140,11 @@ def collected(
     return outcomes, refused
 
 
-def export(study: StudyWithLooks, out: Path) -> Path:
+def export(study: StudyWithLooks, out: Path, agents: bool = True) -> Path:
     """Write a study and its finished seeds to `out/<name>`; returns that folder.
 
     Written again while the study goes on, it holds more seeds. Nothing there is replaced by less, and the study's own
-    file stays as it is: it may have been published before its first seed.
+    file stays as it is: it may have been published before its first seed. `agents` writes the trained agents, too.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def export(study: StudyWithLooks, out: Path) -> Path:
         held = collect.read_entry(EntryStore.find(study.folder, entry)) if state.seeds[name] else None
         finished = None if held is None else held.reaching(study.epochs)
         if finished is not None:
-            export_entry(finished, folder)
+            export_entry(finished, folder, agents=agents)
     if (log := study.folder / LOG).exists():
         shutil.copyfile(log, folder / LOG)
     read(folder)

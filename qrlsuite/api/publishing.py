@@ -103,7 +103,8 @@ def export(
     if with_looks:
         for study in with_looks:
             target = out or Path("leaderboard/plans")
-            yield Exported(folder=published_studies.export(StudyWithLooks(study, runs), target))
+            folder = published_studies.export(StudyWithLooks(study, runs), target, agents)
+            yield Exported(folder=folder)
         return
     lookup.check_tasks(runs, *tasks)
     if everything or named:

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.cli.app import build
+from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard.shelf import collect, importing, published, verify
 from qrlsuite.leaderboard.shelf.export import export
@@ -127,6 +128,16 @@ def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_pat
     taken = importing.import_seeds(source, tmp_path / "new")
     assert taken.notes[-1] == "seeds 1:2 came without agents: they cannot be evaluated"
     assert sorted(evaluation.trained(taken.store, 3, 5).seeds) == [0, 2]
+
+
+def test_agents_of_later_epochs_than_the_curves_are_left_out(folder: Path, tmp_path: Path) -> None:
+    """Most seeds have two epochs, which are published; seed 0 was trained further."""
+    store = runs_of(tmp_path)
+    train_group(store.path, [0], 3)
+    entry = collect.read_entry(store)
+    assert entry is not None
+    assert (entry.seeds, entry.curves.shape) == (SEEDS, (3, 2))
+    assert published.read(export(entry, tmp_path / "fresh")).agents == (1, 2)
 
 
 def test_agents_of_other_curves_are_not_added(folder: Path, tmp_path: Path) -> None:
