@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from simulated import Rates, board_false_winners, power, split_halves
 
 from qrlsuite import api
 from qrlsuite.leaderboard import rules
@@ -25,16 +26,11 @@ from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.statistics import (
     Grid,
     LearningCurves,
-    Rates,
     SignificanceRule,
     SmoothedRuns,
-    board_false_winners,
     bootstrap_interval,
-    false_winners,
-    power,
     sample_complexity,
     slower,
-    split_halves,
 )
 
 CURVES = Path(__file__).parents[1] / "tests" / "golden" / "statistics.json.gz"
@@ -136,7 +132,7 @@ def main() -> None:
     head(f"Simulated equals, {draws} pairs: every winner is false", *columns, "a winner")
     for model, rule in each:
         for sizes in SIZES:
-            rates = false_winners(model, *sizes, grid, rule, draws)
+            rates = power(model, model, *sizes, grid, rule, draws)
             line(model.entry.name, "{}, {}".format(*sizes), rule.name, *shown(rates, rates.winner))
 
     boards = max(1, draws // 10)

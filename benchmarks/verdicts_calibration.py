@@ -17,6 +17,7 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from simulated import judge, simulated_pairs
 
 from qrlsuite.leaderboard.shelf.published import PUBLISHED, read
 from qrlsuite.statistics import (
@@ -38,7 +39,7 @@ from qrlsuite.statistics import (
     times_below,
     times_board,
 )
-from qrlsuite.statistics.simulation import draw_times, judge, judge_times, play, simulated_pairs
+from qrlsuite.statistics.simulation import draw_times, judge_times, play
 
 EPSILONS, DELTAS = [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 GRID = Grid.relative(EPSILONS, DELTAS)

@@ -55,15 +55,10 @@ from qrlsuite.statistics.significance import (
 )
 from qrlsuite.statistics.simulation import (
     DecisionRates,
-    Rates,
     SmoothedRuns,
     TimesRates,
-    board_false_winners,
     decision_rates,
-    false_winners,
-    power,
     slower,
-    split_halves,
 )
 from qrlsuite.statistics.times import MeanTime, mean_time, times_below
 from qrlsuite.statistics.times_board import Direction, TimesBoard, holm, rank_ranges, times_board
@@ -88,7 +83,6 @@ __all__ = [
     "PairDecision",
     "Ranked",
     "Ranking",
-    "Rates",
     "Resampling",
     "ScoreBoard",
     "SequentialDesign",
@@ -104,7 +98,6 @@ __all__ = [
     "across_tasks",
     "areas",
     "at_cap",
-    "board_false_winners",
     "bootstrap_draws",
     "bootstrap_interval",
     "common_horizon",
@@ -112,7 +105,6 @@ __all__ = [
     "compare_scores",
     "decide",
     "decision_rates",
-    "false_winners",
     "final_scores",
     "holm",
     "horizon_shares",
@@ -121,7 +113,6 @@ __all__ = [
     "mean_time",
     "nominal_levels",
     "outperformance",
-    "power",
     "probability_of_improvement",
     "rank",
     "rank_ranges",
@@ -130,7 +121,6 @@ __all__ = [
     "runs_to_detect",
     "sample_complexity",
     "slower",
-    "split_halves",
     "times_below",
     "times_board",
     "times_pair",

@@ -38,10 +38,6 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     [
         "sample_complexity",
         "SignificanceRule",
-        "split_halves",
-        "false_winners",
-        "board_false_winners",
-        "power",
         "Evidence",
         "times_below",
         "mean_time",

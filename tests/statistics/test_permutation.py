@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from benchmarks.simulated import power
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard import rules
 from qrlsuite.statistics import (
@@ -19,8 +20,6 @@ from qrlsuite.statistics import (
     SmoothedRuns,
     TimesRule,
     compare,
-    false_winners,
-    power,
 )
 from qrlsuite.statistics.permutation import (
     CHUNK,
@@ -201,7 +200,7 @@ def test_alpha_and_seed_decide(rule: type) -> None:
 )
 def test_equal_entries_rarely_differ_and_slow_ones_are_found(rule: TimesRule, index: int) -> None:
     model = SmoothedRuns(entry(index))
-    rates = false_winners(model, 30, 30, SURFACE, rule, n_pairs=60)
+    rates = power(model, model, 30, 30, SURFACE, rule, n_pairs=60)
     assert rates.any_cell <= 0.1
     late = LearningCurves(
         np.concatenate([np.zeros((30, 20)), entry(index).values[:, :-20]], axis=1), 2000, "late"

@@ -10,6 +10,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
+from benchmarks.simulated import judge, simulated_pairs
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
     Decided,
@@ -25,7 +26,7 @@ from qrlsuite.statistics import (
     times_below,
 )
 from qrlsuite.statistics.sequential import Decision, PairDecision
-from qrlsuite.statistics.simulation import judge, judge_times, simulated_pairs
+from qrlsuite.statistics.simulation import judge_times
 from tests.statistics.conftest import SURFACE, entry
 
 PILOT = SmoothedRuns(entry(0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.simulated import board_false_winners, judge, power, simulated_pairs, split_halves
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
     Evidence,
@@ -14,13 +15,8 @@ from qrlsuite.statistics import (
     Resampling,
     SmoothedRuns,
     TimesRule,
-    board_false_winners,
     bootstrap_interval,
-    false_winners,
-    power,
-    split_halves,
 )
-from qrlsuite.statistics.simulation import judge, simulated_pairs
 from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE, entry
 
 FAST = Resampling(300)
@@ -28,9 +24,8 @@ FAST = Resampling(300)
 
 @pytest.mark.parametrize(("index", "n_first", "n_second"), [(0, 10, 40), (1, 50, 25)])
 def test_unequal_numbers_of_one_network_rarely_make_a_winner(index: int, n_first: int, n_second: int) -> None:
-    rates = false_winners(
-        SmoothedRuns(entry(index)), n_first, n_second, SURFACE, n_pairs=100, resampling=FAST
-    )
+    model = SmoothedRuns(entry(index))
+    rates = power(model, model, n_first, n_second, SURFACE, n_pairs=100, resampling=FAST)
     assert rates.winner <= 0.12
     assert rates.per_cell.max() <= 0.05
 
@@ -51,7 +46,9 @@ def test_their_own_intervals_would_make_a_winner_of_the_smaller_entry_often(inde
 
 
 def test_equal_numbers_of_one_network_rarely_make_a_winner_in_a_cell() -> None:
-    rates = false_winners(SmoothedRuns(entry(1)), 30, 30, SURFACE, n_pairs=100, resampling=FAST)
+    rates = power(
+        SmoothedRuns(entry(1)), SmoothedRuns(entry(1)), 30, 30, SURFACE, n_pairs=100, resampling=FAST
+    )
     assert rates.per_cell.max() <= 0.06
     assert rates.any_cell >= rates.per_cell.max() > 0
     assert rates.any_cell >= rates.winner
@@ -72,7 +69,7 @@ def test_rules_judge_the_same_pairs() -> None:
     model, rules = SmoothedRuns(entry(1)), [IntervalRule(), TimesRule()]
     together = judge(simulated_pairs(model, model, 20, 20, 12), SURFACE, rules, FAST)
     for rule, rates in zip(rules, together):
-        alone = false_winners(model, 20, 20, SURFACE, rule, n_pairs=12, resampling=FAST)
+        alone = power(model, model, 20, 20, SURFACE, rule, n_pairs=12, resampling=FAST)
         assert (rates.fewer == alone.fewer).all()
         assert (rates.rule, rates.winner) == (rule.name, alone.winner)
 
@@ -136,7 +133,7 @@ def test_seeds_decide() -> None:
     assert (draws[0] == draws[1]).all()
     assert (draws[0] != draws[2]).any()
     cells = Grid.relative([0.2, 0.4], [0.3, 0.5])
-    rates = [false_winners(model, 8, 8, cells, n_pairs=40, seed=seed, resampling=FAST) for seed in (1, 1, 2)]
+    rates = [power(model, model, 8, 8, cells, n_pairs=40, seed=seed, resampling=FAST) for seed in (1, 1, 2)]
     assert (rates[0].per_cell == rates[1].per_cell).all()
     assert (rates[0].per_cell != rates[2].per_cell).any()
     halves = [split_halves(entry(1), cells, n_splits=40, seed=seed, resampling=FAST) for seed in (1, 1, 2)]
@@ -160,4 +157,4 @@ def test_what_cannot_be_simulated_is_refused() -> None:
     with pytest.raises(OptionError, match="'width64' ends at 200000 steps, 'short' at 100000"):
         power(SmoothedRuns(entry(0)), SmoothedRuns(short), 20, 20, SURFACE)
     with pytest.raises(OptionError, match="n_pairs"):
-        false_winners(SmoothedRuns(entry(0)), 20, 20, SURFACE, n_pairs=0)
+        power(SmoothedRuns(entry(0)), SmoothedRuns(entry(0)), 20, 20, SURFACE, n_pairs=0)
