@@ -6,13 +6,16 @@ import warnings
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import pyarrow
 
 from qrlsuite.api.arguments import several
+from qrlsuite.engine.status import EntryStatus
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import collect, fields
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.results.survey import STATUSES
 
 
 def table(
@@ -87,3 +90,27 @@ def table(
     for line in left_out:
         warnings.warn(f"left out: {line}", stacklevel=2)
     return fields.table(found, rows)
+
+
+def progress_table(runs: Path, statuses: Sequence[EntryStatus]) -> list[dict[str, Any]]:
+    """Return a row of values for each entry of a results folder: how far it is, and what `table` says of it."""
+    results = {}
+    if statuses:
+        found, _ = collect.collect(runs, {status.entry.task for status in statuses})
+        results = {(row["task"], row["name"]): row for row in fields.table(found, "entries").to_pylist()}
+    rows = []
+    for status in statuses:
+        entry = status.entry
+        known = results.get(
+            (entry.task, entry.name), {"task": entry.task, "entry": entry.label, "name": entry.name}
+        )
+        low, high = entry.epochs or (0, 0)
+        far = {
+            "epochs_least": low,
+            "epochs_most": high,
+            "bytes": entry.size,
+            "last_activity": entry.last_activity,
+        }
+        rows.append({**{f"seeds_{each}": entry.seeds.get(each, 0) for each in STATUSES}, **far, **known})
+    names = dict.fromkeys(name for row in [*results.values(), *rows] for name in row)
+    return [{name: row.get(name) for name in names} for row in rows]

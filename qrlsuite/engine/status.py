@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 from qrlsuite.engine.where import Queues
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results import lookup
-from qrlsuite.results.store import entries
-from qrlsuite.results.survey import EntrySurvey, GroupStatus, groups, look
+from qrlsuite.results.store import EntryStore, entries
+from qrlsuite.results.survey import EntrySurvey, GroupStatus, delete, groups, look
 
 
 @dataclass(frozen=True)
@@ -73,3 +74,35 @@ def survey(runs: Path, task: str | None = None) -> list[EntryStatus]:
                 problem = str(error)
         statuses.append(EntryStatus(entry, tuple(groups(store, queued)), problem))
     return statuses
+
+
+def choose(runs: Path, names: Sequence[str], task: str | None = None) -> list[EntrySurvey]:
+    """Look at the entries that names mean, each once.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such task, or none or several entries have a name.
+    """
+    lookup.check_tasks(runs, task)
+    stored = lookup.stored(entries(runs, task))
+    searched = f"{runs}, task {task}" if task else runs
+    return [
+        look(store) for store in dict.fromkeys(lookup.choose(stored, name, searched).store for name in names)
+    ]
+
+
+def delete_each(runs: Path, chosen: Sequence[EntrySurvey]) -> int:
+    """Delete entries with all their seeds; returns the bytes that were freed.
+
+    Raises
+    ------
+    StoreError
+        If an entry is being trained, or waits in a queue.
+    """
+    queues, freed = Queues(), 0
+    for entry in chosen:
+        store = EntryStore(entry.folder)
+        queued = queues.waiting(store) if entry.seeds.get("submitted") else None
+        freed += delete(runs, store, queued)
+    return freed
