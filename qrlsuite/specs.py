@@ -19,6 +19,10 @@ WHOLE_NAME = f"^(?:{NAME.pattern})$"
 """Names are lower case, digits, and single hyphens, underscores or dots: safe in a path and on a command line."""
 
 
+NO_MODEL = "none"
+"""The model of algorithms that build no network."""
+
+
 def resolve(reference: str) -> Any:
     """Import what a reference `"package.module:Name"` points at; `"package.module:Name[key]"` is `Name["key"]`.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from qrlsuite.hookspecs import hookimpl
-from qrlsuite.specs import ModelSpec
+from qrlsuite.specs import NO_MODEL, ModelSpec
 
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru`, and `vqc-BACKEND` for each circuit backend."""
+    """Register `mlp`, `fourier`, `gru`, `none`, and `vqc-BACKEND` for each circuit backend."""
     register(
         ModelSpec(
             name="mlp",
@@ -41,6 +41,15 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.gru:GRUOptions",
             build="qrlsuite.plugins.models.gru:build",
             memory="qrlsuite.plugins.models.gru:memory",
+        )
+    )
+    register(
+        ModelSpec(
+            name=NO_MODEL,
+            summary="No network, for algorithms that build none",
+            family="classical",
+            options="qrlsuite.plugins.models.none:NoneOptions",
+            build="qrlsuite.plugins.models.none:build",
         )
     )
     register(

@@ -120,7 +120,7 @@ class Trial:
 def _builds(trial: Trial) -> None:
     group, space = trial.group(range(S)), trial.world.space
     require(
-        not isinstance(space, Discrete) or int(space.n) in group.outputs,
+        not isinstance(space, Discrete) or not group.outputs or int(space.n) in group.outputs,
         f"build_model was called with {group.outputs} outputs, and there are {size_of(space)} actions: take "
         "envs.single_action_space.n",
     )

@@ -111,6 +111,8 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
     task:
         A task, or its file, whose observations are taken instead.
     """
+    if subject.spec.name == specs.NO_MODEL:  # there is nothing to build
+        return []
     subjects = Subjects(subject, task)
     rules = Checklist()
     with one_thread():

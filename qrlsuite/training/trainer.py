@@ -510,11 +510,17 @@ class Trainer:
             factory = specs.resolve(self.entry.algorithm.factory)
             own_options = population.joined([each.algorithm_options for each in self._entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
+        name = self.entry.algorithm.name
+        if not self.models.built and self.entry.model.name != specs.NO_MODEL:
+            raise OptionError(
+                f"algorithm '{name}' builds no network, so that model '{self.entry.model.name}' would say nothing: "
+                f"write '{name} {specs.NO_MODEL}'"
+            )
         self._informed = asks_for_more(self.algorithm.act)
         if not self._informed and any(population.remembers(module) for module in self.models.built):
             raise OptionError(
-                f"model '{self.entry.model.name}' remembers what it saw in an episode, and algorithm "
-                f"'{self.entry.algorithm.name}' would make it forget: {_that_remember(self.entry.model.name)}"
+                f"model '{self.entry.model.name}' remembers what it saw in an episode, and algorithm '{name}' would "
+                f"make it forget: {_that_remember(self.entry.model.name)}"
             )
 
     @functools.cached_property
