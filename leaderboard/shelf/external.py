@@ -50,6 +50,8 @@ GRID_POINTS = 100
 """Points of a grid that is chosen here, at most, up to the end of the longest run."""
 
 _MOST_GRID_POINTS = 100_000
+_ALIKE = 0.9
+"""Runs that reach this share of the longest are cut to one length."""
 _EPSILONS, _REFERENCE = [0.1, 0.2, 0.3, 0.4], 0.2
 _DELTAS, _DELTA = [0.5, 0.75], 0.5
 
@@ -93,7 +95,9 @@ def import_points(
     known = _known_task(name, runs)
     if known is None:
         step = every or _grid_of(points.values())
-        curves = {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
+        curves = _cut(
+            {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
+        )
         _require_reachable(curves, given)
         file = _new_task(name, step, curves, maximum, given)
         definition = _definition(file)
@@ -101,7 +105,7 @@ def import_points(
         file, definition, name = known
         _require_same_options(file, maximum, given, every)
         step = file.protocol.interactions
-        curves = {run: _on_grid(own, step, run, "another --task") for run, own in points.items()}
+        curves = _cut({run: _on_grid(own, step, run, "another --task") for run, own in points.items()})
     best = file.score.max_return if maximum is None else maximum
     scores = {run: _scores(curve, best, file, run, points[run].source) for run, curve in curves.items()}
     by_entry: dict[str, dict[int, NDArray[np.float64]]] = defaultdict(dict)
@@ -204,6 +208,18 @@ def _require_reachable(curves: Mapping[Run, NDArray[np.float64]], thresholds: li
             f"thresholds={','.join(f'{level:g}' for level in thresholds)}: every run is above them from its first "
             f"point on. Write scores as the files have them, which lie between {lowest:g} and {highest:g}"
         )
+
+
+def _cut(curves: Mapping[Run, NDArray[np.float64]]) -> dict[Run, NDArray[np.float64]]:
+    """Cut the curves of each entry to the shortest, but for those that end long before the longest.
+
+    Runs that end with an episode end a little apart, and none of them should be left out for that.
+    """
+    ends: dict[str, list[int]] = defaultdict(list)
+    for (entry, _), curve in curves.items():
+        ends[entry].append(len(curve))
+    common = {entry: min(end for end in own if end >= _ALIKE * max(own)) for entry, own in ends.items()}
+    return {run: curve[: common[run[0]]] for run, curve in curves.items()}
 
 
 def _new_task(
@@ -396,8 +412,9 @@ def _write(
             new.append(seed)
     finally:
         claim.release()
+    lasts = [int(points[entry, seed].steps[-1]) for seed in curves]
     notes = differences(differing) + _notes(
-        entry, curves, sorted({*present, *new}), file.protocol.interactions
+        entry, curves, lasts, sorted({*present, *new}), file.protocol.interactions
     )
     return Imported(store, name, label, task, tuple(new), tuple(known), tuple(notes))
 
@@ -458,10 +475,18 @@ def _finite(value: object) -> bool:
 
 
 def _notes(
-    entry: str, curves: Mapping[int, NDArray[np.float64]], seeds: Sequence[int], every: int
+    entry: str,
+    curves: Mapping[int, NDArray[np.float64]],
+    lasts: Sequence[int],
+    seeds: Sequence[int],
+    every: int,
 ) -> list[str]:
     """Say what a reader has to know: too few seeds, and runs that end before the others."""
     notes = []
+    ends = [last // every for last in lasts]
+    if max(ends) > max(map(len, curves.values())):
+        end = max(map(len, curves.values())) * every
+        notes.append(f"'{entry}': all cut to step {end}; the longest goes on to {max(ends) * every}")
     if len(seeds) < MIN_RUNS:
         notes.append(f"'{entry}' has {counted(len(seeds), 'seed')}: a verdict needs {MIN_RUNS} of each entry")
     longest = max(map(len, curves.values()))

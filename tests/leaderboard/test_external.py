@@ -150,6 +150,22 @@ def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
     assert api.load("a", runs=tmp_path / "runs").left_out == (2,)
 
 
+def test_runs_that_end_a_little_apart_are_cut_to_one_length(tmp_path: Path) -> None:
+    """Episodes end where they end: no seed is left out for that."""
+    path = tmp_path / "curves.csv"
+    rows = [
+        (seed, step)
+        for seed, last in ((0, 200), (1, 190), (2, 180), (3, 100))
+        for step in range(10, last + 1, 10)
+    ]
+    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
+    assert a.notes[0] == "'a': all cut to step 180; the longest goes on to 200"
+    entry = api.load("a", runs=tmp_path / "runs")
+    assert (entry.curves.shape, entry.seeds, entry.left_out) == ((3, 18), (0, 1, 2), (3,))
+    assert a.store.record()["task_file"]["ranking"]["horizons"] == [180]
+
+
 def test_scores_and_grid_of_a_task_of_the_suite(tmp_path: Path) -> None:
     """CartPole's best return is 500 and its epochs have 1000 steps: neither is asked for."""
     runs = {"a": ([0], [[100.0, 250.0]])}
