@@ -349,6 +349,7 @@ def _load(
     _require_unique(known, registered)
     made = Loaded(source, Plugin(source.module, str(source.path), source.name), registered, cell)
     _enter(own, known, made)
+    known.announce(made.sentence)
     return made
 
 

@@ -93,6 +93,8 @@ class Registry:
     strict: bool = False
     own: Any = None
     """What `qrlsuite.own` keeps of the plugins that were loaded by path."""
+    announce: Callable[[str], None] = lambda line: None
+    """Called with a line for the user when a plugin has been loaded by path."""
     on_backends: list[Registered[specs.ModelSpec]] = field(default_factory=list)
     """The models for every circuit backend."""
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from typer import Abort, BadParameter
 
+from qrlsuite import registry
 from qrlsuite.cli.app import build, renamed_option, split_plugins
 from qrlsuite.engine.terminal import printable, printable_lines
 from qrlsuite.errors import PluginError, QrlSuiteError
@@ -39,6 +40,7 @@ def main() -> None:
         warnings.showwarning = show
         try:
             words, paths = split_plugins(sys.argv[1:])
+            registry.load().announce = lambda line: print(printable(line), file=sys.stderr)
             _load_plugins(paths)
             sys.exit(build()(words, prog_name="qrlsuite", standalone_mode=False))
         except UsageError as error:
@@ -63,11 +65,10 @@ def main() -> None:
 
 
 def _load_plugins(paths: list[str]) -> None:
-    """Load plugins by path, and say what each registers."""
+    """Load plugins by path."""
     if not paths:
         return
     from qrlsuite.results import codes
 
     for path in paths:
-        for each in codes.load_plugins(path):
-            print(printable(each.sentence), file=sys.stderr)
+        codes.load_plugins(path)

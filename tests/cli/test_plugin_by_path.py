@@ -193,7 +193,7 @@ def test_a_study_and_a_task_name_their_plugins(folder: Path) -> None:
     (folder / "code").mkdir()
     (folder / "ring.py").rename(folder / "code" / "ring.py")
     (folder / "tiny.toml").write_text('plugins = ["code/ring.py"]\n' + TINY)
-    run(folder, plugin="")
+    assert run(folder, plugin="").startswith("ring.py: ansatz ring\n")
     (folder / "tiny.toml").write_text(TINY)
     (folder / "two.toml").write_text(
         f"""
