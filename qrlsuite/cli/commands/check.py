@@ -30,7 +30,7 @@ def check(
     settings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[OPTION=VALUE]...", help="Check a single plugin with these values of its options."
+            metavar="OPTION=VALUE", help="Check a single plugin with these values of its options."
         ),
     ] = None,
     task: Annotated[

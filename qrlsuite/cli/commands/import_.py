@@ -23,7 +23,7 @@ def import_entries(
     words: Annotated[
         list[str],
         typer.Argument(
-            metavar="PATH... [OPTION=VALUE]...",
+            metavar="PATH|OPTION=VALUE",
             help="Results folders, folders that `export` wrote, or entries' folders in them. Or files with the curves "
             "of other programs: csv (entry,seed,step,score), monitor.csv or evaluations.npz of Stable-Baselines3, "
             "event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best possible score, of which "

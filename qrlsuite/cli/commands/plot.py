@@ -37,7 +37,7 @@ def plot(
     settings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME=VALUE]...",
+            metavar="NAME=VALUE",
             help="Settings of the picture (`qrlsuite show picture KIND` lists them); environment.NAME: of the task.",
         ),
     ] = None,

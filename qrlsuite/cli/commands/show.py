@@ -23,7 +23,7 @@ def show(
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME] [OPTION=VALUE]...",
+            metavar="NAME|OPTION=VALUE",
             help="With a kind first, the name: `show ansatz iqp`. Options of an ansatz, and qubits=4 layers=2.",
         ),
     ] = None,

@@ -52,7 +52,7 @@ EpochsOption = Annotated[int | None, typer.Option("--epochs", min=1, help="Defau
 WordsArgument = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="[WORD]... [OPTION=VALUE]...",
+        metavar="WORD|OPTION=VALUE",
         help="Only entries with one of these words in group, label or task, or with this name. qubits=6 sets an option "
         "wherever an entry has it; vqc-native=vqc-pennylane puts a model in the place of another.",
     ),
