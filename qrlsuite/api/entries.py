@@ -146,8 +146,13 @@ def board(
         other = "several tasks" if together else f"by = '{by}'"
         raise OptionError(f"--rule {rule} judges cells of one task in environment steps: not {other}")
 
+    if study is not None and entries:
+        raise OptionError(f"--study {study} names the entries: leave --entry out")
+
     def select(names: Sequence[str], chosen: Sequence[str | EntryResults]) -> Selected:
-        return _selected(folder, names, chosen, study, published, horizon)
+        if study is None:
+            return collect.select(folder, names, chosen, published, horizon)
+        return studies.select(study, folder, names, published, horizon)
 
     if together:
         found, left_out = across.collected(together, lambda task: select([task], entries))
@@ -332,22 +337,6 @@ def plot(
     for line in drawn.left_out:
         warnings.warn(f"left out: {line}", stacklevel=2)
     return drawn.figure
-
-
-def _selected(
-    runs: Path,
-    tasks: Sequence[str],
-    entries: Sequence[str | EntryResults],
-    study: str | None,
-    published: bool,
-    horizon: int | None,
-) -> tuple[list[EntryResults], list[str]]:
-    """Return the entries of a board, those named or those of a study, and a line for each that was left out."""
-    if study is None:
-        return collect.select(runs, tasks, entries, published, horizon)
-    if entries:
-        raise OptionError(f"--study {study} names the entries: leave --entry out")
-    return studies.select(study, runs, tasks, published, horizon)
 
 
 def _family(shown: Sequence[EntryResults], ranked: Sequence[EntryResults]) -> list[EntryResults]:
