@@ -142,6 +142,11 @@ def test_an_environment_is_checked_as_a_task_has_it(
         "its environment is 'beam6g', not 'cartpole'" in check("environment:cartpole", "--task", tiny_task)[2]
     )
     assert "--deterministic is for an environment" in check("mlp", "--deterministic")[2]
+    asked.clear()
+    for word in ("algorithm:ddqn", "mlp"):
+        assert check(word, "--task", tiny_task)[0] == 0
+    assert asked == [(*words, {}, {"task": tiny_task}) for words in (("algorithm", "ddqn"), ("model", "mlp"))]
+    assert "--task is for one environment, algorithm or model" in check("cz", "--task", tiny_task)[2]
 
 
 def test_ppo_that_draws_in_validation_keeps_the_rules(check: Command) -> None:
