@@ -13,7 +13,7 @@ from qrlsuite.api.tables import progress_table
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
 from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.status import EntryStatus, choose, delete_each, survey
-from qrlsuite.engine.terminal import printable
+from qrlsuite.engine.terminal import printable, table_console
 from qrlsuite.errors import OptionError
 from qrlsuite.results import lookup
 from qrlsuite.results.seeds import format_seeds
@@ -70,6 +70,8 @@ def runs(
         *(_row(status.entry, now) for status in statuses),
     ]
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    if sum(widths) + 2 * len(widths) > table_console(10_000).width:  # the label names the entry as well
+        table, widths = [(row[0], *row[2:]) for row in table], [widths[0], *widths[2:]]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in table]
     typer.echo(lines[0])
     for line, entry_status in zip(lines[1:], statuses):
