@@ -7,15 +7,16 @@ enter here, by the same door as anyone's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from qrlsuite import registry, specs
 from qrlsuite.errors import OptionError, PluginError, UnknownNameError, nearest
 from qrlsuite.hookspecs import hookimpl
 from qrlsuite.specs import RuleSpec, resolve
-from qrlsuite.statistics import Evidence, SignificanceRule
-from qrlsuite.statistics.grid import IntArray
-from qrlsuite.statistics.significance import check_signs
+
+if TYPE_CHECKING:  # numpy, which registering does without
+    from qrlsuite.statistics import Evidence, SignificanceRule
+    from qrlsuite.statistics.grid import IntArray
 
 DEFAULT = "intervals"
 """The paper's rule."""
@@ -83,7 +84,9 @@ def load(name: str = DEFAULT) -> SignificanceRule:
     except Exception as error:
         raise PluginError(f"{origin}: {spec.factory} fails: {type(error).__name__}: {error}") from error
     if registered.distribution == "qrlsuite":
-        return cast(SignificanceRule, rule)
+        return cast("SignificanceRule", rule)
+    from qrlsuite.statistics import SignificanceRule
+
     if not isinstance(rule, SignificanceRule) or not callable(rule):
         raise PluginError(
             f"{origin}: {type(rule).__name__} is no rule: it needs a name, a promise and "
@@ -125,6 +128,7 @@ class _Fenced:
         return self._checked(lambda: judge(first, others), (len(others), *first.grid.shape))
 
     def _checked(self, judge: Callable[[], Any], shape: tuple[int, ...]) -> IntArray:
+        from qrlsuite.statistics.significance import check_signs
 
         try:
             return check_signs(judge(), shape, self)

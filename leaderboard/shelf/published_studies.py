@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
-from qrlsuite.leaderboard.shelf import collect, importing, published
+from qrlsuite.leaderboard.shelf import PLANS, collect, importing, published
 from qrlsuite.leaderboard.shelf.export import export as export_entry
 from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
@@ -24,7 +24,7 @@ from qrlsuite.studies.looks import FILE, LOG, Run, StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome, in_folder
 from qrlsuite.studies.study import Study, dumps, load_kept
 
-PUBLISHED = Path(__file__).parents[1] / "plans"
+PUBLISHED = PLANS
 """The studies with looks that come with the suite."""
 
 

@@ -398,8 +398,9 @@ def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:
 
 def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
     """Return the bytes of the states that a simulator keeps, 0 where nothing is known of it."""
-    of_states = {"native": _native_memory, "pennylane": _pennylane_memory}.get(options.backend)
-    return 0 if of_states is None else of_states(options, agents, batch, copies)
+    if options.backend == "native":
+        return _native_memory(options, agents, batch, copies)
+    return _pennylane_memory(options, agents, batch, copies) if options.backend == "pennylane" else 0
 
 
 def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
@@ -419,7 +420,7 @@ def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int
     backprop = options.diff_method in ("auto", "backprop") and options.shots is None
     if not (_entangled(options) and backprop and options.device == "default.qubit"):
         return 0
-    lane = 64 * (1 << options.qubits) * options.layers * options.qubits
+    lane: int = 64 * (1 << options.qubits) * options.layers * options.qubits
     return min(agents * batch * lane, max(batch * lane, PENNYLANE_STATES))
 
 

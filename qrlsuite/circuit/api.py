@@ -152,11 +152,13 @@ def options_on(own: type[Options], backend: str) -> type[Options]:
     """
     from qrlsuite import registry, specs
 
-    return _joined(own, specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options), backend)
+    theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options)
+    joined: type[Options] = _joined(own, theirs, backend)
+    return joined
 
 
 @functools.cache
-def _joined(own: type[Options], theirs: type[Any], backend: str) -> type[Options]:
+def _joined(own: Any, theirs: Any, backend: str) -> Any:
     from pydantic import ConfigDict
     from pydantic.dataclasses import dataclass
 
@@ -169,8 +171,7 @@ def _joined(own: type[Options], theirs: type[Any], backend: str) -> type[Options
         )
     content = {"__module__": own.__module__, "__doc__": own.__doc__, "backend": backend}
     made = type(f"{own.__name__}[{backend}]", (theirs, own), content)
-    joined: type[Options] = dataclass(frozen=True, config=ConfigDict(extra="forbid"))(made)
-    return joined
+    return dataclass(frozen=True, config=ConfigDict(extra="forbid"))(made)
 
 
 def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBackend:

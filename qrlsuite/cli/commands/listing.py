@@ -58,14 +58,13 @@ def list_things(
 
 def _published_studies() -> list[dict[str, str]]:
     """Return the studies with looks that come with the suite; like a task, each is known by its file alone."""
-    from qrlsuite.leaderboard.shelf import published_studies
+    from qrlsuite.leaderboard.shelf import PLANS
+    from qrlsuite.studies.study import load
 
-    found = {
-        name: published_studies.load(published_studies.PUBLISHED / name) for name in published_studies.names()
-    }
     return [
-        {"kind": "studies", "name": name, "summary": study.file.summary, "distribution": "qrlsuite"}
-        for name, study in found.items()
+        {"kind": "studies", "name": path.parent.name, "distribution": "qrlsuite"}
+        | {"summary": load(str(path)).file.summary}
+        for path in sorted(PLANS.glob("*/plan.toml"))
     ]
 
 
