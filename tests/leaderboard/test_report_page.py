@@ -227,6 +227,7 @@ def test_the_picture_is_saved_with_names_and_colors(opened: Open, page: str) -> 
 
 def test_a_pair_is_chosen_from_the_matrix(opened: Open, page: str) -> None:
     tab = opened(page)
+    tab.locator("#board-0 details.more summary").first.click()
     panel = tab.locator("#board-0-pair")
     assert "model-0 width=1 against model-1 width=2" in panel.inner_text()
     cell = tab.locator("#board-0 .matrix tbody tr").nth(3).locator("td").nth(0)
@@ -253,6 +254,8 @@ def test_hostile_names_stay_text(opened: Open) -> None:
     harmless = {0x202E: "\ufffd", 0: "\ufffd", 0xD800: "\ufffd"}
     assert sorted(seen) == sorted(name.translate(harmless) for name in boards.HOSTILE)
     tab.locator("#board-0").get_by_role("button", name="Pick shown").click()
+    for details in tab.locator("#board-0 details.more").all():
+        details.locator("summary").first.click()
     places = ("#board-0-table tbody", "#refused", "#entries", "#board-0 .ladder", "#board-0 .legend", ".bars")
     for place in places:
         text = tab.locator(place).inner_text()
@@ -328,7 +331,7 @@ def test_print_shows_everything_in_light_colors(opened: Open, page: str) -> None
     assert plot.bounding_box()["width"] <= 700
     assert plot.locator("path.median").first.get_attribute("stroke") == "rgb(0, 114, 178)", "the light blue"
     tab.emulate_media(media="screen")
-    tab.locator("details[open]").first.wait_for(state="detached")
+    tab.locator("details.more[open]").first.wait_for(state="detached")
 
 
 def test_print_without_javascript_opens_everything(opened: Open, page: str) -> None:
@@ -397,7 +400,7 @@ def test_an_entry_has_one_color_in_every_picture(opened: Open) -> None:
         for place in (".ranks tbody tr", ".legend li", ".bars tbody tr"):
             for row in tab.locator(f"#board-{number} {place}").all():
                 look = str(row.locator(".swatch line").get_attribute("class"))
-                name = next(word for word in re.findall(r"(?:slow|fast) \d", row.inner_text()))
+                name = next(word for word in re.findall(r"(?:slow|fast) \d", row.text_content()))
                 looks.setdefault(name, set()).add(look)
         drawn = tab.locator(f"#board-{number} path.median")
         for item, curve in zip(tab.locator(f"#board-{number} .legend li").all(), drawn.all(), strict=True):
