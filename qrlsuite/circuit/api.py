@@ -17,7 +17,7 @@ import threading
 import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def options_on(own: type[Options], backend: str) -> type[Options]:
     from qrlsuite import registry, specs
 
     theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, backend).options)
-    joined: type[Options] = _joined(own, theirs, backend)
+    joined: type[Options] = _joined(cast(Any, own), theirs, backend)
     return joined
 
 
