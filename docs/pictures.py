@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import shlex
 import shutil
 import subprocess
@@ -21,6 +22,8 @@ from typing import Any
 
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+
+from qrlsuite.leaderboard.shelf.published import AGENTS, encode_record
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -163,10 +166,20 @@ def made_from(picture: Plot | Screenshot) -> str:
     digest = hashlib.sha256(repr(picture).encode())
     published = ROOT / "leaderboard"
     for path in sorted(path for pattern in picture.entries for path in published.glob(f"{pattern}/[!.]*")):
-        if path.is_file():
+        if path.is_file() and path.name != AGENTS:
             digest.update(path.relative_to(published).as_posix().encode())
-            digest.update(path.read_bytes())
+            digest.update(_shown(path))
     return digest.hexdigest()[:16]
+
+
+def _shown(path: Path) -> bytes:
+    """Return a published file as it would be without agents, which no picture of published entries shows."""
+    content = path.read_bytes()
+    if path.name != "entry.json":
+        return content
+    record = json.loads(content)
+    record["published"].pop("agents", None)
+    return encode_record(record)
 
 
 def mark_of(path: Path) -> str | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from qrlsuite.leaderboard.shelf.published import AGENTS, encode_record
 from tests.core.test_docs import parse
 from tests.docs import load
 
@@ -57,5 +58,15 @@ def test_a_mark_follows_the_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     picture = pictures.Plot("plot curves", ("entries/task/*",))
     before = pictures.made_from(picture)
     assert pictures.made_from(picture) == before
+    record = {"name": "entry", "published": {"seeds": 1}}
+    (entry / "entry.json").write_bytes(encode_record(record))
+    before = pictures.made_from(picture)
+    named = {**record, "published": {"seeds": 1, "agents": {"seeds": [0]}}}
+    (entry / "entry.json").write_bytes(encode_record(named))
+    (entry / AGENTS).write_bytes(b"agents, which no picture shows")
+    assert pictures.made_from(picture) == before
+    (entry / "entry.json").write_bytes(encode_record({**record, "published": {"seeds": 2}}))
+    assert pictures.made_from(picture) != before
+    before = pictures.made_from(picture)
     (entry / "seeds.parquet").write_bytes(b"new")
     assert pictures.made_from(picture) != before
