@@ -334,7 +334,8 @@ def _load(
         raise PluginError(_failure(source, error)) from error
     finally:
         own.handed = outer
-    registered = [_registered(thing, module, source, place) for thing, place in things or given]
+    named = [(getattr(module, t) if isinstance(t, str) else t, place) for t, place in things]
+    registered = [_registered(thing, module, source, place) for thing, place in named or given]
     if _has_hooks(module):
         registered += known.collect(module, source.name)
     elif not registered:
@@ -363,7 +364,6 @@ def _enter(own: _Own, known: Registry, each: Loaded) -> None:
 
 def _registered(thing: Any, module: ModuleType, source: Source, place: str) -> Registered[Any]:
     try:
-        thing = getattr(module, thing) if isinstance(thing, str) else thing
         spec = thing if isinstance(thing, specs.Spec) else shortforms.spec_of(thing, module, source.name)
     except PluginError as error:
         raise PluginError(f"{place}: {error}") from None
@@ -403,7 +403,7 @@ def _require_free(source: Source) -> None:
     if source.name in {each.distribution for each in registry.load().plugins}:
         raise PluginError(f"{source.path}: there is an installed plugin {source.name}: rename this one")
     there = sys.modules.get(name)
-    spec = getattr(there, "__spec__", None) if there is not None else importlib.util.find_spec(name)
+    spec = getattr(there, "__spec__", None) if there is not None else _found(name)
     origin = getattr(spec, "origin", None)
     if spec is None and name not in sys.stdlib_module_names:
         return
@@ -431,11 +431,17 @@ def _beside(origin: str | None) -> bool:
     return origin is not None and Path(origin).parent in (Path.cwd(), Path.cwd() / "__pycache__")
 
 
+def _found(module: str) -> ModuleSpec | None:
+    """Return where Python finds a module; a folder without code is none."""
+    spec = importlib.util.find_spec(module)
+    return None if spec is not None and spec.origin is None else spec
+
+
 def is_free(module: str) -> bool:
     """Return whether a plugin's module may have a name: one that no module has which is not a plugin's by path."""
     if module in modules():
         return True
-    return module not in {*sys.stdlib_module_names, *sys.modules} and importlib.util.find_spec(module) is None
+    return module not in {*sys.stdlib_module_names, *sys.modules} and _found(module) is None
 
 
 def failure(error: BaseException) -> str:

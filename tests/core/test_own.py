@@ -291,6 +291,10 @@ def test_a_packages_folder_with_hooks_is_used_as_it_lies_there() -> None:
         ),
         ("def iqp(qubits, layers): ...\n", "/bad.py:1: ansatz 'iqp' is registered already, by qrlsuite ("),
         (
+            "import qrlsuite\nqrlsuite.register('x.py')\n",
+            "/bad.py:2: ''x.py'' cannot be registered: it is neither",
+        ),
+        (
             "import qrlsuite\nqrlsuite.register(3)\n",
             "/bad.py:2: '3' cannot be registered: it is neither a spec nor",
         ),
@@ -326,6 +330,14 @@ def test_a_path_that_is_no_plugin_is_refused(path: str, expected: str) -> None:
     with pytest.raises(PluginError) as caught:
         own.load(path)
     assert expected in str(caught.value)
+
+
+def test_a_folder_of_its_name_beside_it_is_no_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `qrlsuite new plugin --from ring.py` makes one, in the folder where a notebook runs."""
+    monkeypatch.syspath_prepend(Path.cwd())
+    write("ring/pyproject.toml", "")
+    write("code/ring.py", RING)
+    assert own.load("code/ring.py").sentence == "ring.py: ansatz ring"
 
 
 def test_two_plugins_of_one_name_are_refused_unless_they_are_equal() -> None:
