@@ -30,7 +30,6 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.pictures import outcome as drawing
-from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.outcome import needs_text
@@ -681,7 +680,8 @@ def test_a_published_study_is_known_by_its_name(monkeypatch: pytest.MonkeyPatch)
     run(study := ask())
     say("export", study, "--out", "published")
     Path(study).unlink()
-    monkeypatch.setattr(published_studies, "PUBLISHED", Path("published").absolute())
+    for place in ("shelf.PLANS", "shelf.published_studies.PUBLISHED"):
+        monkeypatch.setattr(f"qrlsuite.leaderboard.{place}", Path("published").absolute())
     published = answer("show", "widths", "--runs", "none")
     assert published["pairs"][0]["decided"] is not None
     assert re.search(r"widths +Which needs fewer steps", say("list", "studies").stdout)
