@@ -202,7 +202,7 @@ class ModelSpec(NumericSpec):
         return replace(
             self,
             name=name,
-            summary=f"{self.summary} on {backend.name}: {backend.summary.partition(';')[0]}",
+            summary=f"{self.summary}; backend: {backend.summary.partition(';')[0]}",
             options=f"{self.options}[{backend.name}]",
             faster=None if name == self.faster else self.faster,
             backends=False,

@@ -169,9 +169,25 @@ def _joined(own: Any, theirs: Any, backend: str) -> Any:
         raise PluginError(
             f"circuit backend '{backend}': '{shared[0]}' of its options is one of the model's: give it another name"
         )
-    content = {"__module__": own.__module__, "__doc__": own.__doc__, "backend": backend}
+
+    def reduced(
+        self: Any,
+    ) -> tuple[Any, ...]:  # a process that unpickles it finds no class of this name in a module
+        values = {name: getattr(self, name) for name in field_names(type(self))}
+        return _with_values, (own, backend, values)
+
+    content = {
+        "__module__": own.__module__,
+        "__doc__": own.__doc__,
+        "backend": backend,
+        "__reduce__": reduced,
+    }
     made = type(f"{own.__name__}[{backend}]", (theirs, own), content)
     return dataclass(frozen=True, config=ConfigDict(extra="forbid"))(made)
+
+
+def _with_values(own: type[Options], backend: str, values: Mapping[str, Any]) -> Options:
+    return options_on(own, backend)(**values)
 
 
 def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBackend:

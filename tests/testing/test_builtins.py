@@ -51,7 +51,10 @@ WHERE_OFFERED = {
     ("rules", "times"): ["against"],
     ("rules", "times-skewed"): ["against"],
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
-    **{("models", name): ["memory"] for name in ("fourier", "gru", "mlp", "vqc-native", "vqc-pennylane")},
+    **{
+        ("models", name): ["memory"]
+        for name in ("fourier", "gru", "mlp", "vqc-native", "vqc-pennylane", "vqc-qiskit")
+    },
     **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
     ("algorithms", "drqn"): ["memory", "memory of episodes"],
     ("algorithms", "ppo"): ["memory", "box actions", "multi-discrete actions", "multi-binary actions"],
