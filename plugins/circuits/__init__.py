@@ -32,7 +32,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
     register(
         CircuitBackendSpec(
             name="native",
-            summary="The suite's own batched simulator, the fast one; options: shots, gradient, noise_model, trajectories",
+            summary="The suite's own fast simulator; options: shots, gradient, noise_model, trajectories",
             options=f"{_HERE}.options:NativeOptions",
             factory=f"{_HERE}.native:NativeBackend",
             mean_field=True,
