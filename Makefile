@@ -93,6 +93,7 @@ demo-of-wheel: dist
 
 install: $(BIN)/python
 	rm -f $(VENV)/editable
+	@echo 'installing qrlsuite and what it needs'
 	$(BIN)/pip install --quiet .
 
 install-dev: $(VENV)/editable
@@ -105,6 +106,7 @@ $(VENV)/editable: pyproject.toml | $(BIN)/python
 # install the torch of your choice into $(VENV) before anything else; it is kept.
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
+	@echo 'installing torch into $(VENV): a download of 200 MB'
 	$(BIN)/pip install --quiet 'torch==$(TORCH)+cpu' 2>/dev/null \
 	  || $(BIN)/pip install --quiet torch --index-url https://download.pytorch.org/whl/cpu \
 	  || $(BIN)/pip install --quiet torch

@@ -127,9 +127,10 @@ class Registry:
         try:
             return self.of(kind)[name]
         except KeyError:
-            raise UnknownNameError(
-                f"unknown {specs.title(kind, name)}{nearest(name, self.entries[kind])}"
-            ) from None
+            hint = nearest(name, self.entries[kind])
+            if kind is specs.ModelSpec and name in self.entries[specs.AnsatzSpec]:
+                hint = f": it is an ansatz, which a circuit takes: --model vqc-native --set ansatz={name}"
+            raise UnknownNameError(f"unknown {specs.title(kind, name)}{hint}") from None
 
     def add_plugin(self, plugin: Any, distribution: str) -> dict[str, list[str]]:
         """Register a plugin object with the manager, and all that it registers, or nothing of it.

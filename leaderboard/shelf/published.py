@@ -32,6 +32,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.leaderboard.shelf.curves import EntryResults, require_scores
 from qrlsuite.leaderboard.shelf.fingerprint import Fingerprint
+from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet, probes, provenance
 from qrlsuite.results.store import (
@@ -443,10 +444,21 @@ def _check_label(folder: Path, record: Mapping[str, Any], task_file: TaskFile) -
         return
     entry = from_record(record, str(folder / "entry.json"))  # builds the options anew, and compares the hash
     _require(
-        record["label"] == entry.label,
+        record["label"] == entry.label or _words(record["label"]) == _words(entry.label),
         folder,
         f"its label is {record['label']!r}, and should be {entry.label!r}",
     )
+
+
+def _words(label: str) -> list[tuple[str, str]]:
+    """Return the options that a label writes; before 0.2.0 it wrote those of an ansatz as a table."""
+    written = parse_entry(label)
+    words = [("algorithm", str(written.algorithm)), ("model", written.model)]
+    for setting in written.settings:
+        table = setting.name == "ansatz_options" and isinstance(setting.value, Mapping)
+        values = setting.value if table else {setting.name: setting.value}
+        words += [(name, repr(value)) for name, value in values.items()]
+    return words
 
 
 _CURVE_COLUMNS = {"seed": "int64", "epoch": "int64", "score": "double"}

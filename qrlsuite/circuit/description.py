@@ -108,21 +108,23 @@ class Angle:
 
     def __mul__(self, other: Angle) -> Angle:
         """Multiply an input by another one or by a trainable scale (in any order); nothing else may be multiplied."""
-        for a, b in ((self, other), (other, self)):
-            if isinstance(b, Angle) and a.is_bare_input and b.is_bare_weight:
+        for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
+            if a.is_bare_input and b.is_bare_weight:
                 return Angle(input=a.input, scale=b.weight, factor=a.factor)
-            if isinstance(b, Angle) and a.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
+            if a.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
                 return Angle(input=a.input, factor=b.input)
-            if (
-                isinstance(b, Angle)
-                and a._is_scaled_input
-                and b.is_bare_input
-                and a.factor is b.factor is None
-            ):
+            if a._is_scaled_input and b.is_bare_input and a.factor is b.factor is None:
                 return Angle(input=a.input, scale=a.scale, factor=b.input)
-        raise CircuitError(
-            "an angle is affine: only input * parameter, input * input and input * input * parameter can be multiplied"
+        what = (
+            "an angle is affine"
+            if isinstance(other, Angle)
+            else f"an angle cannot be multiplied by {other!r}"
         )
+        raise CircuitError(
+            f"{what}: only input * parameter, input * input and input * input * parameter can be multiplied"
+        )
+
+    __rmul__ = __mul__
 
     def __add__(self, other: Angle | float) -> Angle:
         """Add two angles: at most one input term and one weight may remain."""

@@ -147,6 +147,8 @@ def test_products_are_drawn():
     ("write", "message"),
     [
         (lambda c: c.input(0) * c.input(1) * c.input(0), "an angle is affine: only"),
+        (lambda c: c.input(0) * 3.14, "an angle cannot be multiplied by 3.14: only input . parameter"),
+        (lambda c: 2 * c.input(0), "an angle cannot be multiplied by 2: only input . parameter"),
         (lambda c: c.append("RZZ", 0, 0.1), "RZZ takes 2 wires, 1 angle and no control"),
         (lambda c: c.append("RXY", (0, 1), 0.1), "unknown gate 'RXY'; did you mean"),
         (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, are needed"),

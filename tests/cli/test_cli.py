@@ -199,6 +199,10 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         (["run", "--task", "beam6g", "--model", "mlp", "--budget", "-1"], "--budget -1: write 90s, 30min"),
         (["run", "--task", "beam6h", "--model", "mlp"], "unknown task 'beam6h'; did you mean 'beam6g'"),
         (["run", "--task", "beam6g", "--model", "mpl"], "unknown model 'mpl'; did you mean 'mlp'"),
+        (
+            ["run", "--task", "beam6g", "--model", "iqp"],
+            "unknown model 'iqp': it is an ansatz, which a circuit takes: --model vqc-native --set ansatz=iqp",
+        ),
         (["run", "dqn mlp", "--task", "beam6g"], "did you mean 'ddqn'"),
         (["run", "--task", "beam6g"], "name a model, for example: qrlsuite run mlp width=16 --task beam6g"),
         (["run", "ppo", "mlp", "--model", "mlp", "--task", "beam6g"], "'ppo mlp' and --model mlp: give one"),

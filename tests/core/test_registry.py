@@ -60,7 +60,7 @@ def test_a_model_for_every_circuit_backend_is_one_on_each_whichever_comes_first(
     assert sorted(models) == ["waves-first", "waves-later", "waves-own"]
     assert [models[name].distribution for name in sorted(models)] == ["waves", "waves", "own"]
     assert (models["waves-later"].spec.options, models["waves-own"].spec.options) == ("a:B[later]", "a:B")
-    assert models["waves-later"].spec.summary == "One on later: Exact"
+    assert models["waves-later"].spec.summary == "One; backend: Exact"
     assert [each.registered.get("models") for each in found.plugins] == [
         None, ["waves-first"], ["waves-later"], ["waves-own"]
     ]  # fmt: skip

@@ -94,7 +94,7 @@ def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path
     assert sorted(path.name for path in bare.iterdir()) == ["curves.parquet", "entry.json", "seeds.parquet"]
     assert verify.verify(bare).ok
     with pytest.raises(
-        StoreError, match=r"curves without agents; .*qrlsuite run --task tiny 'ddqn mlp width=16'"
+        StoreError, match=r"curves without agents.*; qrlsuite run --task tiny 'ddqn mlp width=16'"
     ):
         published.PublishedAgents(bare, tmp_path / "runs")
     (source,) = importing.sources(bare)

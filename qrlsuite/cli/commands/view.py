@@ -44,6 +44,6 @@ def view(
     with Server(port) as server:
         typer.echo(f"reading {runs} ...")
         live = Live(render, lambda: survey(runs, task))
-        typer.echo(f"{runs} is shown at {server.address}, to browsers on this machine; Ctrl-C ends it")
+        typer.echo(f"{runs} is shown to browsers on this machine, until Ctrl-C, at {server.address}")
         serve(server, live)
     typer.echo("\nended; nothing in the folder was changed")
