@@ -116,7 +116,8 @@ def test_a_browser_follows_a_run(
     name = tab.locator("#running").get_attribute("data-page")
 
     qrlsuite(*words[:6], "width=4", *words[7:], "--runs", str(tmp_path / "runs"))
-    board.get_by_role("checkbox", name="Pick mlp width=4").wait_for(state="attached")
+    hidden = board.get_by_role("checkbox", name="Pick mlp width=4", include_hidden=True)
+    hidden.wait_for(state="attached")  # the search hides its row
     assert tab.locator("#running").get_attribute("data-page") != name
     assert board.locator(".legend li > span").all_inner_texts() == chosen, "what is picked stays"
     assert search.input_value() == "width=8"
