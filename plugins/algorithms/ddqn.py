@@ -31,7 +31,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel, Memory
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, part, prefixed
 from qrlsuite.seeding import Streams
@@ -124,16 +124,10 @@ class DDQN:
         """Step every environment once and store the S x E transitions."""
         lanes = actions.reshape(-1).cpu().numpy()
         after, rewards, terminated, _, infos = self.envs.step(lanes)
-        following = by_seed(after, self.S, self.device)
-        arrived = by_seed(infos["final_obs"], self.S, self.device) if "final_obs" in infos else following
-        done = infos.get("_final_obs")
-        if done is not None:
-            mask = torch.from_numpy(np.asarray(done, dtype=bool)).view(self.S, self.E, 1).to(self.device)
-            arrived = torch.where(mask, arrived, following)
         rows = torch.cat(
             [
                 self.observations,
-                arrived,
+                by_seed(arrived(after, infos), self.S, self.device),
                 actions[..., None].to(torch.float32),
                 by_seed(rewards, self.S, self.device),
                 1.0 - by_seed(terminated, self.S, self.device),
@@ -143,7 +137,7 @@ class DDQN:
         places = (self.stored + torch.arange(self.E)) % self.options.buffer
         self.buffer[:, places] = rows
         self.stored += self.E
-        self.observations = following
+        self.observations = by_seed(after, self.S, self.device)
 
     def _learn(self, picked: Tensor) -> Tensor:
         """Make one Adam step of every agent on its batch `picked` (S, batch); returns the losses (S,)."""

@@ -168,7 +168,7 @@ def record(
     seed: int = 0,
     published: bool = False,
 ) -> Episode:
-    """Play an episode with an entry's best trained agent, and draw it: see `qrlsuite.api.playing.play`."""
+    """Play an episode with an entry's best trained agent, and draw it: see `qrlsuite.api.play`."""
     on = None if task is None else the_task(runs, task, published)
     store = find(runs, entry, None if on is None else on.name, published)
     played = evaluation.trained_entry(store, on)

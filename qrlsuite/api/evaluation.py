@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -32,9 +32,6 @@ from qrlsuite.training import evaluation
 from qrlsuite.training.deployment import Deployment, steps_per_episode
 from qrlsuite.training.entanglement import PARAMETERS, Entanglement, along_episodes
 from qrlsuite.training.evaluation import Played
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WIDE = 100
 """Columns of a terminal in which the whole table can be read."""

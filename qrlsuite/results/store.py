@@ -802,7 +802,7 @@ def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
     """
     if not runs.is_dir():
         raise StoreError(
-            f"there is no results folder {runs}: `qrlsuite run` creates one, --runs DIR selects another"
+            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another"
         )
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
     return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite import specs
+from qrlsuite import actions, specs
 from qrlsuite.actions import draw
-from qrlsuite.errors import EnvironmentFailure
+from qrlsuite.errors import EnvironmentFailure, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.training.group import lines_of
@@ -160,3 +160,11 @@ def test_what_an_environment_measures_is_recorded() -> None:
         EnvironmentFailure, match=r"info\['metrics'\] of an episode has 'Steps taken' = .*: names are like"
     ):
         wrong.train_epoch()
+
+
+def test_specs_know_the_kinds_of_actions() -> None:
+    """`qrlsuite.specs` imports no Gymnasium, and so has the names once more."""
+    spec = specs.AlgorithmSpec("any", "Any", options="a:b", factory="a:b", actions=tuple(actions.KINDS))
+    assert spec.actions == tuple(actions.KINDS)
+    with pytest.raises(PluginError, match=", ".join(actions.KINDS)):
+        replace(spec, actions=("continuous",))

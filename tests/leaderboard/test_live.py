@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import json
 import os
 import re
 import signal
@@ -236,3 +237,10 @@ def test_damage_while_it_is_shown_is_told_and_goes_by(
     while "mlp width=16" not in (page := answer(address)[1]):
         time.sleep(0.05)
     assert 'id="refused"' not in page
+
+
+def test_published_entries_need_no_results_folder(view: View, tmp_path: Path) -> None:
+    _, address = view("--published", "--task", "cartpole")
+    assert not (tmp_path / "runs").exists()
+    code, text = answer(address, "/progress")
+    assert (code, json.loads(text)["groups"]) == (200, [])

@@ -44,7 +44,7 @@ def demo(runs: RunsOption = Path("runs")) -> None:
     typer.echo(f"\nYour {SEEDS} seeds, {horizon} steps each, pair by pair:")
     for first, second in combinations(trained, 2):
         typer.echo(f"- {api.compare(first, second).verdict}")
-    typer.echo("Next, a circuit of your own: qrlsuite new plugin my-circuit --kind ansatz")
+    typer.echo("Next, a circuit of your own: write it in ring.py, as README does, and add --plugin ring.py")
 
 
 def _do(*words: str, runs: Path) -> int | None:

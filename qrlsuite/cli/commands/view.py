@@ -43,7 +43,7 @@ def view(
 
     with Server(port) as server:
         typer.echo(f"reading {runs} ...")
-        live = Live(render, lambda: survey(runs, task))
+        live = Live(render, lambda: survey(runs, task) if runs.is_dir() or not published else [])
         typer.echo(f"{runs} is shown to browsers on this machine, until Ctrl-C, at {server.address}")
         serve(server, live)
     typer.echo("\nended; nothing in the folder was changed")
