@@ -1,4 +1,4 @@
-"""The built-in function approximators: multilayer perceptron, Fourier features, hybrid variational quantum circuits."""
+"""The built-in function approximators: perceptrons, Fourier features, recurrent units, hybrid quantum circuits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from qrlsuite.specs import NO_MODEL, ModelSpec
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru`, `none`, and `vqc-BACKEND` for each circuit backend."""
+    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-BACKEND` for each circuit backend."""
     register(
         ModelSpec(
             name="mlp",
@@ -33,16 +33,17 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             memory="qrlsuite.plugins.models.fourier:memory",
         )
     )
-    register(
-        ModelSpec(
-            name="gru",
-            summary="Gated recurrent unit, a network that remembers; options: width, input_scale",
-            family="classical",
-            options="qrlsuite.plugins.models.gru:GRUOptions",
-            build="qrlsuite.plugins.models.gru:build",
-            memory="qrlsuite.plugins.models.gru:memory",
+    for name, unit in (("gru", "Gated recurrent unit"), ("lstm", "Long short-term memory")):
+        register(
+            ModelSpec(
+                name=name,
+                summary=f"{unit}, a network that remembers; options: width, input_scale",
+                family="classical",
+                options="qrlsuite.plugins.models.recurrent:RecurrentOptions",
+                build=f"qrlsuite.plugins.models.recurrent:{name}",
+                memory="qrlsuite.plugins.models.recurrent:memory",
+            )
         )
-    )
     register(
         ModelSpec(
             name=NO_MODEL,

@@ -13,7 +13,7 @@ from torch import nn
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.plugins.algorithms.drqn import DRQN
-from qrlsuite.plugins.models.gru import GRU, GRUOptions
+from qrlsuite.plugins.models.recurrent import GRU, LSTM, RecurrentOptions
 from qrlsuite.population import stack
 from qrlsuite.testing.group import Toy
 from qrlsuite.training.trainer import Trainer
@@ -29,30 +29,25 @@ def made(model: str = "gru", seeds: int = 2, **settings: Any) -> DRQN:
     return algorithm
 
 
-def test_the_unit_is_that_of_torch() -> None:
-    unit = GRU(4, 3, GRUOptions(width=6), torch.Generator().manual_seed(1))
-    cell = nn.GRUCell(4, 6)
-    cell.load_state_dict(
-        {
-            "weight_ih": unit.from_input.weight, "bias_ih": unit.from_input.bias,
-            "weight_hh": unit.from_state.weight, "bias_hh": unit.from_state.bias,
-        }
-    )  # fmt: skip
-    x, state = torch.randn(5, 4), torch.randn(5, 6)
-    outputs, after = unit(x, state)
-    torch.testing.assert_close(after, cell(x, state))
-    torch.testing.assert_close(outputs, unit.last(cell(x, state)))
-    torch.testing.assert_close(unit(x), unit(x, torch.zeros(5, 6))[0])
-
-
-def test_a_population_of_units_is_each_of_them() -> None:
-    units = [GRU(4, 3, GRUOptions(width=6), torch.Generator().manual_seed(s)) for s in range(3)]
-    together, x, state = stack(units), torch.randn(3, 5, 4), torch.randn(3, 5, 6)
+@pytest.mark.parametrize(("unit", "cell"), [(GRU, nn.GRUCell), (LSTM, nn.LSTMCell)])
+def test_the_unit_is_that_of_torch_and_a_population_is_each_of_them(unit: Any, cell: Any) -> None:
+    units = [unit(4, 3, RecurrentOptions(width=6), torch.Generator().manual_seed(s)) for s in range(3)]
+    together, x, state = stack(units), torch.randn(3, 5, 4), torch.randn(3, 5, units[0].remembers)
     outputs, after = together(x, state)
-    for s, unit in enumerate(units):
-        torch.testing.assert_close(outputs[s], unit(x[s], state[s])[0])
-        torch.testing.assert_close(after[s], unit(x[s], state[s])[1])
     assert together.problem is None
+    for s, one in enumerate(units):
+        theirs = cell(4, 6)
+        theirs.load_state_dict(
+            {
+                "weight_ih": one.from_input.weight, "bias_ih": one.from_input.bias,
+                "weight_hh": one.from_state.weight, "bias_hh": one.from_state.bias,
+            }
+        )  # fmt: skip
+        before = tuple(torch.chunk(state[s], 2, -1)) if unit is LSTM else state[s]
+        kept = theirs(x[s], before)
+        torch.testing.assert_close(after[s], torch.cat(kept, -1) if unit is LSTM else kept)
+        torch.testing.assert_close(outputs[s], one.last(after[s, :, :6]))
+        torch.testing.assert_close(one(x[s]), one(x[s], torch.zeros_like(state[s]))[0])
 
 
 class Unit:

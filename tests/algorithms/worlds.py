@@ -112,7 +112,7 @@ class Group:
         self.streams = [Streams("tests", seed) for seed in seeds]
         self.E = envs.num_envs // len(self.seeds)
         self.model = registry.get(specs.ModelSpec, model)
-        defaults = {"mlp": {"width": 16, "depth": 1}, "gru": {"width": 16}}.get(
+        defaults = {"mlp": {"width": 16, "depth": 1}, "gru": {"width": 16}, "lstm": {"width": 16}}.get(
             model, {"qubits": 2, "layers": 2}
         )
         self.model_options = options.build(

@@ -53,7 +53,7 @@ WHERE_OFFERED = {
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
     **{
         ("models", name): ["memory"]
-        for name in ("fourier", "gru", "mlp", "vqc-native", "vqc-pennylane", "vqc-qiskit")
+        for name in ("fourier", "gru", "lstm", "mlp", "vqc-native", "vqc-pennylane", "vqc-qiskit")
     },
     **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
     ("algorithms", "drqn"): ["memory", "memory of episodes"],
