@@ -14,7 +14,7 @@ import pytest
 from qrlsuite import registry, testing
 from qrlsuite.cli import main
 from qrlsuite.experiment.task import load
-from tests.core.test_hooks import install, suite
+from tests.core.test_hooks import COMMANDS, install, suite
 
 ENGINES = """
 from typing import Annotated
@@ -103,7 +103,7 @@ def check(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     return run
 
 
-def test_by_name_every_rule_is_shown(check: Command) -> None:
+def test_by_name_every_rule_is_shown_and_a_broken_one_is_exit_code_1(check: Command) -> None:
     code, out, err = check("tidy-too")
     lines = out.splitlines()
     assert (code, err) == (0, "")
@@ -111,9 +111,6 @@ def test_by_name_every_rule_is_shown(check: Command) -> None:
     assert "  ✓ queued: no seed of an entry that was never submitted waits" in lines
     assert lines[-1] == f"all {len(lines) - 2} rules hold"
     assert check("engine:tidy-too") == check("engines:tidy-too") == (code, out, err)
-
-
-def test_settings_are_checked_and_a_broken_rule_is_exit_code_1(check: Command) -> None:
     assert check("tidy-too", "slots=3")[0] == 0
     code, out, _ = check("tidy-too", "slots=0")
     assert code == 1
@@ -122,6 +119,12 @@ def test_settings_are_checked_and_a_broken_rule_is_exit_code_1(check: Command) -
     code, out, _ = check("tidy-too", "slot=3")
     assert code == 1
     assert "did you mean 'slots'" in out
+    code, out, err = check("tidy-too", "slots=0", "--json")
+    rows = json.loads(out)
+    assert (code, err) == (1, "")
+    assert {(row["kind"], row["name"]) for row in rows} == {("engine", "tidy-too")}
+    assert [row["rule"] for row in rows if not row["ok"]] == ["workers"]
+    assert all(row["message"] for row in rows)
 
 
 def test_a_task_of_one_s_own_is_checked(check: Command, tiny_task: str) -> None:
@@ -149,19 +152,6 @@ def test_an_environment_is_checked_as_a_task_has_it(
     assert "--task is for one environment, algorithm or model" in check("cz", "--task", tiny_task)[2]
 
 
-def test_ppo_that_draws_in_validation_keeps_the_rules(check: Command) -> None:
-    assert check("algorithm:ppo", "validation=sampled")[0] == 0
-
-
-def test_json_is_one_row_per_rule(check: Command) -> None:
-    code, out, err = check("tidy-too", "slots=0", "--json")
-    rows = json.loads(out)
-    assert (code, err) == (1, "")
-    assert {(row["kind"], row["name"]) for row in rows} == {("engine", "tidy-too")}
-    assert [row["rule"] for row in rows if not row["ok"]] == ["workers"]
-    assert all(row["message"] for row in rows)
-
-
 def test_a_distribution_stands_for_all_that_it_registers(check: Command) -> None:
     code, out, _ = check("tidy", "--json")
     assert code == 0
@@ -183,27 +173,20 @@ def test_a_name_that_two_distributions_registered_is_a_broken_rule_of_both(check
     assert check("shared")[0] == 2
 
 
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("tidi", "nothing called 'tidi' is registered; did you mean 'tidy'?"),
-        ("engine:tidi", "unknown engine 'tidi'; did you mean 'tidy'?"),
-        ("engin:tidy", "unknown kind 'engin'; did you mean 'engine'?"),
-        ("distribution:tidi", "no plugin is of a distribution 'tidi'; did you mean 'tidy'?"),
-        ("significance-test:times", "'significance-test' is now `rule`"),
-        (
-            "cartpole",
-            "'cartpole' is several things; write qrlsuite check environment:cartpole or qrlsuite check "
-            "task:cartpole or qrlsuite check study:cartpole",
-        ),
-        (
-            "local",
-            "'local' is several things; write qrlsuite check engine:local or qrlsuite check distribution:local",
-        ),
-        ("failing", "'failing' cannot be imported: RuntimeError: no license"),
-        ("silent", "is every hook under @hookimpl"),
-    ],
-)
+WRONG = """
+tidi => nothing called 'tidi' is registered; did you mean 'tidy'?
+engine:tidi => unknown engine 'tidi'; did you mean 'tidy'?
+engin:tidy => unknown kind 'engin'; did you mean 'engine'?
+distribution:tidi => no plugin is of a distribution 'tidi'; did you mean 'tidy'?
+significance-test:times => 'significance-test' is now `rule`
+cartpole => write qrlsuite check environment:cartpole or qrlsuite check task:cartpole or qrlsuite check study:cartpole
+local => 'local' is several things; write qrlsuite check engine:local or qrlsuite check distribution:local
+failing => 'failing' cannot be imported: RuntimeError: no license
+silent => is every hook under @hookimpl
+"""
+
+
+@pytest.mark.parametrize(("word", "message"), [line.split(" => ") for line in WRONG.strip().splitlines()])
 def test_wrong_names_are_one_clear_line(word: str, message: str, check: Command) -> None:
     code, out, err = check(word)
     assert (code, out) == (2, "")
@@ -290,12 +273,8 @@ def test_names_and_messages_of_a_hostile_plugin_control_no_terminal(hostile: Pat
         assert_harmless(done)
         assert "\\x1b" in done.stdout + done.stderr, words
         assert "Traceback" not in done.stderr
-
-
-def test_check_shows_a_hostile_plugin_as_it_is(hostile: Path) -> None:
     done = suite(hostile, "check", "evil")
     assert done.returncode == 1
-    assert_harmless(done)
     assert f"✗ builds: RuntimeError: first {CLEAN}" in done.stdout
     terminal = suite(hostile, "check", "evil", FORCE_COLOR="1", TERM="xterm-256color")
     assert "\x1b[1m" in terminal.stdout, "it believes to write to a terminal"
@@ -308,34 +287,22 @@ def test_a_hostile_tracker_controls_no_terminal_during_a_run(
 ) -> None:
     words = [
         "run",
+        "mlp",
         "--task",
         tiny_task,
-        "--model",
-        "mlp",
-        "--set",
-        "width=16",
         "--seeds",
         "1",
         "--epochs",
         "1",
+        "--runs",
+        str(tmp_path / "runs"),
     ]
-    done = suite(hostile, *words, "--track", "evil-eye", "--runs", str(tmp_path / "runs"))
+    done = suite(hostile, *words, "--track", "evil-eye")
     assert done.returncode == 0, done.stderr
     assert_harmless(done)
-    assert (
-        f"warning: tracker 'evil-eye' failed in its factory and is left out: RuntimeError: first {CLEAN}"
-        in done.stderr
-    )
+    assert f"'evil-eye' failed in its factory and is left out: RuntimeError: first {CLEAN}" in done.stderr
 
 
-COMMANDS = """
-import typer
-from qrlsuite import hookimpl
-
-@hookimpl
-def register_commands(app):
-    {body}
-"""
 UNBUILDABLE = "call = lambda x: None; call.__annotations__ = {'x': 'nosuch'}; app.command('call')(call)"
 SUB = "sub = typer.Typer(); sub.command('list')(lambda: None); app.add_typer(sub)"
 

@@ -14,8 +14,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from qrlsuite import own
 from qrlsuite.cli import main
+from qrlsuite.cli.app import RENAMED, build
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
 from tests.commands import qrlsuite, start
@@ -193,128 +196,188 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
         assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["run", "--task", "beam6g", "--model", "mlp", "--budget", "-1"], "--budget -1: write 90s, 30min"),
-        (["run", "--task", "beam6h", "--model", "mlp"], "unknown task 'beam6h'; did you mean 'beam6g'"),
-        (["run", "--task", "beam6g", "--model", "mpl"], "unknown model 'mpl'; did you mean 'mlp'"),
-        (
-            ["run", "--task", "beam6g", "--model", "iqp"],
-            "unknown model 'iqp': it is an ansatz, which a circuit takes: --model vqc-native --set ansatz=iqp",
-        ),
-        (["run", "dqn mlp", "--task", "beam6g"], "did you mean 'ddqn'"),
-        (["run", "--task", "beam6g"], "name a model, for example: qrlsuite run mlp width=16 --task beam6g"),
-        (["run", "ppo", "mlp", "--model", "mlp", "--task", "beam6g"], "'ppo mlp' and --model mlp: give one"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--set", "widht=1"], "did you mean 'width'"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--set", "width=wide"], "width = 'wide'"),
-        (["run", "--task", "beam6g", "mlp", "preset=relesed"], "did you mean 'released'"),
-        (
-            ["run", "--task", "beam6g", "--model", "mlp", "--seeds", "a:b"],
-            "write a number (100), a range (0:20)",
-        ),
-        (["run", "--task", "no/such.toml", "--model", "mlp"], "cannot be read"),
-        (
-            ["run", "--task", "beam6g", "--model", "mlp", "--set", "environment.antennas=[[[1,1],[1,0]]]"],
-            "antennas",
-        ),
-        (["run", "--task", "beam6g", "--model", "mlp", "--set", "degree=1"], "degree = 1"),
-        (
-            ["run", "--task", "beam6g", "--model", "mlp", "--set", "antennas=[[[1,1],[1,0]],[[9,1],[1,0]]]"],
-            "antennas",
-        ),
-        (
-            ["run", "--task", "beam6g", "--model", "mlp", "--set", "antennas=[[[1,1],[1,0]],[[3,1],[0,0]]]"],
-            "orientation",
-        ),
-        (["run", "--task", "beam6g", "--model", "mlp", "--device", "cudda"], "give cpu, cuda, or one GPU"),
-        (["run", "--task", "beam6g", "--model", "vqc-native", "--set", "qubits=0"], "qubits = 0"),
-        (["run", "--task", "beam6g", "--model", "vqc-native", "--set", "qubits=21"], "qubits = 21"),
-        (["run", "--task", "beam6g", "--model", "vqc-native", "--set", "qubits=1"], "needs 2 to 20"),
-        (["run", "--task", "beam6g", "--model", "vqc-native", "--set", "gate=rott"], "gate = 'rott'"),
-        (
-            ["run", "--task", "beam6g", "--model", "vqc-native", "--set", "ansatz=ipq"],
-            "unknown ansatz 'ipq'; did you mean 'iqp'",
-        ),
-        (["show", "ansatz", "iqp", "qubits=21"], "qubits = 21: a circuit has 1 to 20 qubits"),
-        (
-            ["run", "--task", "beam6g", "--model", "mlp", "--set", "lr=inf"],
-            "lr = inf: infinite numbers cannot",
-        ),
-        (["run", "--task", "beam6g", "--model", "mlp", "--seeds", "9" * 12], "100000 seeds are the most"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--sedes", "3"], "--seeds"),
-        (["run", "--task", "beam6g", "--model", "mlp", "--epochs", "0"], "--epochs"),
-        (["rnu"], "Did you mean 'run'"),
-        (["show", "ansatz", "iqp", "--out", "iqp.jpeg2"], "must be .png, .pdf or .svg"),
-        (["list", "modles"], "did you mean 'models'"),
-        (["show", "mpl"], "did you mean 'mlp'"),
-        (["leaderboard", "--runs", "nowhere"], "there is no results folder nowhere"),
-        *[
-            ([*words, "--task", "beam6h", "--runs", "."], "unknown task 'beam6h'; did you mean 'beam6g'")
-            for words in (
-                ["leaderboard"],
-                ["runs"],
-                ["runs", "gc"],
-                ["plot", "curves"],
-            )
-        ],
-        (["runs", "--task", "/etc"], "unknown task '/etc'"),
-        (["run", "--task", "beam6g", "mlp", "--minutes", "3"], "--minutes is gone: --budget 30min"),
-        (["run", "--task", "beam6g", "mlp", "--preset", "x"], "--preset is gone: write it into the entry"),
-        (["study", "run", "fig6", "--partition", "x"], "--partition is gone: --engine 'slurm partition=gpu"),
-        (["tune", "--task", "beam6g", "--model", "mlp"], "--model is gone: write it into the entry"),
-        (
-            ["evaluate", "mlp", "--backend-set", "shots=3"],
-            "--backend-set is gone: --backend 'qiskit shots=1000'",
-        ),
-        (
-            ["study", "run", "fig6", "--set", "qubits=6"],
-            "--set is gone: write it after the name, as in `qrlsuite study run",
-        ),
-        (["plot", "bars", "--settings"], "--settings is gone: qrlsuite show picture KIND"),
-        (["show", "ansatz", "iqp", "--qubits", "4"], "--qubits is gone: write it after the name"),
-        (["verify", "--choice", "3"], "--choice is gone: --rerun '2 choice=31'"),
-        (["verify", "--rerun", "2 choise=3"], "--rerun 2 choise=3: write a number of seeds"),
-        (["verify", "--rerun", "2 choice=x"], "choice is a whole number, which an earlier check printed"),
-        (["export", "--all"], "--all is gone: qrlsuite export all"),
-        (["export"], "name the entries to export, or say `export all`"),
-        (["show", "picture", "barz"], "nothing called 'barz'; did you mean 'bars'"),
-        (["show", "ansatz", "iqp", "cx"], "ansatz iqp cx: give one name"),
-        (["plot", "bars", "wide"], "wide: write settings of the picture as NAME=VALUE"),
-        (
-            ["study", "run", "fig6", "vqc-native=vqc-nativ"],
-            "unknown model 'vqc-nativ'; did you mean 'vqc-native'",
-        ),
-        (["status"], "`qrlsuite status` is now `qrlsuite runs`"),
-        (["leaderboard", "verify", "."], "`qrlsuite leaderboard verify` is now `qrlsuite verify`"),
-        (["calibrate"], "`qrlsuite calibrate` is now `python benchmarks/calibration.py`"),
-        (["plot", "estimator", "--task", "beam6g"], "picture 'estimator' shows no results: leave --task out"),
-        (["plot", "curves"], "`qrlsuite leaderboard --published` shows what comes with the suite"),
-        (
-            ["show", "mlp", "width=4"],
-            "model 'mlp': NAME=VALUE, --out and --format draw an ansatz",
-        ),
-        (["leaderboard", "--format", "markdwn"], "'markdwn' is not one of"),
-        (["plot", "curvs"], "unknown picture 'curvs'; did you mean 'curves'"),
-    ],
-)
+STUDY = 'format_version = 1\nname = "x"\nsummary = "x"\n[[pictures]]\n'
+DEPLOYED = STUDY + 'kind = "deployed"\nevaluation.deployed = { backend = "B", vary = "V", values = [N] }\n'
+PLUGIN = "def ring(qubits, layers): ...\n"
+GIVEN = {
+    "tiny.toml": TINY + "[protocol.algorithm_epochs]\nppo = 30\n",
+    "bar.toml": STUDY + 'kind = "bar"\n',
+    "many.toml": STUDY + 'kind = "estimator"\nsettings = { runs = "many" }\n',
+    "episodes.toml": STUDY + 'kind = "histogram"\n',
+    "nowhere.toml": STUDY + 'kind = "deployed"\nevaluation = { episodes = 3 }\n',
+    "backend.toml": DEPLOYED.replace("B", "nativ").replace("V", "shots").replace("N", "9"),
+    "zero.toml": DEPLOYED.replace("B", "native").replace("V", "shots").replace("N", "9, 0"),
+    "option.toml": DEPLOYED.replace("B", "native").replace("V", "shot").replace("N", "9"),
+    "ring.py": PLUGIN,
+    "again.py": PLUGIN,
+    "part.py": "from ring import *\n\nclass Net(Base): ...\n",
+    "b/ring.py": PLUGIN + "x = 1\n",
+    "broken.py": "x = 1\nx / 0\n",
+}
+"""Files of the folder in which the wrong commands are typed."""
+WRONG = """
+rnu => Did you mean 'run'
+run mlp --task beam6g --budget -1 => --budget -1: write 90s, 30min
+run --task beam6h --model mlp => unknown task 'beam6h'; did you mean 'beam6g'
+run --task no/such.toml --model mlp => cannot be read
+run --task beam6g => name a model, for example: qrlsuite run mlp width=16 --task beam6g
+run mpl --task beam6g => unknown model 'mpl'; did you mean 'mlp'
+run --task beam6g --model iqp => it is an ansatz, which a circuit takes: --model vqc-native --set ansatz=iqp
+run 'dqn mlp' --task beam6g => did you mean 'ddqn'
+run ppo mlp --model mlp --task beam6g => 'ppo mlp' and --model mlp: give one
+run mlp --task beam6g --set widht=1 => did you mean 'width'
+run mlp --task beam6g --set width=wide => width = 'wide'
+run mlp --task beam6g --set lr=inf => lr = inf: infinite numbers cannot
+run mlp preset=relesed --task beam6g => did you mean 'released'
+run mlp --task beam6g --seeds a:b => write a number (100), a range (0:20)
+run mlp --task beam6g --seeds 999999999999 => 100000 seeds are the most
+run mlp --task beam6g --sedes 3 => --seeds
+run mlp --task beam6g --epochs 0 => --epochs
+run mlp --task beam6g --device cudda => give cpu, cuda, or one GPU
+run mlp --task beam6g --set degree=1 => degree = 1
+run mlp --task beam6g --set environment.antennas=[[[1,1],[1,0]]] => antennas
+run mlp --task beam6g --set antennas=[[[1,1],[1,0]],[[9,1],[1,0]]] => antennas
+run mlp --task beam6g --set antennas=[[[1,1],[1,0]],[[3,1],[0,0]]] => orientation
+run vqc-native qubits=0 --task beam6g => qubits = 0
+run vqc-native qubits=21 --task beam6g => qubits = 21
+run vqc-native qubits=1 --task beam6g => needs 2 to 20
+run vqc-native gate=rott --task beam6g => gate = 'rott'
+run vqc-native ansatz=ipq --task beam6g => unknown ansatz 'ipq'; did you mean 'iqp'
+run mlp --task beam6g --minutes 3 => --minutes is gone: --budget 30min
+run mlp --task beam6g --preset x => --preset is gone: write it into the entry
+list modles => did you mean 'models'
+show mpl => did you mean 'mlp'
+show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
+show picture barz => nothing called 'barz'; did you mean 'bars'
+show ansatz iqp cx => ansatz iqp cx: give one name
+show ansatz iqp qubits=21 => qubits = 21: a circuit has 1 to 20 qubits
+show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
+show ansatz iqp --qubits 4 => --qubits is gone: write it after the name
+show tiny.toml => tiny.toml: unknown key 'default_algorithm'
+show bar.toml => pictures.0.kind: unknown picture 'bar'; did you mean 'bars'
+show many.toml => many.toml: pictures.0.settings
+show episodes.toml => pictures.0.evaluation: picture 'histogram' needs evaluation
+show nowhere.toml => pictures.0.evaluation.deployed: picture 'deployed' needs deployed
+show backend.toml => unknown circuit backend 'nativ'; did you mean 'native'
+show zero.toml => pictures.0.evaluation.deployed: shots = 0
+show option.toml => no option 'shot'; did you mean 'shots'
+show quantum-or-no => 'quantum-or-no'; did you mean 'quantum-or-not'?
+status => `qrlsuite status` is now `qrlsuite runs`
+leaderboard verify . => `qrlsuite leaderboard verify` is now `qrlsuite verify`
+calibrate => `qrlsuite calibrate` is now `python benchmarks/calibration.py`
+leaderboard --runs nowhere => there is no results folder nowhere
+leaderboard --format markdwn => 'markdwn' is not one of
+leaderboard --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
+runs --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
+runs --task /etc => unknown task '/etc'
+runs gc --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
+verify --choice 3 => --choice is gone: --rerun '2 choice=31'
+verify --rerun '2 choise=3' => --rerun 2 choise=3: write a number of seeds
+verify --rerun '2 choice=x' => choice is a whole number, which an earlier check printed
+export => name the entries to export, or say `export all`
+export --all => --all is gone: qrlsuite export all
+evaluate mlp --backend-set shots=3 => --backend-set is gone: --backend 'qiskit shots=1000'
+plot curves => `qrlsuite leaderboard --published` shows what comes with the suite
+plot curves --task beam6h --runs . => unknown task 'beam6h'; did you mean 'beam6g'
+plot curvs => unknown picture 'curvs'; did you mean 'curves'
+plot trajectory => did you mean 'trajectories'
+plot trajectories => add --task TASK
+plot field --task cartpole => shows tasks of beam6g; 'cartpole' is a task of cartpole
+plot histogram => drawn by: qrlsuite evaluate ENTRY
+plot estimator --task beam6g => picture 'estimator' shows no results: leave --task out
+plot bars wide => wide: write settings of the picture as NAME=VALUE
+plot bars --out x.gif => must be .png, .pdf or .svg
+plot bars --settings => --settings is gone: qrlsuite show picture KIND
+tune mlp --task beam6g --model mlp => --model is gone: write it into the entry
+tune width=4 --task tiny.toml => entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ...
+tune mlp mlp --task tiny.toml --out p.toml => for one entry
+tune mlp --task tiny.toml --vary papre => unknown grid 'papre'; did you mean 'paper'
+tune mlp --task tiny.toml --vary =1 => write a name and its values
+tune mlp --task tiny.toml --vary paper --vary x.toml => give one grid
+tune mlp --task tiny.toml --vary lr=1,2 --seeds 0:20 => --seeds 0:20: tuning uses seeds from 1000000
+tune mlp --task tiny.toml --vary lr=1,2 --budget soon => --budget soon: write 90s, 30min
+tune mlp --task tiny.toml --vary lr=1,2 --out p.json => one file ending in .toml
+tune mlp --task tiny.toml --sampler 'randm trials=3' => did you mean 'random'
+tune mlp --task tiny.toml --sampler 'random trial=3' => did you mean 'trials'
+study run fig66 => unknown study 'fig66'; did you mean 'fig6'
+study run gone.toml => study file gone.toml cannot be read
+study run fig6 --budget soon => write 90s, 30min, 8h
+study run fig6 --budget 1s => cannot hold one group
+study run fig6 --engine lokal => did you mean 'local'
+study run fig6 --seeds a:b => write a number (100)
+study run fig6 --partition x => --partition is gone: --engine 'slurm partition=gpu
+study run fig6 --set qubits=6 => --set is gone: write it after the name, as in `qrlsuite study run
+study run fig6 vqc-native=vqc-nativ => unknown model 'vqc-nativ'; did you mean 'vqc-native'
+study run fig6 nothing => study 'fig6' has no such entry
+study draw fig6 => nothing is trained yet: qrlsuite study run fig6
+study draw fig6 --format gif => --format gif
+study end fig6 => study 'fig6' has no looks
+study new p.toml --task tiny.toml mlp => a study with looks needs two or more entries
+study new p.toml --task tiny.toml mlp 'mlp width=4' 'ddqn mlp width=4' => entries.1 and entries.2 are the same
+study new p.toml --task tiny.toml mlp mpl => unknown model 'mpl'; did you mean 'mlp'
+study new p.toml --task tiny.toml mlp 'mlp widht=4' => did you mean 'width'
+study new p.toml --task tiny.toml mlp 'width=4 mlp' => entry 'width=4 mlp'
+study new p.toml --task tiny.toml mlp 'ppo mlp' => different horizons: 'ddqn mlp width=64' at 180 steps, 'ppo
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks alpha=1 => alpha = 1.0 is outside (0, 1)
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks 20,40,40 => each must be at more runs than the one before
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks 10,20 => the first is below 20 runs
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20;40' => --looks 20;40: write numbers of seeds
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20,40 margin=0' => margin = 0.0 is not a positive number
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=3 => seeds 0:4 are the protocol's
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks first_seed=999999 => from 1000000 up are those of tuning
+study new p.toml --task tiny.toml mlp 'mlp width=4' --looks '20 margn=1' => option 'margn'; did you mean 'margin'
+study new p.toml --task tiny.toml mlp 'mlp width=4' --margin 0 => --margin is gone: --looks '20,40,60 alpha=.01
+study new p --task tiny.toml mlp 'mlp width=4' => p: a study file's name ends in .toml
+study new 'p q.toml' --task tiny.toml mlp 'mlp width=4' => name
+study new tiny.toml --task tiny.toml mlp 'mlp width=4' => tiny.toml is there already
+new plugin acme-ring => name the package and what it adds, for example acme-ring --kind ansatz
+new plugin --from part.py => ring.py is another plugin: name it before this one
+new plugin --from none.py => there is no plugin none.py
+new plugin --from ring.py --kind ansatz => leave --kind and --range out
+new plugin --from ring.py Ring => 'Ring' cannot be the name of a package
+list ansatzes --plugin => --plugin needs a path, for example --plugin ring.py
+list ansatzes --plugin none.py => there is no plugin none.py
+list ansatzes --plugin broken.py => broken.py:2: ZeroDivisionError: division by zero
+list ansatzes --plugin ring.py --plugin b/ring.py => two plugins are called ring:
+list ansatzes --plugin ring.py --plugin again.py => ansatz 'ring' is registered already, by ring.py (
+list ansatzes --plugin b => plugin b is no package: it has no __init__.py
+"""
+"""What is typed, and what the one line of the answer has; answered with exit code 2."""
+
+
+@pytest.mark.parametrize(("typed", "message"), [line.split(" => ") for line in WRONG.strip().splitlines()])
 def test_wrong_input_gives_one_clear_line_and_exit_code_2(
-    words: list[str],
+    typed: str,
     message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["qrlsuite", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
+    (tmp_path / "b").mkdir()
+    for name, text in GIVEN.items():
+        Path(name).write_text(text)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    monkeypatch.setattr(sys, "argv", ["qrlsuite", *shlex.split(typed)])
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            main()
+    finally:
+        for plugin in own.loaded():
+            own.unload(plugin)
     printed = capsys.readouterr()
+    said = [line for line in printed.err.strip().splitlines() if line != "ring.py: ansatz ring"]
     assert stopped.value.code == 2
-    assert message in printed.err
-    assert len(printed.err.strip().splitlines()) == 1, printed.err
+    assert len(said) == 1, printed.err
+    assert message in said[0]
     assert printed.out == ""
-    assert list(tmp_path.iterdir()) == [], "wrong input leaves nothing behind"
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before, "nothing is touched"
+
+
+@pytest.mark.parametrize("old", list(RENAMED))
+def test_a_command_of_earlier_versions_names_the_new_one(old: str) -> None:
+    result = CliRunner().invoke(build(), [*old.split(), "width.toml"])
+    assert str(result.exception) == f"`qrlsuite {old}` is now `{RENAMED[old]}`"
 
 
 def test_a_family_of_names_is_one_line_of_all_and_a_line_each_of_its_kind() -> None:

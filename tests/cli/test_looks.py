@@ -436,47 +436,6 @@ def _entry(setting: str) -> Entry:
     return resolve("tiny.toml", f"mlp {setting}")
 
 
-NEW = ("study", "new", "p.toml", "--task", "tiny.toml")
-TWO = (*NEW, "mlp width=16", "mlp width=4")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((*NEW, "mlp"), "a study with looks needs two or more entries"),
-        (
-            (*NEW, "mlp", "mlp width=16", "ddqn mlp width=16"),
-            "entries.1 and entries.2 are the same, 'ddqn mlp width=16': leave one out",
-        ),
-        ((*NEW, "mlp", "mpl"), "unknown model 'mpl'; did you mean 'mlp'"),
-        ((*NEW, "mlp", "mlp widht=4"), "did you mean 'width'"),
-        ((*NEW, "mlp", "width=4 mlp"), "entry 'width=4 mlp'"),
-        (
-            (*NEW, "mlp", "ppo mlp"),
-            "different horizons: 'ddqn mlp width=64' at 1200 steps, 'ppo mlp width=64' at 1800",
-        ),
-        ((*TWO, "--looks", "alpha=1"), "alpha = 1.0 is outside (0, 1)"),
-        ((*TWO, "--looks", "20,40,40"), "each must be at more runs than the one before"),
-        ((*TWO, "--looks", "10,20"), "the first is below 20 runs"),
-        ((*TWO, "--looks", "20;40"), "--looks 20;40: write numbers of seeds"),
-        ((*TWO, "--looks", "20,40 margin=0"), "margin = 0.0 is not a positive number"),
-        ((*TWO, "--looks", "first_seed=50"), "seeds 0:100 are the protocol's"),
-        ((*TWO, "--looks", "first_seed=999950"), "seeds from 1000000 up are those of tuning"),
-        ((*TWO, "--looks", "20 margn=1"), "--looks: unknown option 'margn'; did you mean 'margin'"),
-        ((*TWO, "--margin", "0"), "--margin is gone: --looks '20,40,60 alpha=.01"),
-        (("study", "new", "p", *TWO[3:]), "p: a study file's name ends in .toml"),
-        (("study", "new", "tiny.toml", *TWO[3:]), "tiny.toml is there already"),
-        (("study", "new", "p q.toml", *TWO[3:]), "name"),
-        (("study", "run", "nowhere.toml"), "study file nowhere.toml cannot be read"),
-        (("study", "end", "fig6"), "study 'fig6' has no looks"),
-        (("show", "tiny.toml"), "tiny.toml: unknown key 'default_algorithm'"),
-        (("show", "quantum-or-no"), "'quantum-or-no'; did you mean 'quantum-or-not'?"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line(words: tuple[str, ...], message: str, refused: Refused) -> None:
-    assert message in refused(*words)
-
-
 QUESTIONS = """
 [[looks.questions]]
 text = "Does width help?"

@@ -110,26 +110,6 @@ def build(qubits, layers, options):
     assert trained.returncode == 0
 
 
-def test_a_file_says_what_its_package_adds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "ring.py").write_text(RING)
-    (tmp_path / "part.py").write_text("from ring import *\n\nclass Net(Base): ...\n")
-    for words, expected in (
-        (["--from", "ring.py", "--kind", "ansatz"], "leave --kind and --range out"),
-        (["--from", "none.py"], "there is no plugin none.py"),
-        (["--from", "ring.py", "Ring"], "'Ring' cannot be the name of a package"),
-        (["acme-ring"], "name the package and what it adds, for example acme-ring --kind ansatz"),
-        (["--from", "part.py"], "ring.py is another plugin: name it before this one"),
-    ):
-        code, _, err = qrlsuite(capsys, "new", "plugin", *words)
-        lines = [line for line in err.splitlines() if line != "ring.py: ansatz ring"]
-        assert (code, len(lines)) == (2, 1)
-        assert expected in lines[0]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["part.py", "ring.py"]
-
-
 def test_new_packages_are_found_and_say_where_they_come_from(packages: Path) -> None:
     rows = json.loads(start("list", "--json", env=installed(packages / "site")).communicate()[0])
     found = {(row["kind"], row["name"]) for row in rows if row["distribution"].startswith("acme-")}

@@ -240,30 +240,3 @@ def test_a_plugin_by_path_may_add_commands(folder: Path) -> None:
     )
     done = qrlsuite("hello", "--plugin", "hello.py", cwd=folder)
     assert (done.stdout, done.stderr) == ("hello\n", "hello.py: commands alone\n")
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--plugin",), "--plugin needs a path, for example --plugin ring.py"),
-        (("--plugin", "none.py"), "there is no plugin none.py"),
-        (("--plugin", "broken.py"), "broken.py:2: ZeroDivisionError: division by zero"),
-        (("--plugin", "ring.py", "--plugin", "b/ring.py"), "two plugins are called ring: "),
-        (
-            ("--plugin", "ring.py", "--plugin", "again.py"),
-            "ansatz 'ring' is registered already, by ring.py (",
-        ),
-        (("--plugin", "b"), "plugin b is no package: it has no __init__.py"),
-    ],
-)
-def test_bad_input_is_a_line_and_exit_code_2(folder: Path, words: tuple[str, ...], expected: str) -> None:
-    (folder / "broken.py").write_text("x = 1\nx / 0\n")
-    (folder / "again.py").write_text(RING)
-    (folder / "b").mkdir()
-    (folder / "b" / "ring.py").write_text(RING + "\nx = 1\n")
-    done = qrlsuite("list", "ansatzes", *words, cwd=folder)
-    assert (done.returncode, done.stdout) == (2, "")
-    lines = [line for line in done.stderr.splitlines() if line != "ring.py: ansatz ring"]
-    assert len(lines) == 1
-    assert lines[0].startswith("qrlsuite: ")
-    assert expected in lines[0]

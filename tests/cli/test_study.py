@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,7 @@ import tomli_w
 from typer.testing import CliRunner, Result
 
 from qrlsuite import registry, specs
-from qrlsuite.cli import main
-from qrlsuite.cli.app import RENAMED, build
+from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.worker import train_group
@@ -576,60 +574,3 @@ def test_listing() -> None:
     assert "0/100" in shown
     assert "reference speed, scaled to the speed of this machine" in shown
     assert "3,567 core-hours" in shown
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["run", "fig66"], "unknown study 'fig66'; did you mean 'fig6'"),
-        (["run", "fig6", "--budget", "soon"], "write 90s, 30min, 8h"),
-        (["run", "fig6", "--budget", "1s"], "cannot hold one group"),
-        (["draw", "fig6", "--format", "gif"], "--format gif"),
-        (["run", "fig6", "--engine", "lokal"], "did you mean 'local'"),
-        (["run", "fig6", "vqc-native=vqc-nativ"], "did you mean 'vqc-native'"),
-        (["run", "fig6", "nothing"], "study 'fig6' has no such entry"),
-        (["run", "fig6", "--seeds", "a:b"], "write a number (100)"),
-        (["draw", "fig6"], "nothing is trained yet: qrlsuite study run fig6"),
-        (["show", "bad.toml"], "pictures.0.kind: unknown picture 'bar'; did you mean 'bars'"),
-        (["show", "worse.toml"], "worse.toml: pictures.0.settings"),
-        (["show", "episodes.toml"], "pictures.0.evaluation: picture 'histogram' needs evaluation"),
-        (["show", "nowhere.toml"], "pictures.0.evaluation.deployed: picture 'deployed' needs deployed"),
-        (["show", "backend.toml"], "unknown circuit backend 'nativ'; did you mean 'native'"),
-        (["show", "zero.toml"], "pictures.0.evaluation.deployed: shots = 0"),
-        (["show", "option.toml"], "no option 'shot'; did you mean 'shots'"),
-    ],
-)
-def test_wrong_input_gives_one_clear_line_and_exit_code_2(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    head = 'format_version = 1\nname = "x"\nsummary = "x"\n[[pictures]]\n'
-    Path("bad.toml").write_text(f'{head}kind = "bar"\n')
-    Path("worse.toml").write_text(f'{head}kind = "estimator"\nsettings = {{ runs = "many" }}\n')
-    Path("episodes.toml").write_text(f'{head}kind = "histogram"\n')
-    Path("nowhere.toml").write_text(f'{head}kind = "deployed"\nevaluation = {{ episodes = 3 }}\n')
-    there = f'{head}kind = "deployed"\n[pictures.evaluation.deployed]\n'
-    there += 'backend = "native"\nvary = "shots"\nvalues = [9]\n'
-    Path("backend.toml").write_text(there.replace('"native"', '"nativ"'))
-    Path("zero.toml").write_text(there.replace("[9]", "[9, 0]"))
-    Path("option.toml").write_text(there.replace('"shots"', '"shot"'))
-    before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr(sys, "argv", ["qrlsuite", *([] if words[0] == "show" else ["study"]), *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    printed = capsys.readouterr()
-    assert stopped.value.code == 2
-    assert message in printed.err
-    assert len(printed.err.strip().splitlines()) == 1, printed.err
-    assert printed.out == ""
-    assert sorted(tmp_path.iterdir()) == before, "wrong input leaves nothing behind"
-
-
-@pytest.mark.parametrize("old", list(RENAMED))
-def test_a_command_of_earlier_versions_names_the_new_one(old: str) -> None:
-    result = CliRunner().invoke(build(), [*old.split(), "width.toml"])
-    assert str(result.exception) == f"`qrlsuite {old}` is now `{RENAMED[old]}`"

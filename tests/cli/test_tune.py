@@ -116,30 +116,6 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tm
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["width=4"], "entry 'width=4': write [ALGORITHM] MODEL NAME=VALUE ..."),
-        (["mlp", "mlp", "--out", "p.toml"], "for one entry"),
-        (["mlp", "--vary", "papre"], "unknown grid 'papre'; did you mean 'paper'"),
-        (
-            ["mlp", "--vary", "lr=1,2", "--seeds", "0:20"],
-            "--seeds 0:20: tuning uses seeds from 1000000",
-        ),
-        (["mlp", "--vary", "lr=1,2", "--budget", "soon"], "--budget soon: write 90s, 30min"),
-        (["mlp", "--vary", "=1"], "write a name and its values"),
-        (["mlp", "--vary", "paper", "--vary", "x.toml"], "give one grid"),
-        (["mlp", "--sampler", "randm trials=3"], "did you mean 'random'"),
-        (["mlp", "--sampler", "random trial=3"], "did you mean 'trials'"),
-        (["mlp", "--vary", "lr=1,2", "--out", "p.json"], "one file ending in .toml"),
-    ],
-)
-def test_wrong_input(words: list[str], message: str, task: str) -> None:
-    result = CliRunner().invoke(build(), ["tune", "--task", task, *words])
-    assert isinstance(result.exception, QrlSuiteError), result.output
-    assert message in str(result.exception)
-
-
 def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> None:
     words = ["tune", "mlp width=4", "--task", task, "--vary", "lr=1e-2,1e-3"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
