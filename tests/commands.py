@@ -28,7 +28,10 @@ import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from typer.testing import Result
 
 PRELOADED = (
     "matplotlib.backends.backend_agg",
@@ -350,6 +353,22 @@ def qrlsuite(
     out, err = command.communicate()
     assert command.returncode is not None
     return subprocess.CompletedProcess(["qrlsuite", *words], command.returncode, out, err)
+
+
+def say(*words: str, typed: str | None = None, **environment: str) -> Result:
+    """Run `qrlsuite WORDS` in this process; what it refuses is raised."""
+    from typer.testing import CliRunner
+
+    from qrlsuite.cli.app import build
+
+    return CliRunner().invoke(build(), words, typed, environment, catch_exceptions=False)
+
+
+def answer(*words: str) -> Any:
+    """Return what `qrlsuite WORDS --json` prints, run in this process."""
+    done = say(*words, "--json")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
 
 
 if __name__ == "__main__":

@@ -271,7 +271,11 @@ def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "subprocess", stand_in)
 
 
-def trainer(task: str, root: Path) -> Callable[..., Path]:
+Train = Callable[..., Path]
+"""Trains seeds as one group in this process, and returns the entry's folder."""
+
+
+def trainer(task: str, root: Path) -> Train:
     """Return a function that trains seeds as one group in this process, and returns the entry's folder."""
 
     def run(
@@ -283,11 +287,9 @@ def trainer(task: str, root: Path) -> Callable[..., Path]:
     ) -> Path:
         from qrlsuite.engine.worker import train_group
         from qrlsuite.experiment.entry import resolve
-        from qrlsuite.options import parse_setting
         from qrlsuite.results.store import EntryStore
 
-        entry = resolve(task, model, settings=[parse_setting(word) for word in settings])
-        store = EntryStore.create(root / folder, entry)
+        store = EntryStore.create(root / folder, resolve(task, " ".join([model, *settings])))
         train_group(store.path, seeds, epochs)
         return store.path
 
@@ -308,8 +310,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.fixture
-def train(tiny_task: str, tmp_path: Path) -> Callable[..., Path]:
-    """Train seeds as one group in this process; returns the entry's folder."""
+def train(tiny_task: str, tmp_path: Path) -> Train:
     return trainer(tiny_task, tmp_path)
 
 

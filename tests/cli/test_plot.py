@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from qrlsuite import registry, specs
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.specs import EnvironmentSpec, PictureSpec
+from tests.commands import say
 from tests.leaderboard.test_pictures import learner, noisy
-
-RUNNER = CliRunner()
 
 
 @pytest.fixture
@@ -34,11 +33,9 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> list[EntryResults]:
 
 
 def call(*words: str) -> str:
-    result = RUNNER.invoke(build(), list(words))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.output
+    done = say(*words)
+    assert done.exit_code == 0, done.output
+    return done.output
 
 
 def test_help_lists_every_kind_of_the_suite_and_of_environments() -> None:
@@ -61,14 +58,8 @@ def test_pictures_of_entries(kind: str, entries: list[EntryResults], tmp_path: P
     content = json.loads(call("plot", kind, "--out", str(out), "--json"))
     assert content["seeds"] == {entry.name: 30 for entry in entries}
     assert out.read_text().startswith("<?xml")
-
-
-def test_entries_are_drawn_in_the_order_named(entries: list[EntryResults], tmp_path: Path) -> None:
-    words = ("--entry", "width=64", "--entry", "qubits=6", "--out", str(tmp_path / "p.png"), "--json")
-    assert list(json.loads(call("plot", "curves", *words))["seeds"]) == [
-        "ddqn mlp width=64",
-        "ddqn vqc qubits=6",
-    ]
+    words = ("--entry", "width=64", "--entry", "qubits=6", "--out", str(out), "--json")
+    assert list(json.loads(call("plot", kind, *words))["seeds"]) == ["ddqn mlp width=64", "ddqn vqc qubits=6"]
 
 
 def test_pictures_of_an_environment(tmp_path: Path) -> None:
@@ -85,10 +76,6 @@ def test_pictures_of_an_environment(tmp_path: Path) -> None:
 def test_a_third_partys_environment_may_draw_and_is_checked(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from dataclasses import replace
-
-    from qrlsuite.specs import EnvironmentSpec, PictureSpec
-
     known = registry.load().entries[specs.EnvironmentSpec]
     spec = known["beam6g"].spec
     assert isinstance(spec, EnvironmentSpec)

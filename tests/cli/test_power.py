@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.options import parse_setting
-from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
+from qrlsuite.results.store import EntryStore, json_line, table_bytes
+from tests.commands import say
 from tests.conftest import TINY
 
 EPOCHS = 20
@@ -21,26 +19,16 @@ EPOCHS = 20
 
 def put(width: int, *starts: int, epochs: int = EPOCHS) -> None:
     """Leave an entry of finished runs that reach every threshold at some epoch, 0.5 seconds an epoch."""
-    entry = resolve("tiny.toml", "mlp", settings=[parse_setting(f"width={width}")])
-    store = EntryStore.create(Path("runs"), entry)
+    store = EntryStore.create(Path("runs"), resolve("tiny.toml", f"mlp width={width}"))
     for seed, start in enumerate(starts):
         folder = store.seed(seed)
         rows = [{"epoch": t, "scores": [0.5 * (t >= start)] * 5} for t in range(1, epochs + 1)]
-        write_atomically(folder.table, table_bytes(rows))
-        lines = [
-            json_line({"epoch": t, "train": 0.4, "validate": 0.1, "group": 1}) for t in range(1, epochs + 1)
-        ]
-        write_atomically(folder.timings, b"".join(lines))
-        folder.write_record(
-            {
-                "seed": seed,
-                **store.names,
-                "status": "finished",
-                "epochs": epochs,
-                "parameters": {},
-                "provenance": [],
-            }
-        )
+        folder.path.mkdir()
+        folder.table.write_bytes(table_bytes(rows))
+        times = {"train": 0.4, "validate": 0.1, "group": 1}
+        folder.timings.write_bytes(b"".join(json_line({"epoch": t, **times}) for t in range(1, epochs + 1)))
+        record = {"status": "finished", "epochs": epochs, "parameters": {}, "provenance": []}
+        folder.write_record({"seed": seed, **store.names, **record})
 
 
 @pytest.fixture(autouse=True)
@@ -49,17 +37,15 @@ def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     Path("tiny.toml").write_text(TINY)
 
 
-def say(*words: str) -> str:
-    result = CliRunner().invoke(build(), ["power", *words, "--draws", "20"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+def power(*words: str) -> str:
+    return say("power", *words, "--draws", "20").stdout
 
 
 def test_an_entry_alone_and_against_another() -> None:
     """Runs that hardly differ: 20 seeds, the fewest, find 50 percent. Both entries cost 20 epochs of half a second."""
     put(16, *([10, 11] * 10))
     put(8, *([14, 15] * 10))
-    content = json.loads(say("mlp width=8", "mlp width=16", "--json"))
+    content = json.loads(power("mlp width=8", "mlp width=16", "--json"))
     assert content["horizon"] == EPOCHS * 60
     assert content["core_hours_basis"] == "measured on its own epochs, to within a factor of 1.25"
     rows: list[dict[str, Any]] = content["needs"]
@@ -69,7 +55,7 @@ def test_an_entry_alone_and_against_another() -> None:
     assert half["difference"] == "50% slower than ddqn mlp width=8"
     assert (half["fixed_seeds"], half["looks"], half["mean_seeds"]) == (20, [20], 20)
     assert half["fixed_core_hours"] == pytest.approx(20 * 2 * EPOCHS * 0.5 / 3600)
-    shown = say("mlp width=16")
+    shown = power("mlp width=16")
     assert "10% slower than ddqn mlp width=16" in shown
     assert "Simulated from 20 seeds of ddqn mlp width=16" in shown
     assert "Core-hours: measured on its own epochs, to within a factor of 1.25." in shown
@@ -79,14 +65,14 @@ def test_what_cannot_be_planned_from_is_refused() -> None:
     put(16, 10)
     put(8, 10, 11, epochs=15)
     with pytest.raises(OptionError, match=r"'ddqn mlp width=16' has a single seed"):
-        say("mlp width=16")
+        power("mlp width=16")
     with pytest.raises(UnknownNameError, match="no entry 'mpl'"):
-        say("mpl")
+        power("mpl")
 
 
 def test_a_weak_pilot_is_marked_and_the_shorter_horizon_said() -> None:
     put(16, 6, 7, 8)
     put(8, 10, 11, 12, epochs=15)
-    shown = say("mlp width=16", "mlp width=8")
+    shown = power("mlp width=16", "mlp width=8")
     assert "900 steps, 20 pairs per line" in shown
     assert "Fewer than 20 seeds are a weak pilot" in shown

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from qrlsuite.cli.app import build
-from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
+from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, write_json
+from tests.commands import say
+from tests.conftest import Train
 
 
 def call(runs: Path, *words: str, typed: str | None = None) -> Result:
-    return CliRunner().invoke(build(), ["runs", *words, "--runs", str(runs)], input=typed)
+    return say("runs", *words, "--runs", str(runs), typed=typed)
 
 
 @pytest.fixture
-def two(train: Callable[..., Path]) -> tuple[Path, Path]:
+def two(train: Train) -> tuple[Path, Path]:
     """Two entries of the folder `runs`."""
     first, second = (train("runs", [0, 1], 1, settings=(f"width={width}",)) for width in (8, 16))
     return first, second
@@ -40,36 +40,32 @@ def test_it_asks_first(two: tuple[Path, Path], tmp_path: Path) -> None:
     assert not two[1].exists()
 
 
-def test_an_entry_that_is_being_trained_stays(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_an_entry_that_is_trained_or_waits_in_a_queue_stays(two: tuple[Path, Path], tmp_path: Path) -> None:
     claim = acquire(EntryStore(two[0]), [7])  # a seed that has no folder yet
-    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
-    assert isinstance(said.exception, StoreError)
-    assert "are being trained by process" in str(said.exception)
-    assert (two[0] / "entry.json").exists()
+    with pytest.raises(StoreError, match="are being trained by process"):
+        call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
     claim.release()
-    assert call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exit_code == 0
-
-
-def test_an_entry_that_waits_in_a_queue_stays(two: tuple[Path, Path], tmp_path: Path) -> None:
-    task = {"job": "7", "seeds": [5], "epochs": 1}
-    write_json(two[0] / "slurm" / "submitted.json", {"tasks": [task]})  # of which no queue can be asked here
-    said = call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
-    assert isinstance(said.exception, QrlSuiteError)
+    queue = two[0] / "slurm" / "submitted.json"  # of which no queue can be asked here
+    write_json(queue, {"tasks": [{"job": "7", "seeds": [5], "epochs": 1}]})
+    with pytest.raises(QrlSuiteError):
+        call(tmp_path / "runs", "rm", "mlp width=8", "--yes")
     assert (two[0] / "entry.json").exists()
+    queue.unlink()
+    assert call(tmp_path / "runs", "rm", "mlp width=8", "--yes").exit_code == 0
 
 
 def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     (tmp_path / "runs" / "tiny").rename(elsewhere)
     (tmp_path / "runs" / "tiny").symlink_to(elsewhere)
-    said = call(tmp_path / "runs", "rm", f"tiny/{two[0].name}", "--yes")
-    assert isinstance(said.exception, StoreError)
-    assert "links are not followed" in str(said.exception)
+    with pytest.raises(StoreError, match="links are not followed"):
+        call(tmp_path / "runs", "rm", f"tiny/{two[0].name}", "--yes")
     (tmp_path / "runs" / "tiny").unlink()
     (tmp_path / "runs" / "tiny").mkdir()
     link = tmp_path / "runs" / "tiny" / two[0].name
     link.symlink_to(elsewhere / two[0].name)
-    assert isinstance(call(tmp_path / "runs", "rm", two[0].name, "--yes").exception, StoreError)
+    with pytest.raises(StoreError):
+        call(tmp_path / "runs", "rm", two[0].name, "--yes")
     link.unlink()
     (elsewhere / two[0].name).rename(link)
     (link / "data").symlink_to(elsewhere)
@@ -79,22 +75,20 @@ def test_links_are_not_followed(two: tuple[Path, Path], tmp_path: Path) -> None:
 
 def test_mistakes_say_what_to_type(two: tuple[Path, Path], tmp_path: Path) -> None:
     runs = tmp_path / "runs"
-    for words, kind, message in (
-        (("rm", "mpl width=8", "--yes"), UnknownNameError, "did you mean 'mlp width=8'"),
-        (("rm", "mlp", "--yes"), UnknownNameError, "may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"),
-        (("rm", "mlp width=8", "mlp", "--yes"), UnknownNameError, "may be any of"),
+    for names, message in (
+        (["mpl width=8"], "did you mean 'mlp width=8'"),
+        (["mlp"], "may be any of 'ddqn mlp width=16', 'ddqn mlp width=8'"),
+        (["mlp width=8", "mlp"], "may be any of"),
     ):
-        said = call(runs, *words)
-        assert isinstance(said.exception, kind), words
-        assert message in str(said.exception)
+        with pytest.raises(UnknownNameError, match=message):
+            call(runs, "rm", *names, "--yes")
     for words, message in (
         (("rm",), "Missing argument 'ENTRY...'"),
         (("gc", "mlp"), "unexpected extra argument"),
         (("mr",), "No such command 'mr'"),
     ):
         assert message in call(runs, *words).output
-    misplaced = CliRunner().invoke(build(), ["runs", "--task", "tiny", "gc"])
-    assert "after the action: qrlsuite runs gc" in str(misplaced.exception)
-    there = CliRunner().invoke(build(), ["runs", "gc"], env={"QRLSUITE_RUNS": str(runs)})
-    assert there.exit_code == 0, "a variable is not misplaced"
+    with pytest.raises(OptionError, match="after the action: qrlsuite runs gc"):
+        say("runs", "--task", "tiny", "gc")
+    assert say("runs", "gc", QRLSUITE_RUNS=str(runs)).exit_code == 0, "a variable is not misplaced"
     assert all(path.exists() for path in two)

@@ -33,6 +33,7 @@ from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check
 from qrlsuite.studies.study import parse
 from tests.commands import qrlsuite, start
 from tests.conftest import HANGS, TINY, Hold, results
+from tests.core.test_study import EXPECTED
 from tests.leaderboard import boards
 
 STUDY = """
@@ -131,26 +132,6 @@ def answer(*words: str) -> dict[str, Any]:
     return content
 
 
-STUDIES = (
-    "fig1",
-    "fig6",
-    "fig7",
-    "fig8",
-    "cartpole",
-    "ppo",
-    "ablation",
-    "degree",
-    "antennas",
-    "ansatz",
-    "estimator",
-    "few-runs",
-    "matched",
-    "deploy",
-    "shots",
-    "stacking",
-    "fidelity",
-    "buffer",
-)
 ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz", "stacking", "fidelity", "buffer")
 """Studies whose pictures are of kinds that others have, too."""
 SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
@@ -185,15 +166,8 @@ def reduced(name: str, folder: Path) -> str:
     return str(folder / f"{name}-study.toml")
 
 
-def test_no_study_is_left_out() -> None:
-    built_in = {
-        name for name, r in registry.load().of(specs.StudySpec).items() if r.distribution == "qrlsuite"
-    }
-    assert set(STUDIES) == built_in
-
-
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in STUDIES]
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name in ALIKE else []) for name in EXPECTED]
 )
 def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
     seeds = 6 if name == "few-runs" else 2  # its picture compares 5 with more
@@ -251,18 +225,8 @@ def test_agents_of_a_study_act_on_a_backend_once(tmp_path: Path) -> None:
 
 def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
-    plain = [
-        "run",
-        "--task",
-        str(tmp_path / "tiny.toml"),
-        "--model",
-        "mlp",
-        "--set",
-        "width=16",
-        "--runs",
-        runs,
-    ]
-    done = CliRunner().invoke(build(), [*plain, "--engine", "here"], catch_exceptions=False)
+    plain = ["run", "mlp width=16", "--task", str(tmp_path / "tiny.toml"), "--runs", runs, "--engine", "here"]
+    done = CliRunner().invoke(build(), plain, catch_exceptions=False)
     assert done.exit_code == 0
     assert "it should take" not in done.stderr
     (folder,) = (tmp_path / "runs" / "tiny").iterdir()
@@ -315,10 +279,9 @@ def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
 def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
     words = ("--engine", "here", "--runs", runs)
-    said = say("run", widths, "--seeds", "3", "mlp width=16", *words)
-    assert "3 seeds: ddqn mlp width=16" in said.stdout
-    said = say("run", widths, "--seeds", "2", "mlp width=4", *words)
-    assert "2 seeds: ddqn mlp width=4" in said.stdout
+    for seeds, width in ((3, 16), (2, 4)):
+        said = say("run", widths, "--seeds", str(seeds), f"mlp width={width}", *words)
+        assert f"{seeds} seeds: ddqn mlp width={width}" in said.stdout
     drawn = say("draw", widths, "--runs", runs, "--format", "svg")
     assert "3 seeds: ddqn mlp width=16" in drawn.stdout
     assert "2 seeds: ddqn mlp width=4" in drawn.stdout
@@ -488,12 +451,7 @@ def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> N
         "an entry of both is trained once"
     )
     assert answer("run", "all", "--dry-run", *words)["steps"] == []
-
-
-@pytest.mark.usefixtures("two_studies")
-def test_each_of_all_studies_says_what_was_trained_for_it(tmp_path: Path) -> None:
-    words = ("--engine", "here", "--seeds", "2", "--epochs", "1", "--runs", str(tmp_path / "runs"))
-    found = json.loads(say("run", "all", "--json", *words).stdout)
+    found = json.loads(say("run", "all", "--json", *words[:-1], str(tmp_path / "more")).stdout)
     assert [(each["name"], each["trained"]) for each in found] == [("without-circuit", 2), ("widths", 4)]
 
 
@@ -568,7 +526,7 @@ def test_which_pairs_count() -> None:
 
 def test_listing() -> None:
     listed = say("list", "studies").stdout
-    assert all(name in listed for name in (*STUDIES, *published_studies.names()))
+    assert all(name in listed for name in (*EXPECTED, *published_studies.names()))
     shown = say("show", "fig7", "--runs", "nowhere").stdout
     assert "ddqn vqc-native qubits=14" in shown
     assert "0/100" in shown

@@ -9,23 +9,15 @@ import signal
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.results.store import EntryStore
-from tests.commands import qrlsuite, start
-from tests.conftest import HANGS, TINY, Hold
-from tests.core.test_tuning import SETTINGS, finish, varied, without_hours
+from qrlsuite.tuning import search
+from tests.commands import answer, qrlsuite, say, start
+from tests.conftest import HANGS, Hold
+from tests.core.test_tuning import finish, request, varied, without_hours
 
 pytestmark = pytest.mark.usefixtures("forked_workers")
-
-
-@pytest.fixture
-def task(tmp_path: Path) -> str:
-    path = tmp_path / "tiny.toml"
-    path.write_text(TINY)
-    return str(path)
 
 
 def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
@@ -37,22 +29,15 @@ def stop(words: list[str], hold: Hold, sign: signal.Signals) -> tuple[int, str]:
     return process.wait(), message
 
 
-def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path: Path, hold: Hold) -> None:
-    from qrlsuite.tuning import search
-
-    wanted = search.Request(
-        task,
-        "mlp",
-        settings=SETTINGS,
-        varied=varied("lr=1e-2,1e-3"),
-        seeds=search.tuning_seeds("1"),
-        epochs=8,
-    )
+def test_killed_and_interrupted_it_ends_with_the_same_preset(
+    tiny_task: str, tmp_path: Path, hold: Hold
+) -> None:
+    wanted = request(tiny_task, varied=varied("lr=1e-2,1e-3"), seeds=search.tuning_seeds("1"), epochs=8)
     straight = search.Search(wanted, tmp_path / "straight")
     finish(straight)
     straight.write(straight.path)
 
-    words = ["tune", "mlp width=4 depth=1", "--task", task]
+    words = ["tune", "mlp width=4 depth=1", "--task", tiny_task]
     words += ["--vary", "lr=1e-2,1e-3", "--seeds", "1", "--epochs", "8", "--workers", "1"]
     words += ["--runs", str(tmp_path / "stopped")]
     trials = tmp_path / "stopped" / "tuning"
@@ -74,22 +59,20 @@ def test_killed_and_interrupted_it_ends_with_the_same_preset(task: str, tmp_path
     assert without_hours(path.read_text()) == without_hours(straight.path.read_text())
 
     used = qrlsuite(
-        "run", "mlp", f"preset={path}", "--task", task, "--seeds", "1", "--epochs", "1",
+        "run", "mlp", f"preset={path}", "--task", tiny_task, "--seeds", "1", "--epochs", "1",
         "--runs", str(tmp_path / "runs"), "--json",
     )  # fmt: skip
     assert used.returncode == 0, used.stderr
     store = EntryStore(Path(json.loads(used.stdout)["folder"]))
     assert store.record()["tuning"]["seeds"] == "1000000:1000001"
-    shown = json.loads(qrlsuite("show", str(store.path), "--json").stdout)
+    shown = answer("show", str(store.path))
     for name in (store.path.name, f"{store.path.parent.name}/{shown['label']}"):
-        assert (
-            json.loads(qrlsuite("show", name, "--runs", str(store.path.parents[1]), "--json").stdout) == shown
-        )
+        assert answer("show", name, "--runs", str(store.path.parents[1])) == shown
     assert shown["tuning"]["trials"] == 2
 
 
-def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp width=4 lr=1e-2", "mlp width=5 depth=1 lr=1e-2", "--task", task]
+def test_two_models_with_equal_budgets(tiny_task: str, tmp_path: Path) -> None:
+    words = ["tune", "mlp width=4 lr=1e-2", "mlp width=5 depth=1 lr=1e-2", "--task", tiny_task]
     words += ["--vary", "lr=1e-2,1e-3,1e-4", "--vary", "gamma=.9,.99"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     done = qrlsuite(*words)
@@ -98,43 +81,37 @@ def test_two_models_with_equal_budgets(task: str, tmp_path: Path) -> None:
         r"trials of ddqn mlp width=4 .* and ddqn mlp width=5 depth=1 .*: 2 \(2 runs", done.stdout
     )
     assert done.stdout.count("next: qrlsuite run") == 2
-    content = json.loads(CliRunner().invoke(build(), [*words, "--json"]).stdout)
-    assert [len(each["trials"]) for each in content["searches"]] == [2, 2]
-    assert {"algorithm.gamma"} == set(content["searches"][0]["space"]), (
-        "an option that is written is not varied"
-    )
+    searches = answer(*words)["searches"]
+    assert [len(each["trials"]) for each in searches] == [2, 2]
+    assert {"algorithm.gamma"} == set(searches[0]["space"]), "an option that is written is not varied"
 
 
-def test_it_says_the_size_first_and_wants_large_searches_confirmed(task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp", "--task", task, "--vary", "paper", "--runs", str(tmp_path / "runs")]
-    planned = CliRunner().invoke(build(), [*words, "--dry-run"])
-    assert planned.exit_code == 0
-    assert "2160 trials" in planned.stderr
-    refused = CliRunner().invoke(build(), words)
-    assert isinstance(refused.exception, QrlSuiteError)
-    assert "--yes starts them all" in str(refused.exception)
+def test_it_says_the_size_first_and_wants_large_searches_confirmed(tiny_task: str, tmp_path: Path) -> None:
+    words = ["tune", "mlp", "--task", tiny_task, "--vary", "paper", "--runs", str(tmp_path / "runs")]
+    assert "2160 trials" in say(*words, "--dry-run").stderr
+    with pytest.raises(QrlSuiteError, match="--yes starts them all"):
+        say(*words)
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_budget_is_kept_and_the_rest_continues(task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp width=4", "--task", task, "--vary", "lr=1e-2,1e-3"]
+def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path) -> None:
+    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
-    first = CliRunner().invoke(build(), [*words, "--budget", "0.01s"])
-    assert "the budget is spent, 1 trials are left" in first.stdout, "after the first trial, no other fits"
-    rest = CliRunner().invoke(build(), words)
-    assert rest.exit_code == 0
-    assert "the budget is spent" not in rest.stdout
-    assert "wrote " in rest.stdout
+    first = say(*words, "--budget", "0.01s").stdout
+    assert "the budget is spent, 1 trials are left" in first, "after the first trial, no other fits"
+    rest = say(*words).stdout
+    assert "the budget is spent" not in rest
+    assert "wrote " in rest
 
 
-def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(task: str, tmp_path: Path) -> None:
+def test_the_size_is_estimated_as_everywhere_whatever_else_is_damaged(tiny_task: str, tmp_path: Path) -> None:
     """By the one estimator: what was measured here, past an entry that cannot be read."""
     runs = tmp_path / "runs"
-    trained = qrlsuite("run", "--task", task, "--model", "mlp", "--seeds", "1", "--runs", str(runs))
+    trained = qrlsuite("run", "--task", tiny_task, "--model", "mlp", "--seeds", "1", "--runs", str(runs))
     assert trained.returncode == 0, trained.stderr
     (runs / "tiny" / "damaged").mkdir()
     (runs / "tiny" / "damaged" / "entry.json").write_text("{")
-    words = ["tune", "mlp", "--task", task, "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
+    words = ["tune", "mlp", "--task", tiny_task, "--vary", "lr=[1e-2, 1e-3]", "--dry-run"]
     done = qrlsuite(*words, "--seeds", "1", "--runs", str(runs))
     assert done.returncode == 0, done.stderr
     assert re.search(

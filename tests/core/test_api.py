@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -221,19 +220,6 @@ def test_a_notebook_s_bar_is_one_output_that_is_emptied_at_the_end(monkeypatch: 
     bar.update(5, "training", "6 s left")
     bar.stop()
     assert [data["text/plain"] for data in outputs] == ["training  0%  ", "training  50%  6 s left", ""]
-
-
-def test_importing_the_package_imports_no_library() -> None:
-    program = (
-        "import sys; before = set(sys.modules); import qrlsuite; "
-        "new = {name.partition('.')[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names); "
-        "assert new <= {'qrlsuite'}, new; "
-        "import qrlsuite.cli.commands.run, qrlsuite.cli.commands.study; "
-        "assert 'torch' not in sys.modules; "
-        "import qrlsuite.cli.commands.tune, qrlsuite.api; "
-        "assert not {'torch', 'optuna'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_completion_offers_the_functions_alone() -> None:

@@ -139,10 +139,21 @@ def test_python_started_in_a_checkout_finds_every_folder() -> None:
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
-def test_registering_imports_nothing_heavy() -> None:
-    program = (
-        "import sys, qrlsuite.registry as r; assert not r.create(strict=True).problems; "
-        "heavy = {'torch', 'pennylane', 'qiskit', 'numba', 'scipy', 'gymnasium', 'matplotlib'} & set(sys.modules); "
-        "assert not heavy, heavy"
-    )
+def test_what_is_not_used_is_not_imported() -> None:
+    """The package imports nothing; registering, a command and the functions import no library that they do not need."""
+    program = """if True:
+        import sys
+        def imported(*names): return set(names) & set(sys.modules)
+        before = set(sys.modules)
+        import qrlsuite, json, argparse
+        new = {name.partition(".")[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names)
+        assert new <= {"qrlsuite"}, new
+        assert not imported("qrlsuite.registry", "importlib.metadata")
+        import qrlsuite.registry
+        assert not qrlsuite.registry.create(strict=True).problems
+        heavy = {"torch", "pennylane", "qiskit", "numba", "scipy", "gymnasium", "matplotlib"}
+        assert not imported(*heavy), imported(*heavy)
+        import qrlsuite.cli.commands.run, qrlsuite.cli.commands.study, qrlsuite.cli.commands.tune, qrlsuite.api
+        assert not imported("torch", "optuna")
+    """
     subprocess.run([sys.executable, "-c", program], check=True)

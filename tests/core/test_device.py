@@ -27,6 +27,7 @@ def test_devices_that_there_cannot_be(name):
         (2, "cuda:2", "this machine has GPUs 0 to 1"),
         (2, "cuda:1", None),
         (1, "cuda", None),
+        (0, "cpu", None),
     ],
 )
 def test_gpus_are_looked_for_where_training_is_done(monkeypatch, count, name, message):
@@ -37,7 +38,3 @@ def test_gpus_are_looked_for_where_training_is_done(monkeypatch, count, name, me
     else:
         with pytest.raises(OptionError, match=message):
             device.find(name)
-
-
-def test_the_processor_is_always_there():
-    assert device.find("cpu") == torch.device("cpu")

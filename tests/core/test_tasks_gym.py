@@ -46,6 +46,7 @@ def cli(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 def test_every_task_is_whole(name: str) -> None:
     loaded = task.load(name)
     file = loaded.file
+    assert (loaded.name, file.protocol.rounds >= 1) == (name, True)
     assert task.Task(task.TaskFile.model_validate(file.model_dump(mode="json")), "again").hash == loaded.hash
     reference, ranking = file.ranking.reference, file.ranking
     assert min(ranking.deltas) <= reference.delta <= max(ranking.deltas)
