@@ -16,12 +16,14 @@ import importlib
 import importlib.util
 import json
 import os
+import runpy
 import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -40,6 +42,7 @@ PRELOADED = (
     "qrlsuite.api",
     "qrlsuite.cli",
     "qrlsuite.engine.local",
+    "qrlsuite.engine.probe",
     "qrlsuite.engine.worker",
     "qrlsuite.leaderboard",
     "qrlsuite.plugins.circuits.native.cpu",
@@ -154,9 +157,9 @@ def _resolving_here(
 
 
 def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -> int:
-    """Be `python -W error -m qrlsuite WORDS`, a worker, `pytest WORDS` or `dask WORDS` in a forked process."""
+    """Be `python -W error -m qrlsuite WORDS`, a worker, `pytest WORDS`, `dask WORDS` or `python -m MODULE WORDS`."""
     from qrlsuite import cli, registry
-    from qrlsuite.engine import local, worker
+    from qrlsuite.engine import local, probe, worker
     from qrlsuite.testing import common, fresh
 
     common.fresh_process = functools.partial(_resolving_here, fresh.fresh_process)  # type: ignore[assignment]
@@ -167,6 +170,7 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
         DEVNULL=subprocess.DEVNULL,
         TimeoutExpired=subprocess.TimeoutExpired,
     )
+    probe.subprocess = fresh.subprocess = FORKED  # type: ignore[assignment]
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(env)
@@ -176,6 +180,11 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
         importlib.import_module("dask.config").refresh()  # from this command's environment
     if program == "dask":
         importlib.import_module(f"distributed.cli.dask_{words[0]}").main(words[1:], standalone_mode=False)
+        return 0
+    if "." in program:
+        worker.end_with = _end_with
+        sys.modules.pop(program, None)
+        runpy.run_module(program, run_name="__main__", alter_sys=True)
         return 0
     warnings.simplefilter("error")
     warnings.filterwarnings("ignore", "The ``noload`` loader strategy", DeprecationWarning)  # MLflow's tables
@@ -189,20 +198,35 @@ def _command(program: str, words: list[str], folder: str, env: dict[str, str]) -
     return 0
 
 
-def _answer(request: Mapping[str, Any], out: int, err: int, reply: int) -> None:
+def _end_with(parent: int) -> bool:
+    """Stand in for the worker's `end_with`: whoever started this process is not its parent."""
+
+    def watch() -> None:
+        with contextlib.suppress(ProcessLookupError):
+            while True:
+                os.kill(parent, 0)
+                time.sleep(0.05)
+        os._exit(130)
+
+    threading.Thread(target=watch, daemon=True).start()
+    return True
+
+
+def _answer(request: Mapping[str, Any], out: int, err: int, reply: int, given: int) -> None:
     """Run one command to its end, in a process between it and the one that serves."""
 
     def program() -> int:
         os.close(reply)
         os.setsid()
-        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(given, 0)
         os.dup2(out, 1)
         os.dup2(err, 2)
         return _command(**request)
 
     command = Fork(program)
     os.write(reply, f"{command.pid}\n".encode())
-    os.write(reply, f"{command.wait()}\n".encode())
+    with contextlib.suppress(BrokenPipeError):  # who asked has ended
+        os.write(reply, f"{command.wait()}\n".encode())
 
 
 def serve(control: int) -> None:
@@ -211,9 +235,12 @@ def serve(control: int) -> None:
         importlib.import_module(name)
     importlib.import_module("numba").njit(lambda: 0)()  # the first compiled function takes longest
     requests = socket.socket(fileno=control)
+    from_commands, to_server = socket.socketpair()
+    OWN_SERVER.append(to_server)
     running: list[Fork] = []
     while True:
-        message, files, _, _ = socket.recv_fds(requests, 1, 4)
+        ready = select.select([requests, from_commands], [], [])[0]
+        message, files, _, _ = socket.recv_fds(ready[0], 1, 5)
         running = [process for process in running if process.poll() is None]
         if not message:
             return
@@ -226,8 +253,14 @@ def serve(control: int) -> None:
             os.close(file)
 
 
+OWN_SERVER: list[socket.socket] = []
+"""Where a command asks the process that it was forked from for another fork."""
+
+
 @functools.cache
 def _server(python: str) -> socket.socket:
+    if OWN_SERVER:
+        return OWN_SERVER[0]
     ours, theirs = socket.socketpair()
     own = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     own["QRLSUITE_LOAD_PLUGINS"] = ""  # not what the test that comes first has set
@@ -259,6 +292,7 @@ class Command:
         python: str = sys.executable,
         program: str = "qrlsuite",
         output: IO[bytes] | None = None,
+        given: IO[bytes] | None = None,
     ) -> None:
         self.returncode: int | None = None
         self._printed: tuple[str, ...] = ()
@@ -269,12 +303,12 @@ class Command:
             "folder": str(cwd or Path.cwd()),
             "env": dict(os.environ if env is None else env),
         }
-        with tempfile.TemporaryFile() as request:
+        with tempfile.TemporaryFile() as request, Path(os.devnull).open("rb") as nothing:
             request.write(json.dumps(asked).encode())
             request.seek(0)
             self._reply, reply = os.pipe()
             out, err = output or self._out, output or self._err
-            files = [request.fileno(), out.fileno(), err.fileno(), reply]
+            files = [request.fileno(), out.fileno(), err.fileno(), reply, (given or nothing).fileno()]
             socket.send_fds(_server(python), [b"."], files)
             os.close(reply)
         self.pid = int(self._line(HANGS))
@@ -316,6 +350,21 @@ class Command:
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
+
+
+class Fresh(Command):
+    """Stand in for the `subprocess.Popen` of `python -m MODULE WORDS`: it has imported the suite, and run nothing."""
+
+    def __init__(
+        self, command: list[str], *, stdin: Any = None, stdout: Any, env: Any = None, **rest: object
+    ):
+        module, *words = command[command.index("-m") + 1 :]
+        output = None if stdout == subprocess.PIPE else stdout
+        super().__init__(words, env, program=module, output=output, given=stdin)
+
+
+FORKED = SimpleNamespace(**{**vars(subprocess), "Popen": Fresh})
+"""Stands in for the `subprocess` of a module whose processes must have run nothing."""
 
 
 def _content(file: IO[bytes]) -> str:

@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 
+from tests.commands import FORKED, Command, popen
 from tests.commands import HANGS as HANGS  # tests take it from here
-from tests.commands import Command, popen
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles the suite again
 sys.dont_write_bytecode = False
@@ -83,6 +83,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {Path(__file__).parent / name: rank for rank, name in enumerate(LONGEST)}
     assert all(path.exists() for path in ranks), "LONGEST names a file that is no longer there"
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+
+
+def pytest_collection_finish() -> None:
+    """Fresh processes of probes and checks in the tests' own process are forks."""
+    for name in ("qrlsuite.engine.probe", "qrlsuite.testing.fresh"):
+        if name in sys.modules:
+            sys.modules[name].subprocess = FORKED  # type: ignore[attr-defined]
 
 
 TINY = """
