@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
-from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from qrlsuite.errors import OptionError, StoreError
@@ -23,7 +22,6 @@ from qrlsuite.plugins.environments.cartpole import (
     CartPoleLanes,
     CartPoleOptions,
     advance,
-    make_vector,
     parse,
 )
 
@@ -90,7 +88,7 @@ def test_gymnasium_step_for_step_from_given_states() -> None:
 
 
 @pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
-@pytest.mark.parametrize(("offset", "size"), [(0, 1), (1, 1), (3, 7), (5, 9), (13, 33), (64, 65), (127, 2)])
+@pytest.mark.parametrize(("offset", "size"), [(0, 1), (3, 7), (13, 33), (64, 65), (127, 2)])
 def test_a_lane_does_not_depend_on_its_position_or_on_the_number_of_lanes(
     offset: int, size: int, normalization: str
 ) -> None:
@@ -119,12 +117,6 @@ def test_streams_serve_consecutive_lanes_in_lane_order() -> None:
     env.state[2, [3, 5]] = 1.0  # two of the second stream's lanes fall; they are reset in their order
     env.step(np.zeros(6, dtype=np.int64))
     np.testing.assert_array_equal(env.state[:, [3, 5]].T, second.uniform(-0.05, 0.05, (2, 4)))
-
-
-def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
-    first, again, other = (lanes(4).reset(seed=seed)[0] for seed in (5, 5, 6))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
 
 
 def balance(state: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -196,24 +188,11 @@ def test_resuming_without_autoreset_keeps_ended_lanes_ended() -> None:
     assert other.step(np.zeros(2, dtype=np.int64))[1].tolist() == [0, 1]
 
 
-def test_a_state_is_a_copy() -> None:
-    env = lanes(2)
-    env.reset()
-    state = env.state_dict()
-    before = {name: values.copy() for name, values in state.items()}
-    env.step(np.ones(2, dtype=np.int64))
-    for name, values in state.items():
-        np.testing.assert_array_equal(values, before[name])
-    assert state["state"].shape == (2, 4)
-
-
 def test_normalizations() -> None:
     start = [[2.4, -2.5, 0.21, 0.0], [-1.2, 1.25, 0.0, 5.0]]
     raw = np.array(start, dtype=np.float32)
-    got = {
-        kind: lanes(2, normalization=kind).reset(options={"state": start})[0]
-        for kind in ("none", "bounds", "arctan", "running")
-    }
+    kinds = "none", "bounds", "arctan", "running"
+    got = {kind: lanes(2, normalization=kind).reset(options={"state": start})[0] for kind in kinds}
     np.testing.assert_array_equal(got["none"], raw)
     np.testing.assert_array_equal(got["running"], raw)
     np.testing.assert_allclose(got["bounds"], [[1, -1, 1, 0], [-0.5, 0.5, 0, 2]], rtol=1e-6)
@@ -221,11 +200,9 @@ def test_normalizations() -> None:
     assert all(values.dtype == np.float32 for values in got.values())
     space = lanes(2, normalization="arctan").single_observation_space
     assert space.high[1] == pytest.approx(np.pi / 2)  # type: ignore[attr-defined]
-    np.testing.assert_allclose(
-        lanes(1, normalization="bounds", bounds=[1, 2, 3, 4]).reset(options={"state": [[1, 1, 1, 1]]})[0],
-        [[1, 1 / 2, 1 / 3, 1 / 4]],
-        rtol=1e-6,
-    )
+    bounded = lanes(1, normalization="bounds", bounds=[1, 2, 3, 4])
+    shown = bounded.reset(options={"state": [[1, 1, 1, 1]]})[0]
+    np.testing.assert_allclose(shown, [[1, 1 / 2, 1 / 3, 1 / 4]], rtol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*infinity:UserWarning")  # as Gymnasium's own
@@ -254,13 +231,6 @@ def test_running_statistics_are_asked_for_in_lanes_and_refused_alone() -> None:
         gymnasium.make(ID, normalization="running")
 
 
-def test_importing_twice_and_the_factory() -> None:
-    from qrlsuite.plugins.environments import cartpole
-
-    cartpole.register()
-    assert make_vector(CartPoleOptions(), 5).num_envs == 5
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -276,52 +246,12 @@ def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
         parse(options)
 
 
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [
-        ([0, 2], r"actions must lie in 0..1, not 0..2"),
-        ([-1, 0], r"actions must lie in 0..1, not -1..0"),
-        ([0, 1, 0], r"actions must be 2 integers, not int64 of shape \(3,\)"),
-        ([0.0, 1.0], r"actions must be 2 integers, not float64 of shape \(2,\)"),
-    ],
-)
-def test_actions_that_cannot_be(actions: list[Any], message: str) -> None:
-    env = lanes(2)
-    env.reset()
-    with pytest.raises(InvalidAction, match=message):
-        env.step(np.array(actions))
-
-
 def test_misuse() -> None:
     env = lanes(2)
-    with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
-        env.step(np.zeros(2, dtype=np.int64))
-    with pytest.raises(ResetNeeded, match=r"reset\(\) before state_dict"):
-        env.state_dict()
-    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
-        CartPoleLanes(CartPoleOptions(), 0)
-    with pytest.raises(ValueError, match="3 streams cannot serve 2 lanes"):
-        env.seed_lanes([np.random.default_rng(g) for g in range(3)])
     with pytest.raises(OptionError, match=r"takes the option 'state', not \['low'\]"):
         env.reset(options={"low": 0.0})
     with pytest.raises(OptionError, match=r"'state' has the shape \(4,\), not \(2, 4\)"):
         env.reset(options={"state": np.zeros(4)})
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"step": None}, "a state has ended, state, step, not ended, state"),
-        ({"state": np.zeros((2, 3))}, r"'state' has the shape \(2, 3\), not \(2, 4\)"),
-        ({"step": np.array([0, 501])}, r"'step' must lie in 0..500"),
-    ],
-)
-def test_states_that_do_not_fit(change: dict[str, Any], message: str) -> None:
-    env = lanes(2)
     env.reset()
-    before = env.state_dict()
-    given = {name: values for name, values in (before | change).items() if values is not None}
-    with pytest.raises(StoreError, match=message):
-        env.load_state_dict(given)
-    for name, values in env.state_dict().items():
-        np.testing.assert_array_equal(values, before[name])
+    with pytest.raises(StoreError, match=r"'step' must lie in 0..500"):
+        env.load_state_dict({**env.state_dict(), "step": np.array([0, 501])})

@@ -22,17 +22,8 @@ def antennas(episode):
 
 
 def test_codebook_of_the_released_code():
-    assert physics.physics("released").phases.tolist() == [
-        3.13,
-        2.8,
-        2.11,
-        1.13,
-        0,
-        -1.13,
-        -2.11,
-        -2.8,
-        -3.13,
-    ]
+    released = [3.13, 2.8, 2.11, 1.13, 0, -1.13, -2.11, -2.8, -3.13]
+    assert physics.physics("released").phases.tolist() == released
 
 
 def test_codebook_of_the_text_has_five_distinct_beams():

@@ -10,14 +10,7 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from benchmarks.planted import fit
 from qrlsuite.circuit import ansatz, expectations
 from qrlsuite.errors import OptionError
-from qrlsuite.plugins.environments.planted import (
-    MARGIN,
-    SCALING,
-    THRESHOLDS,
-    WEIGHTS,
-    Planted,
-    classify,
-)
+from qrlsuite.plugins.environments.planted import MARGIN, SCALING, THRESHOLDS, WEIGHTS, Planted, classify
 
 
 def test_classes_are_those_of_the_circuit_on_another_backend() -> None:

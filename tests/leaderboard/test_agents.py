@@ -20,6 +20,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.leaderboard.shelf import collect, importing, published, verify
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
@@ -35,10 +36,14 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("agents")
     (root / "tiny.toml").write_text(TINY)
     store = EntryStore(trainer(str(root / "tiny.toml"), root)("runs", SEEDS, 2))
-    entry = collect.read_entry(store)
-    assert entry is not None
-    export(entry, root / "entries")
+    export(read(store), root / "entries")
     return root
+
+
+def read(store: EntryStore, seeds: list[int] | None = None) -> EntryResults:
+    entry = collect.read_entry(store, seeds)
+    assert entry is not None
+    return entry
 
 
 @pytest.fixture
@@ -88,9 +93,7 @@ def test_published_agents_are_the_trained_ones_and_play_the_same_episodes(
 
 
 def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path, tmp_path: Path) -> None:
-    entry = collect.read_entry(runs_of(tmp_path))
-    assert entry is not None
-    bare = export(entry, tmp_path / "bare", agents=False)
+    bare = export(read(runs_of(tmp_path)), tmp_path / "bare", agents=False)
     assert sorted(path.name for path in bare.iterdir()) == ["curves.parquet", "entry.json", "seeds.parquet"]
     assert verify.verify(bare).ok
     with pytest.raises(
@@ -107,14 +110,10 @@ def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path
 def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_path: Path) -> None:
     """Of fewer seeds, too; what was published of the curves stays as it is."""
     store = runs_of(tmp_path)
-    whole = collect.read_entry(store)
-    part = collect.read_entry(store, [0, 2])
-    assert whole is not None
-    assert part is not None
-    bare = export(whole, tmp_path / "bare", agents=False)
+    bare = export(read(store), tmp_path / "bare", agents=False)
     before = {path.name: path.read_bytes() for path in bare.iterdir()}
     record = json.loads(before["entry.json"])
-    export(part, tmp_path / "bare")
+    export(read(store, [0, 2]), tmp_path / "bare")
     found = published.read(bare)
     assert found.agents == (0, 2)
     assert found.seeds == SEEDS
@@ -134,16 +133,14 @@ def test_agents_of_later_epochs_than_the_curves_are_left_out(folder: Path, tmp_p
     """Most seeds have two epochs, which are published; seed 0 was trained further."""
     store = runs_of(tmp_path)
     train_group(store.path, [0], 3)
-    entry = collect.read_entry(store)
-    assert entry is not None
+    entry = read(store)
     assert (entry.seeds, entry.curves.shape) == (SEEDS, (3, 2))
     assert published.read(export(entry, tmp_path / "fresh")).agents == (1, 2)
 
 
 def test_agents_of_other_curves_are_not_added(folder: Path, tmp_path: Path) -> None:
     store = runs_of(tmp_path)
-    whole = collect.read_entry(store)
-    assert whole is not None
+    whole = read(store)
     bare = export(whole, tmp_path / "bare", agents=False)
     curves = whole.curves.copy()
     curves[1, 1] -= 1e-6
@@ -162,19 +159,10 @@ def nan(arrays: dict[str, Any]) -> None:
 
 
 CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "another file": (
-        lambda f: rewrite(f, nudge, False),
-        "is not the file",
-    ),
+    "another file": (lambda f: rewrite(f, nudge, False), "is not the file"),
     "not a number": (lambda f: rewrite(f, nan), "'w0' holds a value that is not a finite number"),
-    "another model": (
-        lambda f: rewrite(f, lambda a: {**a, "b0": a["b0"][:, :-1]}),
-        "does not fit the entry's model",
-    ),
-    "fewer agents": (
-        lambda f: rewrite(f, lambda a: {n: v[:2] for n, v in a.items()}),
-        "does not hold the 3 agents",
-    ),
+    "another model": (lambda f: rewrite(f, lambda a: {**a, "b0": a["b0"][:, :-1]}), "does not fit the entry's model"),
+    "fewer agents": (lambda f: rewrite(f, lambda a: {n: v[:2] for n, v in a.items()}), "does not hold the 3 agents"),
     "an odd name": (lambda f: rewrite(f, lambda a: {**a, "\x1b[2J": a["b0"]}), "controls a terminal"),
     "truncated": (
         lambda f: (f / published.AGENTS).write_bytes((f / published.AGENTS).read_bytes()[:99]),
@@ -182,13 +170,10 @@ CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "missing": (lambda f: (f / published.AGENTS).unlink(), "agents.safetensors is missing"),
     "not named": (lambda f: state(f, lambda p: p.pop("agents")), "entry.json does not name it"),
-    "strange seeds": (
-        lambda f: state(f, lambda p: p["agents"].update(seeds=[0, 1, 9])),
-        "does not name seeds",
-    ),
+    "strange seeds": (lambda f: state(f, lambda p: p["agents"].update(seeds=[0, 1, 9])), "does not name seeds"),
     "seeds of text": (lambda f: state(f, lambda p: p["agents"].update(seeds="012")), "does not name seeds"),
     "no hash": (lambda f: state(f, lambda p: p["agents"].pop("sha256")), "does not name seeds"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -228,19 +213,15 @@ def test_parameters_that_are_no_numbers_are_not_played(folder: Path, tmp_path: P
     del record["format_version"]
     seed.write_record({**record, "diverged": 2})  # of a run that diverged it is known
     assert len(evaluation.trained(runs_of(tmp_path), 3, 5).seeds) == 3
-    entry = collect.read_entry(runs_of(tmp_path))
-    assert entry is not None
-    assert published.read(export(entry, tmp_path / "fresh")).agents == (0, 2)
+    assert published.read(export(read(runs_of(tmp_path)), tmp_path / "fresh")).agents == (0, 2)
 
 
 def test_a_forged_agent_is_found_by_training_again(folder: Path) -> None:
     assert verify.verify(folder, rerun=3).check == "verified"
     rewrite(folder, nudge)
     found = verify.verify(folder, rerun=3)
-    assert (found.ok, "trained again is another agent than the published one" in found.message) == (
-        False,
-        True,
-    )
+    assert not found.ok
+    assert "trained again is another agent than the published one" in found.message
 
 
 OTHER = TINY.replace("degree = 3", "degree = 2").replace('name = "tiny"', 'name = "other"')
@@ -266,25 +247,15 @@ def test_agents_play_another_task_as_that_tasks_own_would(folder: Path, tmp_path
         assert np.array_equal(transferred.returns[row], swapped.returns[swapped.seeds.index(seed)])
     assert not np.array_equal(transferred.returns, own.returns)
     assert references[0].returns.tobytes() == evaluation.references(there.entry(), 20)[0].returns.tobytes()
-    words = [
-        "evaluate",
-        str(folder),
-        "--task",
-        str(tmp_path / "other.toml"),
-        "--runs",
-        str(tmp_path / "runs"),
-    ]
-    result = CliRunner().invoke(build(), [*words, "--best", "3", "--episodes", "20", "--json"])
+    words = ["evaluate", folder, "--task", tmp_path / "other.toml", "--runs", tmp_path / "runs", "--json"]
+    result = CliRunner().invoke(build(), [*map(str, words), "--best", "3", "--episodes", "20"])
     assert json.loads(result.stdout)["policies"][0]["return"] == transferred.summary()["return"]
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ["tiny/mlp", "--task", "cartpole"],
-            "whose observations are Box(0.0, 1.0, (3,), float32), and here they are",
-        ),
+        (["tiny/mlp", "--task", "cartpole"], "observations are Box(0.0, 1.0, (3,), float32), and here they are"),
         (["mlp", "--task", "cartpole"], "write 'tiny/mlp'"),
         (["nothing", "--task", "cartpole"], "no entry 'nothing'"),
         (["mlp", "--task", "cartpol"], "did you mean 'cartpole'"),
@@ -292,7 +263,7 @@ def test_agents_play_another_task_as_that_tasks_own_would(folder: Path, tmp_path
         (["mlp", "--perturb", "nan"], "give a relative size"),
         (["beam6g/ddqn mlp width=16", "--published"], "is published as curves without agents"),
     ],
-)
+)  # fmt: skip
 def test_what_agents_cannot_play_is_said_in_one_line(
     words: list[str], message: str, folder: Path, tmp_path: Path
 ) -> None:
@@ -312,9 +283,7 @@ def test_perturbed_numbers_are_as_large_as_asked_for_and_drawn_anew(folder: Path
     def noise(block: int) -> np.ndarray:
         shake(block)
         state = agents.algorithm.policy_state()
-        return np.concatenate(
-            [((state[n] / v - 1) / 0.1).flatten(1).numpy() for n, v in exact.items()], axis=1
-        )
+        return np.hstack([((state[n] / v - 1) / 0.1).flatten(1).numpy() for n, v in exact.items()])
 
     first = noise(0)
     assert np.isfinite(first).all()
@@ -344,9 +313,7 @@ def test_published_circuits_act_with_shots_and_nothing_is_written_beside_them(
     train: Callable[..., Path], tmp_path: Path
 ) -> None:
     store = EntryStore(train("runs", [0, 1], 1, "vqc-native", settings=("qubits=3", "layers=1")))
-    entry = collect.read_entry(store)
-    assert entry is not None
-    folder = export(entry, tmp_path / "entries")
+    folder = export(read(store), tmp_path / "entries")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     arguments: dict[str, Any] = {"best": 2, "episodes": 10, "backend": "native shots=10", "progress": False}
     here = api.evaluate(str(store.path), runs=tmp_path / "runs", **arguments)

@@ -77,16 +77,10 @@ def test_a_folder_named_like_a_command_is_refused_and_runs_nothing(repository: P
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (INJECTED, "is no published name"),
-        ("leaderboard/entries/beam6g/`id`/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/x;id/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/-rf/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/.x/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/two words/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/two\nlines/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/\x1b[2J/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/\udcff/entry.json", "is no published name"),
-        ("leaderboard/entries/beam6g/Ddqn/entry.json", "is no published name"),
+        *(
+            (f"leaderboard/entries/beam6g/{name}/entry.json", "is no published name")
+            for name in ("`id`", "x;id", "-rf", ".x", "two words", "two\nlines", "\x1b[2J", "\udcff", "Ddqn")
+        ),
         ("leaderboard/unranked/$(id)/x/entry.json", "is no published name"),
         ("leaderboard/plans/$(id)/plan.toml", "is no published name"),
         ("leaderboard/entries/beam6g/entry.json", "holds TASK/ENTRY/"),
@@ -138,11 +132,8 @@ def test_what_differs_is_found(repository: Path) -> None:
     (repository / "leaderboard/plans/new/task/entry/entry.json").touch()
     (repository / PLACE / "seeds.parquet").unlink()
     entries, plans = changed("HEAD~2", repository / "leaderboard")
-    assert [str(path.relative_to(repository)) for path in entries] == [
-        PLACE,
-        "leaderboard/plans/new/task/entry",
-        "leaderboard/unranked/beam6g+7d1167f1/one",
-    ]
+    added = ["leaderboard/plans/new/task/entry", "leaderboard/unranked/beam6g+7d1167f1/one"]
+    assert [str(path.relative_to(repository)) for path in entries] == [PLACE, *added]
     assert [path.name for path in plans] == [PLAN]
     shutil.rmtree(repository / PLACE)
     assert PLACE not in [str(path.relative_to(repository)) for path in changed("HEAD", repository)[0]]

@@ -17,7 +17,7 @@ from qrlsuite.leaderboard.boards import board, ranked
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
-from tests.conftest import TINY
+from tests.conftest import TINY, trainer
 from tests.leaderboard.boards import entry as drawn
 
 
@@ -64,9 +64,8 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     task = tasks.load("beam6g")
     ranking = task.file.ranking
     cell = ranking.reference.model_copy(update={"epsilon": 0.4, "delta": 0.3})
-    lying = task.file.model_copy(
-        update={"ranking": ranking.model_copy(update={"epsilons": [0.4], "deltas": [0.3], "reference": cell})}
-    )
+    other = ranking.model_copy(update={"epsilons": [0.4], "deltas": [0.3], "reference": cell})
+    lying = task.file.model_copy(update={"ranking": other})
     assert collect.current(lying, "beam6g", task.hash).ranking == ranking
     assert collect.current(lying, "beam6g", "another definition") is lying
     assert collect.current(lying, "not-installed", task.hash) is lying
@@ -75,19 +74,15 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     for order in (several, several[::-1]):
         assert ranked.ranking_of(order) == ranking
         assert board.build(order).sections[0].cell == ranked.cell_text(ranking)
-    one, two = several[0], several[1]
-    assert ranked.ranking_of([one, two]) == ranked.ranking_of([two, one])
+    assert ranked.ranking_of(several[:2]) == ranked.ranking_of(several[1::-1])
 
 
 def test_scores_that_no_board_would_rank_end_the_run_at_once(
     tiny_task: str, train: Callable[..., Path]
 ) -> None:
-    Path(tiny_task).write_text(
-        TINY.replace("[ranking]", '[score]\nsource = "return"\nmax_return = 0.01\n[ranking]')
-    )
-    with pytest.raises(
-        EnvironmentFailure, match=r"has the score [\d.]+, outside \[0, 1\]: is score.max_return"
-    ):
+    scored = '[score]\nsource = "return"\nmax_return = 0.01\n[ranking]'
+    Path(tiny_task).write_text(TINY.replace("[ranking]", scored))
+    with pytest.raises(EnvironmentFailure, match=r"has the score [\d.]+, outside \[0, 1\]: is score.max"):
         train("runs", [0], 2)
 
 
@@ -98,24 +93,18 @@ def test_versions_that_mix_are_pointed_out(train: Callable[..., Path], tmp_path:
     record["provenance"][0]["versions"]["torch"] = "2.0"
     run.write_text(json.dumps(record))
     said = CliRunner().invoke(build(), ["leaderboard", "--explain", "--runs", str(tmp_path / "runs")]).output
-    assert "made with several versions, see `qrlsuite show ENTRY`: ddqn mlp width=16 (torch)" in " ".join(
-        said.split()
-    )
+    several = "made with several versions, see `qrlsuite show ENTRY`: ddqn mlp width=16 (torch)"
+    assert several in " ".join(said.split())
     shown = CliRunner().invoke(build(), ["show", path.name, "--runs", str(tmp_path / "runs")]).output
     assert '"torch": "2.0"' in shown
     assert np.__version__ in shown
 
 
-@pytest.fixture
-def with_smoke(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def with_smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with runs of a published entry: one epoch of three seeds, as a smoke test leaves them."""
-    from qrlsuite.engine.worker import train_group
-    from qrlsuite.experiment.entry import resolve
-    from qrlsuite.options import parse_setting
-
-    entry = resolve("beam6g", "mlp", settings=[parse_setting("width=16")])
-    train_group(EntryStore.create(tmp_path / "runs", entry).path, range(3), 1)
-    return tmp_path / "runs"
+    root = tmp_path_factory.mktemp("smoke")
+    return trainer("beam6g", root)("runs", range(3), 1).parents[1]
 
 
 def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
@@ -156,10 +145,8 @@ def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -
     own, other = ("ddqn mlp width=16", 3), ("ddqn mlp width=16 (published)", 100)
     both = rows("--entry", "beam6g/mlp width=16")
     assert both == {2000: [own], 200_000: [other]}
-    assert sorted(rows("--entry", "mlp width=16", "--task", "beam6g", "--horizon", "2000")[2000]) == [
-        own,
-        other,
-    ]
+    cut = rows("--entry", "mlp width=16", "--task", "beam6g", "--horizon", "2000")
+    assert sorted(cut[2000]) == [own, other]
     everything = rows("--horizon", "2000")
     assert list(everything) == [2000]
     assert {own, other} <= set(everything[2000])
@@ -170,13 +157,10 @@ def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ("--horizon", "2500"),
-            "an epoch of task 'beam6g' has 2000 steps; write a multiple of it, such as --horizon 2000",
-        ),
+        (("--horizon", "2500"), "task 'beam6g' has 2000 steps; write a multiple of it, such as --horizon 2000"),
         (("--horizon", "4000"), "no entry is left: ddqn mlp width=16: ends at 2000 of 4000 steps"),
     ],
-)
+)  # fmt: skip
 def test_what_leaves_nothing_says_why(words: tuple[str, ...], message: str, with_smoke: Path) -> None:
     for command in (("leaderboard",), ("plot", "bars")):
         done = CliRunner().invoke(build(), [*command, "--runs", str(with_smoke), *words])

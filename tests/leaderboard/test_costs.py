@@ -35,11 +35,8 @@ def learner(
     curves = np.ones((seeds, epochs))
     for run in range(seeds):
         curves[run, : epochs_below + run % 2] = 0
-    paid = {
-        "epochs": epochs,
-        "executions": per_step * STEPS * epochs,
-        "hours": per_step * STEPS * epochs / 3600,
-    }
+    executions = per_step * STEPS * epochs
+    paid = {"epochs": epochs, "executions": executions, "hours": executions / 3600}
     known = {"clocked": False, "processors": ("Alpha",)}
     return replace(entry, curves=curves, records=dict.fromkeys(range(seeds), paid), **{**known, **facts})
 
@@ -62,9 +59,7 @@ def test_the_cheaper_step_can_outweigh_the_fewer_steps() -> None:
     assert found.mean(first).mean * found.part == pytest.approx(30.5 * STEPS * 10, abs=found.part)
     assert found.mean(second).mean * found.part == pytest.approx(20.5 * STEPS * 20, abs=found.part)
     assert [found.rank_text(row) for row in found.rows] == ["1", "2"]
-    assert found.cells(first)[3:5] == ("10", "620k (620k to 620k)"), (
-        "31 epochs: half of the runs are there after 30"
-    )
+    assert found.cells(first)[3:5] == ("10", "620k (620k to 620k)"), "31 epochs: half of them need 30"
     assert found.cells(first)[-2:] == ("few steps", "-")
     assert found.cells(second)[-2:] == ("-", "cheap steps")
     (by_steps,) = boards.of([few, cheap]).sections
@@ -129,9 +124,7 @@ def test_numbers_that_cannot_be_compared_are_marked() -> None:
 
 def test_seeds_that_cost_differently_and_seeds_without_a_record() -> None:
     entry = learner("uneven", 20, 1)
-    records = {
-        seed: {**record, "executions": 1000 * (2 if seed else 3)} for seed, record in entry.records.items()
-    }
+    records = {s: {**each, "executions": 1000 * (2 if s else 3)} for s, each in entry.records.items()}
     found = section(replace(entry, records=records))
     assert any("up to 1.5 times as much in one seed" in line for line in found.notes())
     records[0]["executions"] = 0
@@ -159,10 +152,7 @@ def test_few_seeds_and_short_entries() -> None:
 
 
 def test_an_unknown_axis_is_one_error() -> None:
-    with pytest.raises(
-        OptionError,
-        match="choose among steps, executions, shots, core-hours, score, area; did you mean 'shots'",
-    ):
+    with pytest.raises(OptionError, match=r"steps, executions, shots, .*; did you mean 'shots'"):
         board.build([learner("a", 20, 2)], by="shot")
 
 
@@ -189,9 +179,8 @@ def test_the_board_in_every_format(tmp_path: Any) -> None:
     latex = say("--by", "executions", *PAIR, "--format", "latex").stdout
     assert r"\label{tab:beam6g-executions}" in latex
     assert "1.87k" in latex
-    assert "not ranked: ddqn mlp width=32: executes no" in " ".join(
-        say("--by", "executions", *PAIR).stdout.split()
-    )
+    table = " ".join(say("--by", "executions", *PAIR).stdout.split())
+    assert "not ranked: ddqn mlp width=32: executes no" in table
     page = tmp_path / "page.html"
     assert say("--by", "executions", *PAIR, "--format", "html", "--out", str(page)).exit_code == 0
     assert '<a href="#beside-1">beam6g by executions</a>' in page.read_text()

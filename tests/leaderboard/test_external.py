@@ -59,9 +59,10 @@ def qrlsuite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., A
     return run
 
 
-def test_from_csv_to_a_verdict_and_a_picture_in_three_commands(
+def test_from_csv_to_a_verdict_and_a_picture_and_what_external_entries_cannot_do(
     csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
 ) -> None:
+    """External is said everywhere, and nothing unknown is a number."""
     imported = qrlsuite("import", csv, "maximum=100")
     assert "external fast lr=0.1 on external: imported seeds 0:20" in imported.output
     assert "grid: every 1000 steps, the last score at or before" in imported.output
@@ -72,11 +73,6 @@ def test_from_csv_to_a_verdict_and_a_picture_in_three_commands(
     assert qrlsuite("plot", "curves").output == "wrote runs/external-curves.png\n"
     assert (tmp_path / "runs" / "external-curves.png").stat().st_size > 10_000
 
-
-def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
-    csv: Path, qrlsuite: Callable[..., Any], tmp_path: Path
-) -> None:
-    qrlsuite("import", csv, "maximum=100")
     board = qrlsuite("leaderboard").output
     assert "curves that other programs made, and nobody here can train or check again: external fast" in board
     [fast] = [line for line in board.splitlines() if "fast lr=0.1" in line and "█" in line]
@@ -93,39 +89,34 @@ def test_external_is_said_everywhere_and_nothing_unknown_is_a_number(
     assert entry.external
     assert entry.facts["made"] == "by another program"
     assert entry.options["model"] == {"name": "fast lr=0.1", "lr": 0.1}
-
-
-def test_external_entries_are_not_trained_evaluated_or_published(
-    csv: Path, qrlsuite: Callable[..., Any]
-) -> None:
-    qrlsuite("import", csv, "maximum=100")
     for words, message in (
         (("export", "fast"), "can be compared, not trained, evaluated or published"),
         (("evaluate", "fast"), "hold learning curves and no trained parameters"),
         (("run", "external fast", "--task", "cartpole"), "can be compared, not trained"),
     ):
-        result = qrlsuite(*words)
-        assert message in str(result.exception), words
-
-
-def test_power_and_rliable_take_them(qrlsuite: Callable[..., Any], csv: Path, tmp_path: Path) -> None:
-    qrlsuite("import", csv, "maximum=100")
+        assert message in str(qrlsuite(*words).exception), words
+    needs = json.loads(qrlsuite("power", "fast", "slow", "--draws", 20, "--json").output)
+    assert "known" in needs["core_hours_basis"]
+    assert needs["needs"][0]["fixed_seeds"] <= 20
     qrlsuite("import", csv, "maximum=100", "--task", "another")
     scores = qrlsuite("export", "--out", "scores.npz", "--task", "external", "--task", "another")
     assert "fast lr=0.1: 20 runs, 2 tasks" in scores.output, scores.exception
-    needs = json.loads(
-        qrlsuite("power", "fast", "slow", "--task", "external", "--draws", 20, "--json").output
-    )
-    assert needs["core_hours_basis"] == "not known" or "known" in needs["core_hours_basis"]
-    assert needs["needs"][0]["fixed_seeds"] <= 20
 
 
-POINTS = (0, 9), (7, 1), (19, 2), (40, 3), (45, 4)
+def lines(points: Sequence[tuple[int, int, int]]) -> str:
+    """A csv file of entry a, from (seed, step, score)."""
+    return "entry,seed,step,score\n" + "".join(f"a,{seed},{step},{score}\n" for seed, step, score in points)
+
+
+def ending(path: Path, *lasts: int) -> Path:
+    """Seeds that are scored every 10 steps until their last: seed plus step."""
+    path.write_text(lines([(s, t, s + t) for s, last in enumerate(lasts) for t in range(10, last + 1, 10)]))
+    return path
 
 
 def test_unequal_steps_take_the_last_score_at_or_before_each_grid_point(tmp_path: Path) -> None:
     path = tmp_path / "curves.csv"
-    path.write_text("entry,seed,step,score\n" + "".join(f"a,0,{s},{v}\n" for s, v in POINTS))
+    path.write_text(lines([(0, 0, 9), (0, 7, 1), (0, 19, 2), (0, 40, 3), (0, 45, 4)]))
     [a] = api.import_curves(path, thresholds=[2.5], every=10, runs=tmp_path / "runs")
     curve = a.store.seed(0).read().curve
     # at 10, 20, 30, 40: not the 9 before training, and nothing after 40
@@ -141,9 +132,7 @@ def test_a_grid_is_round_where_every_run_has_begun(tmp_path: Path) -> None:
 
 
 def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "curves.csv"
-    rows = [(seed, step) for seed, last in ((0, 30), (1, 30), (2, 20)) for step in range(10, last + 1, 10)]
-    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    path = ending(tmp_path / "curves.csv", 30, 30, 20)
     [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
     assert "seeds 2:3 end before the others, from step 20 on (others at 30)" in a.notes[1]
     assert a.store.record()["task_file"]["ranking"]["horizons"] == [30]
@@ -152,13 +141,7 @@ def test_runs_of_different_length_are_named(tmp_path: Path) -> None:
 
 def test_runs_that_end_a_little_apart_are_cut_to_one_length(tmp_path: Path) -> None:
     """Episodes end where they end: no seed is left out for that."""
-    path = tmp_path / "curves.csv"
-    rows = [
-        (seed, step)
-        for seed, last in ((0, 200), (1, 190), (2, 180), (3, 100))
-        for step in range(10, last + 1, 10)
-    ]
-    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    path = ending(tmp_path / "curves.csv", 200, 190, 180, 100)
     [a] = api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
     assert a.notes[0] == "'a': all cut to step 180; the longest goes on to 200"
     entry = api.load("a", runs=tmp_path / "runs")
@@ -233,10 +216,7 @@ BAD = {
     "controls": (GOOD + "a\x1b[2J,0,10,1\n", r"entry 'a\\x1b\[2J': a name is one line"),
     "a long name": (GOOD + "a" * 81 + ",0,10,1\n", "1 to 80 characters"),
     "a long line": (GOOD + "a" * run_files._LONGEST_LINE, "a line of it has 1,000,000 characters"),
-    "copies": (
-        GOOD + "".join(f"a,{s},{t},{t}\n" for s in (0, 1) for t in (1, 2, 3)),
-        "seeds 0 and 1 of 'a' have the same",
-    ),
+    "copies": (lines([(s, t, t) for s in (0, 1) for t in (1, 2, 3)]), "seeds 0 and 1 of 'a' have the same"),
     "below 0": (GOOD + "a,0,10,-1\n", "scores from -1 to -1 are not between 0 and 100, the maximum"),
 }
 
@@ -281,7 +261,8 @@ def test_huge_files_are_refused_before_they_are_read(tmp_path: Path, monkeypatch
 @pytest.fixture(scope="module")
 def sb3(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs of Stable-Baselines3, with every file that it writes."""
-    gymnasium, sb = pytest.importorskip("gymnasium"), pytest.importorskip("stable_baselines3")
+    sb = pytest.importorskip("stable_baselines3")
+    import gymnasium
     from stable_baselines3.common.callbacks import EvalCallback
     from stable_baselines3.common.monitor import Monitor
 
@@ -289,10 +270,7 @@ def sb3(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, width in (("small", 4), ("large", 8)):
         folder = logs / name / "seed-3"
         folder.mkdir(parents=True)
-        env, test = (
-            Monitor(gymnasium.make("CartPole-v1"), f"{folder}/"),
-            Monitor(gymnasium.make("CartPole-v1")),
-        )
+        env, test = (Monitor(gymnasium.make("CartPole-v1"), where) for where in (f"{folder}/", None))
         model = sb.PPO(
             "MlpPolicy", env, n_steps=64, n_epochs=1, seed=3, policy_kwargs={"net_arch": [width]},
             tensorboard_log=str(folder), device="cpu",
@@ -346,13 +324,8 @@ def test_offline_files_of_wandb(tmp_path: Path) -> None:
     wandb = pytest.importorskip("wandb")
     for seed in (0, 1):
         run = wandb.init(
-            project="p",
-            group="small",
-            config={"seed": seed},
-            dir=tmp_path,
-            mode="offline",
-            reinit="finish_previous",
-        )
+            project="p", group="small", config={"seed": seed}, dir=tmp_path, mode="offline", reinit="finish_previous"
+        )  # fmt: skip
         for step in (1, 2):
             run.log({"eval/mean_reward": step + seed, "global_step": 100 * step})
         run.finish()

@@ -21,6 +21,7 @@ from qrlsuite.leaderboard.shelf import fields
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import final_scores
 from qrlsuite.statistics.times import mean_time
+from tests.leaderboard.test_external import ending
 
 NAMES = ["mlp width=16", "mlp width=64", "vqc-native qubits=6"]
 
@@ -104,11 +105,9 @@ def test_columns_say_what_they_are() -> None:
 def test_values_of_several_types_and_what_is_unknown(runs: Path) -> None:
     found = api.table(runs=runs)
     assert found["model.width"].to_pylist() == ["4", "8", "wide"]
-    assert found["model.lr"].to_pylist() == [
-        1.0,
-        0.5,
-        None,
-    ]  # what is no number or text is no option of a name
+    assert found["model.lr"].to_pylist() == [1.0, 0.5, None], (
+        "what is no number or text is no option of a name"
+    )
     assert found["parameters"].to_pylist() == [None] * 3
     assert found["core_hours"].to_pylist() == [None] * 3
     assert found["external"].to_pylist() == [True] * 3
@@ -119,16 +118,10 @@ def test_values_of_several_types_and_what_is_unknown(runs: Path) -> None:
 
 
 def test_seeds_that_are_not_complete_have_no_scores(tmp_path: Path) -> None:
-    path = tmp_path / "curves.csv"
-    rows = [(seed, step) for seed, last in ((0, 30), (1, 30), (2, 20)) for step in range(10, last + 1, 10)]
-    path.write_text("entry,seed,step,score\n" + "".join(f"a,{s},{t},{s + t}\n" for s, t in rows))
+    path = ending(tmp_path / "curves.csv", 30, 30, 20)
     api.import_curves(path, thresholds=[15], runs=tmp_path / "runs")
     found = api.table("seeds", runs=tmp_path / "runs").to_pylist()
-    assert [(row["seed"], row["epochs"], row["area"]) for row in found] == [
-        (0, 3, 20),
-        (1, 3, 21),
-        (2, 2, None),
-    ]
+    assert [(row["epochs"], row["area"]) for row in found] == [(3, 20), (3, 21), (2, None)]
 
 
 def test_a_horizon_cuts_all(published: list[EntryResults]) -> None:
@@ -161,25 +154,21 @@ def test_a_picture_shows_means_of_the_rows_at_each_value(runs: Path) -> None:
     assert line == [(4, pytest.approx(0.3)), (8, pytest.approx(0.7))]
     [line] = points(draw(own, x="steps", y="score", where="model=net width=8")).values()
     assert line == [(10, pytest.approx(0.5)), (20, pytest.approx(0.7)), (30, pytest.approx(0.9))]
-    [line] = points(draw(own, x="external", y="area")).values()
-    assert line == [(0, pytest.approx(0.5))]
     figure = draw(own, x="external", y="area")
+    assert [*points(figure).values()] == [[(0, pytest.approx(0.5))]]
     assert "1 of 1 point from several entries" in " ".join(figure.get_supxlabel().split())
     three = draw([*own, api.load("tree", runs=runs)], x="lr", y="area")
     assert "without 1 entry without one of these fields" in " ".join(three.get_supxlabel().split())
 
 
 def test_lines_are_by_the_fields_asked_for(published: list[EntryResults]) -> None:
-    figure = draw(published, x="parameters", y="final_score")
-    [legend] = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["mlp", "vqc-native"]
-    figure = draw(published, x="parameters", y="final_score", by=["algorithm", "width"])
-    [legend] = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "ddqn, width=16",
-        "ddqn, width=64",
-        "ddqn, width=none",
-    ]
+    def legend(**by: Any) -> list[str]:
+        [found] = draw(published, x="parameters", y="final_score", **by).legends
+        return [text.get_text() for text in found.get_texts()]
+
+    assert legend() == ["mlp", "vqc-native"]
+    widths = ["ddqn, width=16", "ddqn, width=64", "ddqn, width=none"]
+    assert legend(by=["algorithm", "width"]) == widths
 
 
 @pytest.mark.parametrize(
@@ -187,14 +176,11 @@ def test_lines_are_by_the_fields_asked_for(published: list[EntryResults]) -> Non
     [
         ({"x": "wdith"}, "no field 'wdith' here"),
         ({"y": "model"}, "y = model is 'mlp': choose a field of numbers"),
-        (
-            {"x": "width", "where": "model=vqc-native"},
-            "nothing has model.width, steps_below_threshold and model=vqc",
-        ),
+        ({"x": "width", "where": "model=vqc-native"}, "nothing has model.width, steps_below_threshold and model=vqc"),
         ({"where": "model"}, "where: model: write name=value"),
         ({"by": "nothing"}, "no field 'nothing' here"),
     ],
-)
+)  # fmt: skip
 def test_bad_settings(settings: dict[str, Any], message: str, published: list[EntryResults]) -> None:
     with pytest.raises((OptionError, UnknownNameError), match=message):
         draw(published, **settings)

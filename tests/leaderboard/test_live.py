@@ -78,19 +78,7 @@ def test_a_browser_follows_a_run(
     board = tab.locator("#board-0")
     board.get_by_role("checkbox", name="Pick mlp width=16").wait_for()
 
-    words = (
-        "run",
-        "--task",
-        tiny_task,
-        "--model",
-        "mlp",
-        "--set",
-        "width=8",
-        "--seeds",
-        "2",
-        "--epochs",
-        "8",
-    )
+    words = ("run", "--task", tiny_task, "mlp width=8", "--seeds", "2", "--epochs", "8")
     run = start(*words, "--runs", str(tmp_path / "runs"), env=hold.environment)
     hold.wait(run)
     row = tab.locator("#running tbody tr", has_text="mlp width=8").first
@@ -116,7 +104,7 @@ def test_a_browser_follows_a_run(
     assert chosen == ["mlp width=16", "mlp width=8"]
     name = tab.locator("#running").get_attribute("data-page")
 
-    qrlsuite(*words[:6], "width=4", *words[7:], "--runs", str(tmp_path / "runs"))
+    qrlsuite(*words[:3], "mlp width=4", *words[4:], "--runs", str(tmp_path / "runs"))
     hidden = board.get_by_role("checkbox", name="Pick mlp width=4", include_hidden=True)
     hidden.wait_for(state="attached")  # the search hides its row
     assert tab.locator("#running").get_attribute("data-page") != name
@@ -153,28 +141,19 @@ def test_only_two_addresses_of_this_machine_are_answered(view: View, train: Call
     _, address = view()
     port = address.rpartition(":")[2]
     assert answer(address, Host=f"localhost:{port}")[0] == 200
-    for host in (
-        "evil.example",
-        f"evil.example:{port}",
-        f"127.0.0.1.evil.example:{port}",
-        "127.0.0.1",
-        "",
-        "[::1]",
-    ):
+    evil = "evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}"
+    for host in (*evil, "127.0.0.1", "", "[::1]"):
         assert answer(address, Host=host) == (403, f"403: only {address} is served here\n")
         assert answer(address, "/progress", Host=host)[0] == 403
     inside = folder.relative_to(folder.parents[1])
-    for path in (
+    own = [
         f"/{inside}/entry.json",
         f"//{inside}/entry.json",
         f"/../{inside}/entry.json",
-        "/%2e%2e/%2e%2e/etc/passwd",
-        "/../../../../etc/passwd",
-        "/page.js",
-        "/progress/",
-        "/?",
-        str(folder / "entry.json"),
-    ):
+        f"{folder}/entry.json",
+    ]
+    elsewhere = ["/%2e%2e/%2e%2e/etc/passwd", "/../../../../etc/passwd"]
+    for path in (*own, *elsewhere, "/page.js", "/progress/", "/?"):
         assert answer(address, path) == (404, f"404: there is nothing but {address}/\n"), path
     for method in ("POST", "PUT", "DELETE", "OPTIONS", "HEAD"):
         assert answer(address, method=method)[0] == 501

@@ -19,13 +19,11 @@ from matplotlib.patches import Rectangle
 
 from qrlsuite import options, specs
 from qrlsuite.errors import OptionError, UnknownNameError
-from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard import pictures
-from qrlsuite.leaderboard.pictures import cells
+from qrlsuite.leaderboard.pictures import cells, few_runs, histogram
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import Grid
-
-FILE = tasks.load("beam6g").file
+from tests.leaderboard import boards
 
 
 def learner(
@@ -41,37 +39,18 @@ def learner(
     """All runs reach .95 after the same epoch and stay: S_hat is that epoch in every cell, without spread."""
     curves = np.zeros((seeds, epochs))
     curves[:, first_good:] = 0.95
-    return EntryResults(
-        name=label,
-        label=label,
-        task=task,
-        task_hash=task,
-        task_file=FILE,
-        algorithm="ddqn",
-        model=label.split()[1],
-        parameters=(387, quantum),
-        curves=curves,
-        seeds=tuple(range(seeds)),
-        left_out=(),
-        hours=0.1,
-        folder=Path(label),
-        identity={
-            "model_options": model_options or {},
-            "task": {"environment_options": environment_options or {}},
-        },
-    )
+    identity = {
+        "model_options": model_options or {}, "task": {"environment_options": environment_options or {}},
+    }  # fmt: skip
+    made = boards.entry(label, seeds, epochs, quantum=quantum)
+    return replace(made, task=task, task_hash=task, model=label.split()[1], curves=curves, identity=identity)
 
 
 def noisy(label: str, seeds: int = 30, level: float = 0.9) -> EntryResults:
-    entry = learner(label, seeds=seeds)
     generator = np.random.default_rng(len(label))
     pace = generator.lognormal(2.5, 0.4, (seeds, 1))
-    entry.curves[:] = np.clip(
-        level - level * np.exp(-np.arange(1, 101) / pace) + 0.03 * generator.standard_normal((seeds, 100)),
-        0,
-        1,
-    )
-    return entry
+    curves = level - level * np.exp(-np.arange(1, 101) / pace) + 0.03 * generator.normal(size=(seeds, 100))
+    return replace(learner(label, seeds=seeds), curves=np.clip(curves, 0, 1))
 
 
 def texts(figure: Figure) -> str:
@@ -97,32 +76,23 @@ def test_kinds_have_a_line_settings_and_a_drawing_function() -> None:
         assert all(row["description"] for row in options.describe(specs.resolve(picture.options)))
 
 
-@pytest.mark.parametrize(
-    "kind", [name for name, picture in pictures.KINDS.items() if picture.data == "entries"]
-)
-@pytest.mark.parametrize("format_", ["png", "svg"])
-def test_any_name_can_be_drawn_and_seeds_are_stated(kind: str, format_: str) -> None:
+@pytest.mark.parametrize("kind", [name for name, kind in pictures.KINDS.items() if kind.data == "entries"])
+def test_any_name_can_be_drawn_and_seeds_are_stated(kind: str) -> None:
     names = ["ddqn <b>$x^$ 50\\% & \ud800\x00\u202e", "ddqn mlp " + "long " * 40]
-    entries = [noisy(name) for name in names]
-    for k, entry in enumerate(entries):
-        object.__setattr__(entry, "model", "mlp")
-        object.__setattr__(entry, "identity", {"model_options": {"width": k + 1}})
+    widths = ({"model_options": {"width": k + 1}} for k in range(2))
+    entries = [replace(noisy(name), model="mlp", identity=width) for name, width in zip(names, widths)]
     figure = pictures.draw(kind, entries)
     written = texts(figure)
     assert "30 seeds*" in written or "30 of 100 seeds" in written
     assert "provisional" in written
-    encoded = pictures.encode(figure, format_)
-    assert encoded.startswith(b"\x89PNG" if format_ == "png" else b"<?xml")
+    assert pictures.encode(figure, "png").startswith(b"\x89PNG")
+    encoded = pictures.encode(figure, "svg")
+    assert encoded.startswith(b"<?xml")
     assert b"<b>" not in encoded
 
 
-def test_a_complete_entry_is_not_called_provisional() -> None:
-    written = texts(pictures.draw("bars", [learner(seeds=100)]))
-    assert "100 seeds" in written
-    assert "provisional" not in written
-
-
 def test_bars_have_the_height_of_s_hat_and_fade_at_the_cap() -> None:
+    assert "provisional" not in texts(pictures.draw("bars", [learner(seeds=100)]))
     never = learner("ddqn mlp width=8", 100)
     figure = pictures.draw("bars", [*ENTRIES, never], epsilons=[0.2], deltas=[0.5])
     first, second, third = bars(figure.axes[0])
@@ -192,11 +162,12 @@ def test_scaling_draws_depth_for_each_width_but_no_line_of_chance_pairs() -> Non
         for w, d in [(16, 2), (32, 2), (64, 2), (32, 1), (32, 3), (64, 1), (64, 3)]
     ]
     width, depth = pictures.draw("scaling", entries).axes
-    assert [line.get_label() for line in width.get_lines() if not str(line.get_label()).startswith("_")] == [
-        "mlp"
-    ]
-    labels = {line.get_label() for line in depth.get_lines() if not str(line.get_label()).startswith("_")}
-    assert labels == {"mlp width=32", "mlp width=64"}
+    assert [line.get_label() for line in labeled(width)] == ["mlp"]
+    assert {line.get_label() for line in labeled(depth)} == {"mlp width=32", "mlp width=64"}
+
+
+def labeled(axes: Axes) -> list[Any]:
+    return [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
 
 
 def test_scaling_over_tasks_averages_instances() -> None:
@@ -208,9 +179,7 @@ def test_scaling_over_tasks_averages_instances() -> None:
     line = figure.axes[0].get_lines()[0]
     assert (list(line.get_xdata()), list(line.get_ydata())) == ([2, 3], [30_000, 80_000])
     assert "mean over instances" in texts(figure)
-    with pytest.raises(
-        OptionError, match=r"by = 'environment\.antenas'.*did you mean 'environment\.antennas'"
-    ):
+    with pytest.raises(OptionError, match=r"by = 'environment\.antenas'.*did you mean 'environment\.ant"):
         pictures.draw("scaling", entries, by="environment.antenas")
 
 
@@ -221,8 +190,8 @@ def test_scaling_draws_lines_that_are_not_complete_yet_and_names_what_it_leaves_
         for n in sizes
     ]
     figure = pictures.draw("scaling", entries, by="environment.antennas")
-    lines = [line for line in figure.axes[0].get_lines() if not str(line.get_label()).startswith("_")]
-    assert [(line.get_label(), len(line.get_xdata())) for line in lines] == [("mlp", 3), ("vqc", 2)]
+    lines = [(line.get_label(), len(line.get_xdata())) for line in labeled(figure.axes[0])]
+    assert lines == [("mlp", 3), ("vqc", 2)]
     assert "not shown, too few of a kind for a line: ddqn odd 2" in texts(figure).replace("\n", " ")
 
 
@@ -236,9 +205,6 @@ def test_tiers_say_in_how_many_cells() -> None:
 
 
 def test_few_runs_of_one_entry_are_disjoint_sets_and_equally_often_ahead() -> None:
-    from qrlsuite.leaderboard.pictures import few_runs
-    from qrlsuite.statistics import Grid
-
     entry = noisy("ddqn mlp width=64", 40, 0.95)
     drawn = few_runs._sample([entry], Grid.relative([0.2], [0.75]), 200_000, 5, 400, np.random.default_rng(0))
     assert all(not set(a) & set(b) for a, b in zip(*(runs.tolist() for runs in drawn.runs)))
@@ -251,18 +217,14 @@ def test_few_runs_of_one_entry_are_disjoint_sets_and_equally_often_ahead() -> No
 
 
 def test_estimator_draws_the_exact_binomial() -> None:
-    from math import comb
-
     axes = pictures.draw("estimator", runs=5, deltas=[0.9]).axes[0]
     curve = next(line for line in axes.get_lines() if line.get_label() == "δ = 0.9")
     at = int(np.argmin(np.abs(np.asarray(curve.get_xdata()) - 0.8)))
     # of 5 runs 5 must be there: the chance that one is not
-    assert np.asarray(curve.get_ydata())[at] == pytest.approx(1 - comb(5, 5) * 0.8**5)
+    assert np.asarray(curve.get_ydata())[at] == pytest.approx(1 - 0.8**5)
 
 
 def test_histogram_says_means_and_numbers_of_episodes() -> None:
-    from qrlsuite.leaderboard.pictures import histogram
-
     figure = histogram.draw({"optimal": np.full(4, 2.0), "mlp": np.array([[1.0, 2.0], [3.0, 2.0]])})
     assert "optimal   mean 2   (4 episodes)" in texts(figure)
     assert "mlp   mean 2   (2 x 2 episodes)" in texts(figure)
@@ -282,16 +244,11 @@ def test_curves_show_single_runs_of_few() -> None:
 
 def test_a_curve_of_one_epoch_can_be_seen() -> None:
     both = [learner(seeds=3), replace(learner("ddqn mlp width=8"), curves=learner().curves[:, :1])]
-    longer, point = (
-        next(
-            line
-            for line in pictures.draw("curves", both).axes[0].get_lines()
-            if line.get_label().startswith(entry.label)
-        )
-        for entry in both
-    )
-    assert longer.get_marker() == "None"
-    assert point.get_marker() == "o"
+    lines = labeled(pictures.draw("curves", both).axes[0])
+    markers = [
+        line.get_marker() for each in both for line in lines if line.get_label().startswith(each.label)
+    ]
+    assert markers == ["None", "o"]
 
 
 @pytest.mark.parametrize("kind", ["curves", "surface", "bars", "tiers", "few-runs"])
@@ -339,12 +296,8 @@ def test_legends_name_the_ansatz_and_pictures_of_many_can_be_read() -> None:
 
 
 def test_an_entry_keeps_its_color_where_others_are_left_out() -> None:
-    from dataclasses import replace
-
     entries = [replace(entry, color=place) for place, entry in enumerate(ENTRIES)]
     both, one = pictures.draw("curves", entries), pictures.draw("curves", entries[1:])
     assert both.axes[0].lines[-1].get_color() == one.axes[0].lines[-1].get_color()
-    colors = [bar.get_facecolor()[:3] for bar in bars(pictures.draw("bars", entries[1:]).axes[0])]
-    assert set(colors) <= {
-        bar.get_facecolor()[:3] for bar in bars(pictures.draw("bars", entries).axes[0])[-6:]
-    }
+    both, one = (bars(pictures.draw("bars", some).axes[0]) for some in (entries, entries[1:]))
+    assert {bar.get_facecolor()[:3] for bar in one} <= {bar.get_facecolor()[:3] for bar in both[-6:]}

@@ -31,12 +31,8 @@ NAMES = {
 
 
 def test_pairs_are_those_of_the_statistics() -> None:
-    members = [
-        boards.entry("fast", 100, speed=2),
-        boards.entry("slow", 30, speed=0.4),
-        boards.entry("slower", 25, 120, speed=0.3),
-        boards.entry("few", 8),
-    ]
+    drawn = ("fast", 100, 100, 2), ("slow", 30, 100, 0.4), ("slower", 25, 120, 0.3), ("few", 8, 100, 1)
+    members = [boards.entry(*each) for each in drawn]
     (section,) = boards.of(members).sections
     found = judge(section)
     grid = members[0].task_file.ranking.grid
@@ -49,10 +45,8 @@ def test_pairs_are_those_of_the_statistics() -> None:
         np.testing.assert_array_equal(
             found.evidence[pair.second, pair.n_runs].interval(), wanted.intervals[1]
         )
-    assert {pair.outcome(0) for pair in found.pairs if pair.first == 0} == {
-        Outcome.OUTPERFORMS,
-        Outcome.UNDECIDED,
-    }
+    outcomes = {pair.outcome(0) for pair in found.pairs if pair.first == 0}
+    assert outcomes == {Outcome.OUTPERFORMS, Outcome.UNDECIDED}
     assert any("^" in pair.cells for pair in found.pairs)
 
 
@@ -65,9 +59,8 @@ def test_a_page_agrees_with_its_board() -> None:
 
 
 def test_a_pair_speaks_from_both_sides() -> None:
-    pair = judge(
-        boards.of([boards.entry("fast", speed=2), boards.entry("slow", speed=0.5)]).sections[0]
-    ).pairs[0]
+    made = boards.of([boards.entry("fast", speed=2), boards.entry("slow", speed=0.5)])
+    pair = judge(made.sections[0]).pairs[0]
     assert pair.words(0).startswith("outperforms: significantly fewer samples in ")
     assert pair.words(1).startswith("is outperformed: significantly more samples in ")
 
@@ -85,9 +78,7 @@ def test_an_arc_reaches_the_further_the_more_rows_it_spans_and_stays_inside() ->
         beats[start, end] = True
     arcs = ladder.draw(beats, [1, 2, 2, 2, 3, 3, 3]).arcs
     rows = {arc.end - arc.start: float(re.match(r"M6 [\d.]+C([\d.]+) ", arc.line)[1]) for arc in arcs}  # type: ignore[index]
-    reached = {
-        span: bend * 3 / 4 for span, bend in rows.items()
-    }  # of a cubic curve with these control points
+    reached = {span: 0.75 * bend for span, bend in rows.items()}  # of a cubic with these control points
     assert reached[1] < 0.5 * reached[6]
     assert reached[1] < reached[3] < reached[6] < ladder.WIDTH
 
@@ -175,11 +166,8 @@ def test_an_empty_board_is_still_a_page() -> None:
 def test_the_command_writes_a_page(tmp_path: Path, train: Callable[..., Path]) -> None:
     folder = train("runs", [0], epochs=1).parents[1]
     result = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--format", "html"])
-    assert (result.exit_code, result.stdout, result.exception) == (
-        0,
-        f"wrote {folder / 'leaderboard.html'}\n",
-        None,
-    )
+    assert result.exit_code == 0, result.exception
+    assert result.stdout == f"wrote {folder / 'leaderboard.html'}\n"
     assert "<h1>Sample complexity leaderboard</h1>" in (folder / "leaderboard.html").read_text()
     wrong = CliRunner().invoke(app.build(), ["leaderboard", "--runs", str(folder), "--out", "page.html"])
     assert isinstance(wrong.exception, OptionError)

@@ -60,18 +60,10 @@ def test_a_study_is_shown_with_hash_dates_looks_and_what_was_spent(runs: Path) -
     found, refused = in_folder(runs)
     assert refused == []
     three, two = (looks_report.view(outcome) for outcome in found)
-    assert [line.verdict for line in three.pairs] == [
-        "equal within 10 percent",
-        "mlp width=16 needs fewer",
-        "mlp width=8 needs fewer",
-    ]
-    assert [(line.seeds, line.taken != "–") for line in three.looks] == [
-        (20, True),
-        (40, True),
-        (60, False),
-        (80, False),
-        (100, False),
-    ]
+    verdicts = ["equal within 10 percent", "mlp width=16 needs fewer", "mlp width=8 needs fewer"]
+    assert [line.verdict for line in three.pairs] == verdicts
+    taken = [(20, True), (40, True), (60, False), (80, False), (100, False)]
+    assert [(line.seeds, line.taken != "–") for line in three.looks] == taken
     # Pocock's spending at a fifth of the runs: alpha x log(1 + (e - 1) / 5)
     assert [line.spent for line in three.looks] == ["0.015", "0.026", "0.035", "0.043", "0.050"]
     assert [bool(text) for text, _ in three.looks[1].p] == [True, False, False], "the others were closed"

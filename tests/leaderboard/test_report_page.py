@@ -11,10 +11,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.report import render
-from qrlsuite.leaderboard.shelf import collect
 from tests.leaderboard import boards
 
 Open = Callable[..., Any]
@@ -37,14 +35,6 @@ def column(tab: Any, key: str, table: str = "#board-0-table") -> list[str]:
     return values
 
 
-def test_a_board_of_published_size_loads_offline_and_is_small(opened: Open) -> None:
-    text = render(boards.of(boards.graded(8, seeds=100)))
-    assert len(text.encode()) < 500_000
-    tab = opened(text)
-    assert tab.locator("#board-0 .plot svg").count() == 1
-    assert tab.locator("#board-0-table tbody tr").count() == 8
-
-
 def test_the_table_sorts_by_click(opened: Open, page: str) -> None:
     tab = opened(page)
     means = [float(value) for value in column(tab, "mean")[:-1]]
@@ -59,17 +49,18 @@ def test_the_table_sorts_by_click(opened: Open, page: str) -> None:
     header.get_by_role("button").click()
     assert [int(value) for value in column(tab, "steps")] == up[::-1]
     assert header.get_attribute("aria-sort") == "descending"
-
-
-def test_an_unranked_entry_stays_last_whichever_way_ranks_are_sorted(opened: Open, page: str) -> None:
-    tab = opened(page)
     for reverse in (False, True):
         tab.locator("#board-0-table th[data-key=rank] button").click()
-        assert column(tab, "rank") == [*sorted(column(tab, "rank")[:-1], reverse=reverse), ""]
+        ranks = column(tab, "rank")
+        assert ranks == [*sorted(ranks[:-1], reverse=reverse), ""], "an unranked entry stays last"
 
 
-def test_the_table_sorts_by_keyboard(opened: Open, page: str) -> None:
+def test_the_keyboard_skips_to_the_content_and_sorts(opened: Open, page: str) -> None:
     tab = opened(page)
+    tab.keyboard.press("Tab")
+    assert tab.evaluate("document.activeElement.className") == "skip"
+    tab.keyboard.press("Enter")
+    assert tab.evaluate("document.activeElement.id") == "content"
     for _ in range(60):
         tab.keyboard.press("Tab")
         if tab.evaluate("document.activeElement.closest('th')?.dataset.key") == "parameters":
@@ -79,14 +70,6 @@ def test_the_table_sorts_by_keyboard(opened: Open, page: str) -> None:
     values = [int(value) for value in column(tab, "parameters")]
     assert values == sorted(values)
     assert outline == "solid"
-
-
-def test_the_first_stop_of_the_keyboard_skips_to_the_content(opened: Open, page: str) -> None:
-    tab = opened(page)
-    tab.keyboard.press("Tab")
-    assert tab.evaluate("document.activeElement.className") == "skip"
-    tab.keyboard.press("Enter")
-    assert tab.evaluate("document.activeElement.id") == "content"
 
 
 def test_the_page_begins_with_the_boards_verdict(opened: Open) -> None:
@@ -139,12 +122,19 @@ def picked(tab: Any) -> list[str]:
 
 
 def test_rows_are_picked_by_a_click_and_compared(opened: Open, page: str) -> None:
+    assert len(page.encode()) < 500_000
     tab = opened(page)
+    tab.locator("#board-0").get_by_label("Single runs").check()
+    runs = tab.locator("#board-0 path.runs")
+    assert [path.get_attribute("d").count("M") for path in runs.all()] == [20, 20]
     assert picked(tab) == ["model-0 width=1", "model-1 width=2"]
     row = tab.locator("#board-0-table tbody tr", has_text="model-3 width=8")
     row.locator("td").last.click()
     assert picked(tab) == ["model-0 width=1", "model-1 width=2", "model-3 width=8"]
     assert tab.locator("#board-0 .verdicts .verdict").count() == 3, "all pairs of three"
+    assert not tab.get_by_text("Options of the algorithm").first.is_visible()
+    tab.locator("#board-0-table").get_by_role("link", name="model-0 width=1").click()
+    tab.get_by_text("Options of the algorithm").first.wait_for(state="visible")
     assert tab.locator("#board-0 path.median").count() == 3
     tab.locator("#board-0-table tbody tr", has_text="model-1 width=2").locator("td").last.click()
     verdict = tab.locator("#board-0 .verdicts .verdict")
@@ -270,6 +260,18 @@ def test_hostile_names_stay_text(opened: Open) -> None:
     assert tab.title() == "Sample complexity leaderboard"
 
 
+def test_without_javascript_everything_is_there_and_printed(opened: Open, page: str) -> None:
+    tab = opened(page, java_script_enabled=False)
+    parts = {"-table tbody tr": 5, " .ladder .arc": 4, " .tiers tbody tr": 5, " .surface": 5}
+    assert {part: tab.locator(f"#board-0{part}").count() for part in parts} == parts
+    assert tab.locator("#board-0 .matrix tbody td").count() == 25
+    assert "model-0" in tab.locator("#board-0-table tbody").inner_text()
+    assert not tab.locator("#theme").is_visible()
+    assert not tab.locator(".facts").first.is_visible()
+    tab.emulate_media(media="print")
+    assert tab.locator(".facts").first.is_visible()
+
+
 def test_dark_mode_follows_the_system_and_the_button(opened: Open, page: str) -> None:
     tab = opened(page, color_scheme="dark")
     ground = "getComputedStyle(document.documentElement).backgroundColor"
@@ -334,40 +336,6 @@ def test_print_shows_everything_in_light_colors(opened: Open, page: str) -> None
     tab.locator("details.more[open]").first.wait_for(state="detached")
 
 
-def test_print_without_javascript_opens_everything(opened: Open, page: str) -> None:
-    tab = opened(page, java_script_enabled=False)
-    assert not tab.locator(".facts").first.is_visible()
-    tab.emulate_media(media="print")
-    assert tab.locator(".facts").first.is_visible()
-
-
-def test_without_javascript_tables_and_tiers_are_there(opened: Open, page: str) -> None:
-    tab = opened(page, java_script_enabled=False)
-    assert tab.locator("#board-0-table tbody tr").count() == 5
-    assert "model-0" in tab.locator("#board-0-table tbody").inner_text()
-    assert tab.locator("#board-0 .ladder .arc").count() == 4
-    assert tab.locator("#board-0 .tiers tbody tr").count() == 5
-    assert tab.locator("#board-0 .surface").count() == 5
-    assert tab.locator("#board-0 .matrix tbody td").count() == 25
-    assert not tab.locator("#theme").is_visible()
-
-
-def test_single_runs_are_shown(opened: Open, page: str) -> None:
-    tab = opened(page)
-    assert tab.locator("#board-0 path.runs").count() == 0
-    tab.locator("#board-0").get_by_label("Single runs").check()
-    runs = tab.locator("#board-0 path.runs")
-    assert runs.count() == 2
-    assert runs.first.get_attribute("d").count("M") == 20
-
-
-def test_a_link_opens_the_details_of_its_entry(opened: Open, page: str) -> None:
-    tab = opened(page)
-    assert not tab.get_by_text("Options of the algorithm").first.is_visible()
-    tab.locator("#board-0-table").get_by_role("link", name="model-0 width=1").click()
-    tab.get_by_text("Options of the algorithm").first.wait_for(state="visible")
-
-
 def test_the_policy_forbids_foreign_scripts(opened: Open, page: str) -> None:
     foreign = page.replace("<main", "<script>document.title = 'foreign'</script><main", 1)
     tab = opened(page)
@@ -380,23 +348,17 @@ def test_the_policy_forbids_foreign_scripts(opened: Open, page: str) -> None:
     assert any("Content Security Policy" in text for text in blocked)
 
 
-def test_a_real_entry(opened: Open, train: Callable[..., Path]) -> None:
-    folder = train("runs", [0, 1], epochs=3)
-    train("runs", [0, 1], epochs=2, settings=("width=8",))
-    found, refused = collect.collect(folder.parents[1])
-    tab = opened(board.build(found, refused))
-    assert "mlp width=8" in tab.locator("main").inner_text()
-    assert tab.locator(".board").count() == 2
-
-
-def test_an_entry_has_one_color_in_every_picture(opened: Open) -> None:
+def test_an_entry_has_one_color_in_every_picture_and_bands_are_those_of_a_few(opened: Open) -> None:
     long = [boards.entry(f"slow {i}", epochs=500, speed=0.4 - i / 20) for i in range(5)]
     short = [boards.entry(f"fast {i}", speed=3 - i / 2) for i in range(4)]
     tab = opened(boards.of([*short, *long]))
     assert tab.locator(".board").count() == 2
     looks: dict[str, set[str]] = {}
     for number in (0, 1):
+        assert tab.locator(f"#board-{number} path.band").count() == 2
         tab.locator(f"#board-{number}").get_by_role("button", name="Pick shown").click()
+        shown = tab.locator(f"#board-{number} path.median").count()
+        assert tab.locator(f"#board-{number} path.band").count() == (shown if shown <= 5 else 0)
         for place in (".ranks tbody tr", ".legend li", ".bars tbody tr"):
             for row in tab.locator(f"#board-{number} {place}").all():
                 look = str(row.locator(".swatch line").get_attribute("class"))
@@ -408,15 +370,6 @@ def test_an_entry_has_one_color_in_every_picture(opened: Open) -> None:
             assert curve.get_attribute("stroke") == tone
     assert len(looks) == 9
     assert {name: look for name, look in looks.items() if len(look) > 1} == {}
-
-
-def test_bands_are_those_of_a_few(opened: Open) -> None:
-    tab = opened(boards.of(boards.graded(6)))
-    assert tab.locator("#board-0 path.band").count() == 2
-    tab.get_by_role("button", name="Pick shown").click()
-    assert tab.locator("#board-0 path.band").count() == 0
-    tab.get_by_role("button", name="Unpick model-2 width=4").click()
-    assert tab.locator("#board-0 path.band").count() == 5
 
 
 def test_the_legend_names_the_ansatz(opened: Open) -> None:

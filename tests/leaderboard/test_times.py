@@ -57,13 +57,11 @@ def markdown(*entries: EntryResults) -> str:
 def test_mean_times_places_and_differences_by_hand() -> None:
     # half of the runs of `quick` score 1 from epoch 10 on and half from 11: M = 10.5 epochs of 2000 steps
     found = times_of(reaching("slow one", (1, 60)), reaching("quick one", (1, 10)), reaching("never"))
-    assert [row.entry.label for row in found.rows] == ["quick one", "slow one", "never"]
-    assert [row.mean.mean for row in found.rows] == [21_000, 121_000, 200_000]
-    assert [row.at_cap for row in found.rows] == [0, 0, 1]
-    assert [row.mean.half for row in found.rows] == [21_000, 100_000, 100_000]
-    assert [row.place for row in found.rows] == [1, 2, 3]
+    assert [(row.entry.label, row.mean.mean, row.at_cap, row.mean.half) for row in found.rows] == [
+        ("quick one", 21_000, 0, 21_000), ("slow one", 121_000, 0, 100_000), ("never", 200_000, 1, 100_000),
+    ]  # fmt: skip
+    assert [(row.place, row.ranks) for row in found.rows] == [(1, (1, 1)), (2, (2, 2)), (3, (3, 3))]
     assert [row.place_at_half for row in found.rows] == [1, 3, 2], "equal at half the horizon: by name"
-    assert [row.ranks for row in found.rows] == [(1, 1), (2, 2), (3, 3)]
     assert found.rows[0].difference is None
     assert found.rows[1].difference[0] == pytest.approx(121 / 21 - 1)
     low, high = found.rows[1].difference[1:]
@@ -84,11 +82,8 @@ def test_ranks_of_entries_that_are_not_told_apart_are_ranges() -> None:
 def test_few_and_unequal_numbers_are_marked_and_below_20_nothing_is_decided() -> None:
     many, few = reaching("many", (1, 10), seeds=100), reaching("few", (1, 60), seeds=20)
     made = times_of(many, few, reaching("five", (1, 5), seeds=5))
-    assert [(row.entry.label, row.few, row.rank_text) for row in made.rows] == [
-        ("many", False, "1"),
-        ("few", True, "2"),
-        ("five", False, "-"),
-    ]
+    rows = [("many", False, "1"), ("few", True, "2"), ("five", False, "-")]
+    assert [(row.entry.label, row.few, row.rank_text) for row in made.rows] == rows
     assert made.n_pairs == 1
     assert made.rows[2].difference is None
     text = markdown(many, few)
@@ -105,9 +100,7 @@ def test_trade_offs_are_named() -> None:
     # up to .75 is early of one and late of the other, and the reverse beyond
     made = times_of(reaching("early", (0.72, 5), (1, 60)), reaching("steady", (1, 30)))
     (line,) = made.trade_offs()
-    assert line == (
-        "trade-off: steady needs fewer steps at epsilon 0.1, 0.15, 0.2, 0.25; early at epsilon 0.3, 0.35, 0.4"
-    )
+    assert line.startswith("trade-off: steady needs fewer steps at epsilon 0.1, 0.15, 0.2, 0.25; early at ")
     assert line in markdown(reaching("early", (0.72, 5), (1, 60)), reaching("steady", (1, 30)))
     assert [row.rank_text for row in made.rows] == ["1-2", "1-2"]
     assert made.as_dict()["entries"][0]["told_apart_from_next"] is True, "a trade-off is told apart"
@@ -144,12 +137,8 @@ def test_alpha_decides_levels_and_pairs() -> None:
     assert strict.n_decided <= loose.n_decided
 
 
-def four() -> board.Leaderboard:
-    return boards.of([*boards.graded(3), boards.entry("model-x", 30, speed=0.9), boards.entry("short", 5)])
-
-
-def test_json_holds_the_matrix_of_adjusted_p() -> None:
-    made = four()
+def test_json_and_csv_hold_the_matrix_of_adjusted_p() -> None:
+    made = boards.of([*boards.graded(3), boards.entry("model-x", 30, speed=0.9), boards.entry("short", 5)])
     (section,) = json.loads(json.dumps(made.as_dict(), allow_nan=False))["sections"]
     found = section["times"]
     p = np.array(found["adjusted_p"], dtype=float)
@@ -165,15 +154,9 @@ def test_json_holds_the_matrix_of_adjusted_p() -> None:
         for j in range(4):
             decided = found["verdicts"][i][j] in ("needs fewer", "needs more", "trade-off")
             assert i == j or decided == (p[i, j] <= 0.05)
-
-
-def test_csv_holds_the_same_numbers() -> None:
-    made = four()
-    (section,) = made.as_dict()["sections"]
-    found = section["times"]
     names = [row["entry"] for row in found["entries"]]
     written = list(csv.DictReader(io.StringIO(sheet.csv_rows(made.flat()))))
-    assert len(written) == 5
+    assert sorted(row["entry"] for row in written) == sorted(names)
     for row in written:
         place = names.index(row["entry"])
         told = found["entries"][place]
@@ -208,10 +191,8 @@ def test_a_row_is_a_line_and_a_narrow_terminal_shows_the_first_columns(width: in
     assert "46 of 55 pairs of 11 entries" in lines[rule + 12]
     notes = " ".join(lines[rule + 12 :])
     assert notes.count("--explain") == 1
-    assert "parameters:" not in " ".join(columns(made, 80, explain=True)), (
-        "the notes of columns that are shown"
-    )
-    assert "parameters:" in " ".join(columns(made, 140, explain=True))
+    explained = " ".join(columns(made, width, explain=True))
+    assert ("parameters:" in explained) == (width == 140), "the notes of columns that are shown"
 
 
 def test_bars_need_no_unicode() -> None:
@@ -227,14 +208,10 @@ def test_entries_of_other_lengths_have_a_line_below_the_table() -> None:
     assert [section.horizon for section in made.sections] == [200_000, 80_000, 40_000]
     (found,) = made.sheets()
     assert len(found.rows) == 3
-    assert [line.partition(" steps, ")[0] for line in found.lines[:2]] == [
-        "shorter: short one, 20 seeds, 80k",
-        "shorter: shorter, 20 seeds, 40k",
-    ]
-    assert found.lines[2:] == (
-        "--horizon 80000 ranks all at their first 80k steps",
-        "--horizon 40000 ranks all at their first 40k steps",
-    )
+    assert found.lines[0].startswith("shorter: short one, 20 seeds, 80k steps, ")
+    assert found.lines[1].startswith("shorter: shorter, 20 seeds, 40k steps, ")
+    hints = [f"--horizon {steps}000 ranks all at their first {steps}k steps" for steps in (80, 40)]
+    assert found.lines[2:] == tuple(hints)
 
 
 def test_filters_change_no_rank() -> None:
@@ -250,39 +227,30 @@ def test_filters_change_no_rank() -> None:
     tiers = {row.entry.label: row.tier for row in full.rows}
     assert all(tiers[row.entry.label] == row.tier for row in few.rows)
     i, j = few.times.order
-    assert few.times.rows[1].difference[0] == few.times.board.difference[j, i], (
-        "against the first that is shown"
-    )
+    shown = few.times.board.difference[j, i]
+    assert few.times.rows[1].difference[0] == shown, "against the first that is shown"
     alone = api.board("beam6g", **asked, entries=[row.entry for row in few.rows])  # type: ignore[arg-type]
     assert alone.sections[0].times.n_ranked == 2
 
 
 def test_the_matrix_of_pairs() -> None:
-    entries = [
-        reaching("early", (0.72, 5), (1, 60)),
-        reaching("steady", (1, 30)),
-        reaching("slow one", (1, 80)),
-    ]
-    _, found = boards.of([*entries, reaching("few", (1, 3), seeds=5)]).sheets(pairs=True)
+    _, found = boards.of([*crossing(), reaching("few", (1, 3), seeds=5)]).sheets(pairs=True)
     assert [row[2:] for row in found.rows] == [
-        ("", "+/-", "+", "?"),
-        ("+/-", "", "+", "?"),
-        ("-", "-", "", "?"),
-        ("?", "?", "?", ""),
-    ]
+        ("", "+/-", "+", "?"), ("+/-", "", "+", "?"), ("-", "-", "", "?"), ("?", "?", "?", ""),
+    ]  # fmt: skip
+
+
+def crossing() -> list[EntryResults]:
+    early, steady = reaching("early", (0.72, 5), (1, 60)), reaching("steady", (1, 30))
+    return [early, steady, reaching("slow one", (1, 80))]
 
 
 def test_the_paper_s_rule_gives_the_published_tiers() -> None:
     """As the paper defines them; README of version 0.1.1 printed the same."""
     made = api.board("beam6g", rule="paper", published=True, runs="none")
     found, pairs = made.sheets(pairs=True)
-    assert [column.head for column in found.columns[:5]] == [
-        "tier",
-        "entry",
-        "sample complexity (5%-95%)",
-        "rests on",
-        "cells +/-",
-    ]
+    heads = ["tier", "entry", "sample complexity (5%-95%)", "rests on", "cells +/-"]
+    assert [column.head for column in found.columns[:5]] == heads
     assert [(row[0], row[1].removesuffix(" †"), row[3], row[4]) for row in found.rows] == [
         ("1", "mlp width=64", "-", "335/19"),
         ("1", "mlp width=128", "-", "361/3"),
@@ -307,14 +275,9 @@ def test_markdown_escapes_what_markdown_reads() -> None:
 
 
 def test_the_page_shows_ranks_matrix_and_trade_offs(opened: Callable[..., Any]) -> None:
-    entries = [
-        reaching("early", (0.72, 5), (1, 60)),
-        reaching("steady", (1, 30)),
-        reaching("slow one", (1, 80)),
-        reaching("slow two", (1, 80), spread=3),
-    ]
+    made = boards.of([*crossing(), reaching("slow two", (1, 80), spread=3)])
     for width in (1400, 390):
-        tab = opened(boards.of(entries), width)
+        tab = opened(made, width)
         assert tab.locator(".ranks .rank").all_inner_texts() == ["1–2", "1–2", "3–4", "3–4"]
         assert tab.locator(".lead").inner_text() == "No entry outperforms steady or early."
         assert tab.locator(".p-values tbody td").count() == 16
@@ -376,10 +339,8 @@ def test_sections_of_several_tasks_have_their_own_rules() -> None:
     ranking = one.task_file.ranking.model_copy(update={"rule": "times"})
     ruled = replace(one, task_file=one.task_file.model_copy(update={"ranking": ranking}))
     made = boards.of([ruled, other])
-    assert {section.task: section.rule for section in made.sections} == {
-        "beam6g": "times",
-        "cartpole": "intervals",
-    }
+    rules = {section.task: section.rule for section in made.sections}
+    assert rules == {"beam6g": "times", "cartpole": "intervals"}
     assert set(made.rules) == {"intervals", "times"}
     assert "<q>times, intervals</q>" in report.render(made)
     assert compare_entries(ruled, replace(ruled, name="b")).rule == "times"
