@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import re
 
-import gymnasium
 import numpy as np
 import pytest
 
 from qrlsuite.errors import OptionError
 from qrlsuite.options import plain
-from qrlsuite.plugins.environments.beam6g import ID
+from qrlsuite.plugins.environments.beam6g import BeamManagement6G
 from qrlsuite.plugins.environments.beam6g.options import MAIN, BeamOptions, parse
 
 HERE = ((1.0, 1.0), (1.0, 0.0))
@@ -46,7 +45,7 @@ def test_bad_values(values, message):
 
 def test_unknown_render_mode():
     with pytest.raises(OptionError, match="render_mode = 'html': Input should be 'human' or 'rgb_array' or"):
-        gymnasium.make(ID, render_mode="html")
+        BeamManagement6G(render_mode="html")
 
 
 def test_orientations_are_normalized_and_then_stay_as_they_are():
