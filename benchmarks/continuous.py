@@ -1,20 +1,26 @@
-"""Continuous actions on Pendulum-v1, side by side with Stable-Baselines3's SAC, TD3 and PPO at equal settings.
+"""Continuous actions and memory, side by side with Stable-Baselines3 and sb3-contrib at equal settings.
 
     pip install 'qrlsuite[bench]'
-    python benchmarks/continuous.py [--algorithms sac td3 ppo] [--seeds 5] [--epochs 10] [--json out.json]
+    python benchmarks/continuous.py [--algorithms sac td3 ppo lstm] [--seeds 5] [--epochs 10] [--json out.json]
 
-Every agent has the same network (two hidden layers of 64 rectifiers, torch's own initialization), learning rate,
-discount, batch, replay buffer, gradient steps per interaction and noise; it learns from one environment of the task
-`pendulum`, and every 1000 interactions it plays the same 20 greedy episodes as its peers. Settings are the defaults and
-presets of the task. PPO's are those of RL Baselines3 Zoo with minibatches of 50, which divide 1000 samples; what its
-peer does otherwise is switched to what the suite does: no clipping of gradients, ReLU and torch's initialization, and
-actions rescaled to -1 .. 1, as the suite's networks have them. SAC and TD3 of the peer do that themselves.
+SAC, TD3 and PPO learn Pendulum-v1. Every agent has the same network (two hidden layers of 64 rectifiers, torch's own
+initialization), learning rate, discount, batch, replay buffer, gradient steps per interaction and noise; it learns from
+one environment of the task `pendulum`, and every 1000 interactions it plays the same 20 greedy episodes as its peers.
+Settings are the defaults and presets of the task. PPO's are those of RL Baselines3 Zoo with minibatches of 50, which
+divide 1000 samples; what its peer does otherwise is switched to what the suite does: no clipping of gradients, ReLU and
+torch's initialization, and actions rescaled to -1 .. 1, as the suite's networks have them. SAC and TD3 of the peer do
+that themselves.
+
+`lstm` is PPO with memory beside RecurrentPPO of sb3-contrib, on CartPole-v1 without velocities (`cartpole-hidden`), in
+four environments: an LSTM of 64 numbers and a linear layer, for actor and critic each, and minibatches of 125 steps.
+Those of its peer follow each other in one environment or two, and are cut where episodes end; ours are five sequences
+of 25 steps from anywhere.
 
 Printed are the measures of `benchmarks/learning.py`: medians over seeds and, in brackets, their 5th to 95th bootstrap
-percentiles (whole runs resampled, 10,000 times), interactions until a mean return first reaches -500 and -200, the mean
-of the whole curve, the last mean return, and seconds of processor time per seed spent on learning, without evaluation.
-Differences are ours minus theirs. One thread; all seeds of the suite are trained together, those of its peer one after
-another.
+percentiles (whole runs resampled, 10,000 times), interactions until a mean return first reaches -500 and -200 (with
+memory a mean score of 0.2 and 0.5), the mean of the whole curve, the last mean return or score, and seconds of
+processor time per seed spent on learning, without evaluation. Differences are ours minus theirs. One thread; all seeds
+of the suite are trained together, those of its peer one after another.
 """
 
 from __future__ import annotations
@@ -40,8 +46,16 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.training.trainer import Trainer, play_episodes
 
-learning.THRESHOLDS = (-500, -200)
-SETTINGS = {"sac": [], "td3": [], "ppo": ["batch=50"]}
+MEMORY = [
+    "width=64",
+    "gamma=.98",
+    "gae_lambda=.8",
+    "clip=.2",
+    "entropy_coefficient=0",
+    "batch=125",
+    "length=25",
+]
+SETTINGS = {"sac": [], "td3": [], "ppo": ["batch=50"], "lstm": MEMORY}
 
 
 def validated(trainer: Trainer, act: Callable[..., Any], epoch: int) -> FloatArray:
@@ -59,7 +73,7 @@ def ours(entry: Entry, seeds: range, epochs: int) -> Runs:
     seconds, scores = 0.0, []
     for epoch in range(epochs):
         begun = time.process_time()
-        trainer.algorithm.train_epoch(learning.INTERACTIONS)
+        trainer.algorithm.train_epoch(learning.INTERACTIONS // trainer.E)
         seconds += time.process_time() - begun
         scores.append(validated(trainer, trainer.act, epoch + 1))
     return Runs(f"qrlsuite {entry.algorithm.name}", np.stack(scores, axis=1), seconds / len(seeds))
@@ -70,24 +84,54 @@ def theirs(name: str, make: Callable[[Any, int], Any], entry: Entry, seeds: rang
     seconds, curves = 0.0, []
     for seed in seeds:
         referee = Trainer(entry, [seed])  # whose validation episodes are played
-        environment = gymnasium.make("Pendulum-v1")
-        if entry.algorithm.name == "ppo":
-            environment = gymnasium.wrappers.RescaleAction(environment, np.float32(-1), np.float32(1))
-        agent = make(environment, seed)
-        factor = 2.0 if entry.algorithm.name == "ppo" else 1.0
+        agent = make(environment(entry), seed)
+        factor = 2.0 if entry.algorithm.name == "ppo" and not hidden(entry) else None
+        kept: list[Any] = [None]
 
-        def act(observations: Any, agent: Any = agent, factor: float = factor) -> Any:
-            actions, _ = agent.predict(observations, deterministic=True)
-            return (factor * np.asarray(actions)).astype(np.float32)
+        def act(
+            observations: Any,
+            begins: Any,
+            infos: Any,
+            agent: Any = agent,
+            factor: Any = factor,
+            kept: Any = kept,
+        ) -> Any:
+            actions, kept[0] = agent.predict(observations, kept[0], begins, deterministic=True)
+            return actions if factor is None else (factor * np.asarray(actions)).astype(np.float32)
 
         scores = []
         for epoch in range(epochs):
             begun = time.process_time()
             agent.learn(learning.INTERACTIONS, reset_num_timesteps=False)
             seconds += time.process_time() - begun
+            kept[0] = None
             scores.append(float(validated(referee, act, epoch + 1)[0]))
         curves.append(scores)
     return Runs(name, np.array(curves), seconds / len(seeds))
+
+
+def hidden(entry: Entry) -> bool:
+    """Return whether an entry has to remember."""
+    return entry.task.name == "cartpole-hidden"
+
+
+def environment(entry: Entry) -> Any:
+    """Return what a peer learns from."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    if not hidden(entry):
+        made = gymnasium.make("Pendulum-v1")
+        if entry.algorithm.name == "ppo":
+            made = gymnasium.wrappers.RescaleAction(made, np.float32(-1), np.float32(1))
+        return made
+
+    def cartpole() -> Any:
+        whole, shown = gymnasium.make("CartPole-v1"), [0, 2]
+        space = whole.observation_space
+        part = gymnasium.spaces.Box(space.low[shown], space.high[shown])
+        return gymnasium.wrappers.TransformObservation(whole, lambda seen: seen[shown], part)
+
+    return DummyVecEnv([cartpole] * entry.task.file.protocol.environments)
 
 
 def peer(entry: Entry) -> Callable[[Any, int], Any]:
@@ -96,7 +140,7 @@ def peer(entry: Entry) -> Callable[[Any, int], Any]:
     from stable_baselines3.common.noise import NormalActionNoise
 
     o, network = entry.algorithm_options, entry.model_options
-    layers = [network.width] * network.depth
+    layers = [network.width] * getattr(network, "depth", 0)
     common = {"learning_rate": o.lr, "gamma": o.gamma, "batch_size": o.batch, "device": "cpu"}
     if entry.algorithm.name == "ppo":
         policy: dict[str, Any] = {
@@ -106,7 +150,7 @@ def peer(entry: Entry) -> Callable[[Any, int], Any]:
             "optimizer_kwargs": {"eps": 1e-8},
         }
         common |= {
-            "n_steps": learning.INTERACTIONS,
+            "n_steps": learning.INTERACTIONS // entry.task.file.protocol.environments,
             "n_epochs": o.repeats,
             "gae_lambda": o.gae_lambda,
             "clip_range": o.clip,
@@ -114,6 +158,13 @@ def peer(entry: Entry) -> Callable[[Any, int], Any]:
             "vf_coef": o.value_coefficient,
             "max_grad_norm": float("inf"),
         }
+        if hidden(entry):
+            from sb3_contrib import RecurrentPPO
+
+            policy["lstm_hidden_size"] = network.width
+            return lambda made, seed: RecurrentPPO(
+                "MlpLstmPolicy", made, policy_kwargs=policy, seed=seed, **common
+            )
     else:
         policy = {"net_arch": layers, "activation_fn": torch.nn.ReLU}
         common |= {
@@ -131,7 +182,7 @@ def peer(entry: Entry) -> Callable[[Any, int], Any]:
             "action_noise": NormalActionNoise(np.zeros(1), np.full(1, o.noise)),
         }
     cls = {"sac": sb3.SAC, "td3": sb3.TD3, "ppo": sb3.PPO}[entry.algorithm.name]
-    return lambda environment, seed: cls("MlpPolicy", environment, policy_kwargs=policy, seed=seed, **common)
+    return lambda made, seed: cls("MlpPolicy", made, policy_kwargs=policy, seed=seed, **common)
 
 
 def main() -> None:
@@ -148,8 +199,10 @@ def main() -> None:
     seeds, stored = range(arguments.seeds), {}
     for algorithm in arguments.algorithms:
         settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *arguments.set]]
-        entry = resolve("pendulum", "mlp", algorithm, settings)
-        name = f"SB3 {algorithm.upper()}"
+        names = ("cartpole-hidden", "lstm", "ppo") if algorithm == "lstm" else ("pendulum", "mlp", algorithm)
+        entry = resolve(*names, settings)
+        learning.THRESHOLDS = (0.2, 0.5) if algorithm == "lstm" else (-500, -200)
+        name = "RecurrentPPO" if algorithm == "lstm" else f"SB3 {algorithm.upper()}"
         all_runs = [
             ours(entry, seeds, arguments.epochs),
             theirs(name, peer(entry), entry, seeds, arguments.epochs),

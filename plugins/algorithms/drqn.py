@@ -37,12 +37,12 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from torch import Tensor, nn
+from torch import Tensor
 
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers
+from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
 from qrlsuite.seeding import Streams
 
 
@@ -174,30 +174,6 @@ class DRQN:
         seeds = torch.arange(self.S, device=self.device)[:, None, None]
         return self.buffer[seeds, lane[..., None], steps]
 
-    def _unroll(
-        self, network: nn.Module, seen: Tensor, begins: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Show a network sequences (S, B, K, obs).
-
-        Parameters
-        ----------
-        begins:
-            1 where an episode begins (S, B, K).
-        state:
-            What is remembered before (S, B, M).
-
-        Returns
-        -------
-        tuple
-            Values (S, B, K, actions), and what is remembered after every step (S, B, K, M).
-        """
-        values, states = [], []
-        for k in range(seen.shape[2]):
-            each, state = remember(network, seen[:, :, k].contiguous(), state * (1.0 - begins[:, :, k, None]))
-            values.append(each)
-            states.append(state)
-        return torch.stack(values, 2), torch.stack(states, 2)
-
     def _learn(self, rows: Tensor) -> Tensor:
         """Make one Adam step of every agent on its sequences (S, B, L, columns); returns the losses (S,)."""
         o, d = self.options, self.obs_dim
@@ -208,12 +184,10 @@ class DRQN:
         start = nothing
         with torch.no_grad():
             if o.burn_in:
-                _, before = self._unroll(
-                    self.online, seen[:, :, : o.burn_in], begins[:, :, : o.burn_in], nothing
-                )
+                _, before = unroll(self.online, seen[:, :, : o.burn_in], begins[:, :, : o.burn_in], nothing)
                 start = before[:, :, -1]
-            _, behind = self._unroll(self.target, seen, begins, nothing)
-        values, states = self._unroll(self.online, seen[:, :, new], begins[:, :, new], start)
+            _, behind = unroll(self.target, seen, begins, nothing)
+        values, states = unroll(self.online, seen[:, :, new], begins[:, :, new], start)
         flat = (self.S, rows.shape[1] * o.length, -1)
         with torch.no_grad():
             beyond = following[:, :, new].reshape(flat)

@@ -27,6 +27,17 @@ The actor's outputs are pi by the kind of the environment's actions:
 Rollouts run across the ends of episodes and are cut where the epoch ends; what would have followed is estimated by
 the critic, there and where a time limit truncated an episode, not where one terminated.
 
+*Models that remember* (`qrlsuite.population.remembers`) see an episode's observations one by one; pi and V depend on
+what they remember, too: s_t stands for both. The samples of a minibatch are then sequences of `length` consecutive
+steps of one environment, `batch` / `length` of them. A sequence begins with what was remembered there when it was
+collected, as in sb3-contrib's RecurrentPPO, and as the "stored state" of Kapturowski et al. (2019), who replay;
+gradients reach back to its first step. Where an episode begins, what is remembered becomes 0. Where `length` does not
+divide T, some sequences overlap, so that all are equally long. RecurrentPPO cuts them at the ends of episodes and pads.
+
+With `repeats=1` and a `batch` of all samples, the ratio is 1 and nothing is clipped: one step per epoch along the
+gradient of - mean log pi(a|s) A, which is that of A2C (Mnih et al. 2016, arXiv:1602.01783, algorithm S3; Huang et al.
+2022, arXiv:2205.09123), with generalized, normalized advantages.
+
 Deviations from the paper (its algorithm 'Estimating the Sample Complexity of PPO' and its table of hyperparameters):
 - The paper's epoch is one whole episode of each environment. Ours is as many steps, so that every agent learns from
   equally many samples whatever the lengths of its episodes; with 200 steps per episode and environment the two agree.
@@ -54,7 +65,7 @@ from qrlsuite.actions import from_units, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed
+from qrlsuite.population import Adam, by_seed, part, prefixed, remember, remembers, unroll
 from qrlsuite.seeding import Streams
 
 FloatArray = NDArray[np.float64]
@@ -81,6 +92,11 @@ class PPOOptions:
     clip: Annotated[float, Field(gt=0, description="ratios beyond 1 - clip and 1 + clip earn nothing")] = 0.1
     repeats: Annotated[int, Field(ge=1, description="passes over an epoch's samples")] = 10
     batch: Annotated[int, Field(ge=2, description="samples per gradient step")] = 64
+    length: Annotated[
+        int,
+        Field(ge=1, description="steps of a sequence that models that remember learn from"),
+        Since("0.2.0"),
+    ] = 16
     value_coefficient: Annotated[float, Field(ge=0, description="weight of the squared value error")] = 0.5
     entropy_coefficient: Annotated[float, Field(ge=0, description="weight of the policy's entropy")] = 0.01
     validation: Annotated[
@@ -208,6 +224,10 @@ class Rollout(NamedTuple):
     """(S, N, numbers): of a box u, before it was clipped, else int64"""
     log_probs: Tensor
     """Of the actions, under the policy that chose them (S, N)."""
+    begins: Tensor
+    """1 where an episode begins with the state (S, N)."""
+    remembered: Tensor
+    """What the actor remembered before it saw the state (S, N, M)."""
     rewards: FloatArray
     """(S, T, E), as the two below"""
     terminated: NDArray[np.bool_]
@@ -281,13 +301,22 @@ class PPO:
             self.adams.append(self.spread_adam)
         self.epoch = 0
         self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
+        self.begins = torch.ones((self.S, self.E), device=device)
+        self.actor_memory, self.critic_memory = (self._nothing(n, self.E) for n in (self.actor, self.critic))
+        self.remembers = remembers(self.actor) + remembers(self.critic) > 0
+        self.validation_memory = self._nothing(self.actor, 0)  # no part of training
         self._validation: list[np.random.Generator] = []
         self.draws = options.validation == "sampled"
+
+    def _nothing(self, network: nn.Module, lanes: int) -> Tensor:
+        """Return what a network remembers where episodes begin (S, lanes, M)."""
+        return torch.zeros((self.S, lanes, remembers(network)), device=self.device)
 
     def start(self) -> None:
         """Reset the environments."""
         first, _ = self.envs.reset()
         self.observations = by_seed(first, self.S, self.device)
+        self.begins = torch.ones((self.S, self.E), device=self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Collect `rounds` steps of every environment and learn from them.
@@ -296,27 +325,46 @@ class PPO:
         `entropy` and `kl`, an estimate of how far the policy has moved from the one that collected the samples.
         """
         rollout = self._collect(rounds)
-        advantages, returns = self._estimate(rollout)
+        advantages, returns, critic_remembered = self._estimate(rollout)
         states = rollout.states.reshape(-1, self.obs_dim)
         # one row per quantity and not one per sample: every minibatch column is then contiguous
-        columns = torch.stack([rollout.log_probs, advantages, returns]).view(3, -1)
+        columns = torch.stack([rollout.log_probs, advantages, returns, rollout.begins]).view(4, -1)
         actions = rollout.actions.reshape(-1, self.policy.numbers)
-        samples = rounds * self.E
+        memories = [each.flatten(0, 1) for each in (rollout.remembered, critic_remembered)]
+        sequences = self._sequences(rounds)
+        length = sequences.shape[1]
         total = torch.zeros((4, self.S), device=self.device)
         steps = 0
-        for order in self._orders(samples):  # (S, N), into the flattened S x N samples
-            for piece in minibatches(samples, self.options.batch):
-                picked = order[:, piece].reshape(-1)
+        for order in self._orders(len(sequences) // self.S):  # (S, n), into the flattened S x n sequences
+            for piece in minibatches(order.shape[1], max(1, self.options.batch // length)):
+                chosen = sequences[order[:, piece].reshape(-1)]
+                picked = chosen.reshape(-1)
+                *judged, begins = columns.index_select(1, picked).view(4, self.S, -1)
+                per_agent = (self.S, len(chosen) // self.S)
                 total += self._learn(
                     states.index_select(0, picked).view(self.S, -1, self.obs_dim),
                     actions.index_select(0, picked).view(self.S, -1, self.policy.numbers),
-                    *columns.index_select(1, picked).view(3, self.S, -1),
+                    *judged,
+                    begins.view(*per_agent, length),
+                    *(
+                        each.index_select(0, chosen[:, 0]).view(*per_agent, each.shape[1])
+                        for each in memories
+                    ),
                 )
                 steps += 1
         self.epoch += 1
         self._validation = []
         means = (total.to(torch.float64) / steps).cpu().numpy()
         return dict(zip(("policy_loss", "value_loss", "entropy", "kl"), means))
+
+    def _sequences(self, rounds: int) -> Tensor:
+        """Return the samples of all sequences (S x n, length), numbered through the flattened S x N samples."""
+        length = min(self.options.length, rounds) if self.remembers else 1
+        first = np.linspace(0, rounds - length, -(-rounds // length)).round().astype(np.int64)
+        step = first[:, None, None] + np.arange(length)  # (n / E, 1, length)
+        samples = (step * self.E + np.arange(self.E)[:, None]).reshape(-1, length)
+        offset = np.arange(self.S)[:, None, None] * rounds * self.E
+        return torch.from_numpy((samples + offset).reshape(-1, length)).to(self.device)
 
     def _orders(self, samples: int) -> Tensor:
         """Draw every pass's order (repeats, S, N); positions count through the flattened S x N samples."""
@@ -335,13 +383,15 @@ class PPO:
         states = torch.empty((*shape, self.obs_dim), device=self.device)
         arrivals = torch.empty_like(states)
         outputs = torch.empty((*shape, self.policy.outputs), device=self.device)
-        chosen = []
+        begins = torch.empty(shape, device=self.device)
+        chosen, remembered = [], []
         rewards = np.empty(shape)
         terminated, truncated = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         for k in range(rounds):
-            states[:, k] = self.observations
+            states[:, k], begins[:, k] = self.observations, self.begins
+            remembered.append(self.actor_memory * (1.0 - self.begins)[..., None])
             with torch.no_grad():
-                outputs[:, k] = self.actor(self.observations)
+                outputs[:, k], self.actor_memory = remember(self.actor, self.observations, remembered[k])
                 chosen.append(self.policy.draw(outputs[:, k], noise[:, k]))
             lanes = self.policy.lanes(chosen[k].reshape(self.S * self.E, -1))
             after, reward, terminal, limit, infos = self.envs.step(lanes)
@@ -350,6 +400,7 @@ class PPO:
             rewards[:, k] = np.reshape(reward, (self.S, self.E))
             terminated[:, k] = np.reshape(terminal, (self.S, self.E))
             truncated[:, k] = np.reshape(limit, (self.S, self.E))
+            self.begins = by_seed(terminal | limit, self.S, self.device)[..., 0]
         actions = torch.stack(chosen, 1)  # (S, rounds, E, numbers)
         samples = (self.S, rounds * self.E)
         with torch.no_grad():
@@ -359,16 +410,22 @@ class PPO:
             arrivals.view(*samples, -1),
             actions.view(*samples, -1),
             log_probs.view(samples),
+            begins.view(samples),
+            torch.stack(remembered, 1).flatten(1, 2),
             rewards,
             terminated,
             truncated,
         )
 
-    def _estimate(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
-        """Return advantages A and returns R of the samples, both (S, N)."""
+    def _estimate(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
+        """Return A and R of the samples, both (S, N), and what the critic remembered before each (S, N, M)."""
         o, shape = self.options, rollout.rewards.shape
-        values = self._values(rollout.states).reshape(shape)
-        following = self._values(rollout.arrived).reshape(shape)
+        if remembers(self.critic):
+            values, following, remembered = self._values_in_order(rollout)
+        else:
+            values, following = (self._values(states) for states in (rollout.states, rollout.arrived))
+            remembered = rollout.states[..., :0]
+        values, following = values.reshape(shape), following.reshape(shape)
         advantages = generalized_advantages(
             rollout.rewards,
             values,
@@ -380,7 +437,22 @@ class PPO:
         )
         both = np.stack([advantages, advantages + values]).astype(np.float32).reshape(2, self.S, -1)
         first, second = torch.from_numpy(both).to(self.device)
-        return first, second
+        return first, second, remembered
+
+    @torch.no_grad()
+    def _values_in_order(self, rollout: Rollout) -> tuple[FloatArray, FloatArray, Tensor]:
+        """Show the critic every environment's steps; returns V(s) and V(s') (S, N), and its memory before (S, N, M)."""
+        S, T, E = rollout.rewards.shape
+        states, begins = rollout.states.view(S, T, E, -1), rollout.begins.view(S, T, E)
+        values, after = unroll(
+            self.critic, states.transpose(1, 2), begins.transpose(1, 2), self.critic_memory
+        )
+        before = torch.cat([self.critic_memory[:, :, None], after[:, :, :-1]], 2).transpose(1, 2)
+        self.critic_memory = after[:, :, -1]
+        following, _ = remember(self.critic, rollout.arrived, after.transpose(1, 2).reshape(S, T * E, -1))
+        both = (each.to(torch.float64).cpu().numpy() for each in (values.transpose(1, 2), following))
+        remembered = before * (1.0 - begins)[..., None]
+        return next(both), next(both), remembered.reshape(S, T * E, -1)
 
     @torch.no_grad()
     def _values(self, states: Tensor) -> FloatArray:
@@ -391,7 +463,13 @@ class PPO:
         return result
 
     def _learn(
-        self, states: Tensor, actions: Tensor, old_log_probs: Tensor, advantages: Tensor, returns: Tensor
+        self,
+        states: Tensor,
+        actions: Tensor,
+        old_log_probs: Tensor,
+        advantages: Tensor,
+        returns: Tensor,
+        *memory: Tensor,
     ) -> Tensor:
         """Make one Adam step of every agent on its minibatch of B samples.
 
@@ -403,6 +481,9 @@ class PPO:
             (S, B, numbers).
         old_log_probs, advantages, returns:
             (S, B).
+        memory:
+            Of models that remember: where episodes begin in each sequence (S, B / length, length), and what actor and
+            critic remembered before it, both (S, B / length, M).
 
         Returns
         -------
@@ -410,29 +491,45 @@ class PPO:
             Policy loss, value loss, entropy and divergence (4, S).
         """
         o = self.options
-        log_probs, entropies = self.policy.judge(self.actor(states), actions)
+        log_probs, entropies = self.policy.judge(_outputs(self.actor, states, *memory[:2]), actions)
         log_ratio = log_probs - old_log_probs
         ratio = log_ratio.exp()
         a = _normalized(advantages)
         policy_loss = -torch.minimum(ratio * a, ratio.clamp(1.0 - o.clip, 1.0 + o.clip) * a).mean(1)
-        value_loss = (self.critic(states).squeeze(2) - returns).square().mean(1)
+        value_loss = (_outputs(self.critic, states, *memory[::2]).squeeze(2) - returns).square().mean(1)
         entropy = entropies.mean(1)
         losses = policy_loss + o.value_coefficient * value_loss - o.entropy_coefficient * entropy
         for adam in self.adams:
             adam.zero_grad()
-        losses.sum().backward()
+        torch.autograd.backward(losses.sum())
         for adam in self.adams:
             adam.step()
         with torch.no_grad():
             return torch.stack([policy_loss, value_loss, entropy, -log_ratio.mean(1)])
 
     @torch.no_grad()
-    def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+    def act(
+        self,
+        observations: NDArray[np.float32],
+        begins: NDArray[np.bool_] | None = None,
+        infos: Mapping[str, Any] | None = None,
+    ) -> NDArray[Any]:
         """Return actions (S, B, ...) for observations (S, B, obs), as the option `validation` says.
 
         Drawn actions come from one stream per seed and epoch, in the order of the calls since the epoch ended.
+
+        Parameters
+        ----------
+        begins:
+            Where an episode begins with the observation (S, B); None: everywhere.
         """
-        outputs = self.actor(torch.from_numpy(observations).to(self.device))
+        seen = torch.from_numpy(observations).to(self.device)
+        if begins is None or self.validation_memory.shape[1] != seen.shape[1]:  # or other lanes than before
+            self.validation_memory = self._nothing(self.actor, seen.shape[1])
+        else:
+            going_on = torch.from_numpy(~begins).to(self.device)[..., None]
+            self.validation_memory = self.validation_memory * going_on
+        outputs, self.validation_memory = remember(self.actor, seen, self.validation_memory)
         if not self.draws:
             return self.policy.lanes(self.policy.best(outputs))
         if not self._validation:
@@ -450,7 +547,12 @@ class PPO:
         return prefixed(**{prefix: self.policy.state_dict()}) if isinstance(self.policy, Gaussian) else {}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return networks, optimizers, current observations and the epoch, seed-first."""
+        """Return networks, optimizers, current observations, what is remembered of them, and the epoch, seed-first."""
+        remembered = {
+            "begins": self.begins,
+            "actor_memory": self.actor_memory,
+            "critic_memory": self.critic_memory,
+        }
         return {
             **prefixed(
                 actor=self.actor.state_dict(),
@@ -465,6 +567,7 @@ class PPO:
                 else {}
             ),
             "observations": self.observations,
+            **(remembered if self.remembers else {}),
             "epoch": torch.full((self.S,), self.epoch, dtype=torch.int64),
         }
 
@@ -478,8 +581,23 @@ class PPO:
             self.policy.load_state_dict(part(state, "spread"))
             self.spread_adam.load_state_dict(part(state, "spread_adam"))
         self.observations = state["observations"].clone().to(self.device)
+        if self.remembers:
+            self.begins, self.actor_memory, self.critic_memory = (
+                state[name].clone().to(self.device) for name in ("begins", "actor_memory", "critic_memory")
+            )
         self.epoch = int(state["epoch"][0])
         self._validation = []
+
+
+def _outputs(
+    network: nn.Module, states: Tensor, begins: Tensor | None = None, remembered: Tensor | None = None
+) -> Tensor:
+    """Return a network's outputs (S, B, out) for states (S, B, obs), which are sequences where it remembers."""
+    if not remembers(network) or begins is None or remembered is None:
+        outputs: Tensor = network(states)
+        return outputs
+    sequences = states.view(*begins.shape, -1)
+    return unroll(network, sequences, begins, remembered)[0].flatten(1, 2)
 
 
 def _normalized(advantages: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
                 family="classical",
                 options="qrlsuite.plugins.models.recurrent:RecurrentOptions",
                 build=f"qrlsuite.plugins.models.recurrent:{name}",
+                population="qrlsuite.plugins.models.recurrent:population",
                 memory="qrlsuite.plugins.models.recurrent:memory",
             )
         )

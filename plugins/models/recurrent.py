@@ -29,6 +29,7 @@ sum of two biases stands for every b.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -37,6 +38,10 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.options import Tuned
+from qrlsuite.population import StackedPopulation, linear
+
+Layer = Callable[[str, Tensor], Tensor]
+"""Computes a linear layer by its name."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -52,6 +57,13 @@ class RecurrentOptions:
 def gate(x: Tensor) -> Tensor:
     """Return the logistic function of x, with the same bits wherever in a vector a number stands."""
     return 0.5 * (1.0 + torch.tanh(0.5 * x))
+
+
+def lstm_step(parts: Tensor, before: Tensor) -> Tensor:
+    """Return h' and m' (..., 2 width) by what i, f, g and o are functions of (..., 4 width), and by h and m."""
+    i, f, g, o = torch.chunk(parts, 4, -1)
+    kept = gate(f) * before[..., before.shape[-1] // 2 :] + gate(i) * torch.tanh(g)
+    return torch.cat([gate(o) * torch.tanh(kept), kept], -1)
 
 
 class _Unit(nn.Module):
@@ -78,13 +90,22 @@ class _Unit(nn.Module):
 
     def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
         """Return outputs and the next state; without a state those outputs alone that an episode begins with."""
-        before = x.new_zeros((*x.shape[:-1], self.remembers)) if state is None else state
-        after = self.step(x * self.options.input_scale, before)
-        outputs = self.last(after[..., : self.options.width])
+        return self.compute(lambda name, inner: self.get_submodule(name)(inner), x, state, self.options)
+
+    @classmethod
+    def compute(cls, layer: Layer, x: Tensor, state: Tensor | None, options: RecurrentOptions) -> Any:
+        """Return what `forward` does, of one agent or of S, by their layers."""
+        width = options.width
+        before = x.new_zeros((*x.shape[:-1], cls.states * width)) if state is None else state
+        after = cls.step(
+            layer("from_input", x * options.input_scale), layer("from_state", before[..., :width]), before
+        )
+        outputs = layer("last", after[..., :width])
         return outputs if state is None else (outputs, after)
 
-    def step(self, x: Tensor, before: Tensor) -> Tensor:
-        """Return the next state (B, remembers); h comes first in it."""
+    @classmethod
+    def step(cls, seen: Tensor, shown: Tensor, before: Tensor) -> Tensor:
+        """Return the next state, in which h comes first, by what the layers make of x and of h."""
         raise NotImplementedError
 
 
@@ -93,13 +114,12 @@ class GRU(_Unit):
 
     parts, states = 3, 1
 
-    def step(self, x: Tensor, before: Tensor) -> Tensor:
+    @classmethod
+    def step(cls, seen: Tensor, shown: Tensor, before: Tensor) -> Tensor:
         """Return h'."""
-        xr, xz, xc = torch.chunk(self.from_input(x), 3, -1)
-        hr, hz, hc = torch.chunk(self.from_state(before), 3, -1)
-        r, z = gate(xr + hr), gate(xz + hz)
-        candidate = torch.tanh(xc + r * hc)
-        return candidate + z * (before - candidate)
+        (xr, xz, xc), (hr, hz, hc) = torch.chunk(seen, 3, -1), torch.chunk(shown, 3, -1)
+        candidate = torch.tanh(xc + gate(xr + hr) * hc)
+        return candidate + gate(xz + hz) * (before - candidate)
 
 
 class LSTM(_Unit):
@@ -107,12 +127,27 @@ class LSTM(_Unit):
 
     parts, states = 4, 2
 
-    def step(self, x: Tensor, before: Tensor) -> Tensor:
+    @classmethod
+    def step(cls, seen: Tensor, shown: Tensor, before: Tensor) -> Tensor:
         """Return h' and m'."""
-        h, m = torch.chunk(before, 2, -1)
-        i, f, g, o = torch.chunk(self.from_input(x) + self.from_state(h), 4, -1)
-        kept = gate(f) * m + gate(i) * torch.tanh(g)
-        return torch.cat([gate(o) * torch.tanh(kept), kept], -1)
+        return lstm_step(seen + shown, before)
+
+
+class UnitPopulation(StackedPopulation):
+    """S units, (S, B, in) and a state (S, B, remembers), in products of stacked matrices."""
+
+    def __init__(self, modules: Sequence[_Unit], options: RecurrentOptions) -> None:
+        super().__init__(modules)
+        self.compute, self.options = modules[0].compute, options
+
+    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
+        """Return outputs (S, B, out), and with a state the next one."""
+        layers = self._modules
+        return self.compute(lambda name, inner: _of_all(layers[name], inner), x, state, self.options)
+
+
+def _of_all(layer: Any, x: Tensor) -> Tensor:
+    return linear(x, layer.weight, layer.bias)
 
 
 def gru(obs_dim: int, out_dim: int, options: RecurrentOptions, generator: torch.Generator) -> GRU:
@@ -123,6 +158,11 @@ def gru(obs_dim: int, out_dim: int, options: RecurrentOptions, generator: torch.
 def lstm(obs_dim: int, out_dim: int, options: RecurrentOptions, generator: torch.Generator) -> LSTM:
     """Build one agent's long short-term memory with its initial parameters drawn from `generator`."""
     return LSTM(obs_dim, out_dim, options, generator)
+
+
+def population(modules: Sequence[_Unit], options: RecurrentOptions) -> UnitPopulation:
+    """Stack built units."""
+    return UnitPopulation(modules, options)
 
 
 def memory(options: RecurrentOptions, agents: int, batch: int, copies: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,6 @@ from qrlsuite.actions import check_actions, size
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
 from qrlsuite.testing.group import ROUNDS, E, ToyGroup, World, array, differs
-from qrlsuite.training.trainer import asks_for_more
 
 S = 5
 
@@ -36,17 +36,18 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
     if task is not None:
         return _check(subject, World.of_task(task))
     first, *others = subject.spec.actions
-    findings = _check(subject, World.toy(first, hidden=_remembers_by_its_class(subject)))
+    asks = inspect.signature(getattr(specs.resolve(subject.spec.factory), "act", len)).parameters.get(
+        "begins"
+    )
+    optional = asks is not None and asks.default is None
+    findings = _check(subject, World.toy(first, hidden=asks is not None and not optional))
     if all(finding.ok for finding in findings):
-        for kind in others:
-            findings += _check_kind(subject, World.toy(kind), kind)
+        worlds = {f"{kind} actions": World.toy(kind) for kind in others}
+        if optional:
+            worlds["memory of episodes"] = World.toy(first, hidden=True)
+        for rule, world in worlds.items():
+            findings += _check_more(subject, world, rule)
     return findings
-
-
-def _remembers_by_its_class(subject: Subject) -> bool:
-    """Tell whether `act` of an algorithm asks where episodes begin: its toy then shows a context once in an episode."""
-    assert isinstance(subject.spec, specs.AlgorithmSpec)
-    return asks_for_more(getattr(specs.resolve(subject.spec.factory), "act", len))
 
 
 def _check(subject: Subject, world: World) -> list[Finding]:
@@ -65,7 +66,7 @@ def _check(subject: Subject, world: World) -> list[Finding]:
         cause = "act takes observations (S, B, inputs), B as many as validation has lanes"
         looked_at = "actions (S, B, ...), the same every time, changing nothing"
         rules.run("acts", looked_at, lambda: _acts(trial), cause)
-        if trial.group([0]).remembers:
+        if world.hidden:
             cause = "begins is (S, B): where it is true, what is remembered of the lane is forgotten"
             looked_at = "what an episode left is forgotten where the next begins, lane by lane"
             rules.run("memory of episodes", looked_at, lambda: _remembers(trial), cause)
@@ -90,18 +91,23 @@ def _check(subject: Subject, world: World) -> list[Finding]:
 _RESTORES = "load_state_dict() takes what state_dict() returned, or slices of it, in place of start()"
 
 
-def _check_kind(subject: Subject, world: World, kind: str) -> list[Finding]:
-    """Check what depends on the kind of actions."""
+def _check_more(subject: Subject, world: World, rule: str) -> list[Finding]:
+    """Check what depends on the kind of actions, or on networks that remember."""
     rules, trial = Checklist(), Trial(subject, world)
 
     def all_of_it() -> None:
-        for rule in (_trains, _interactions, _acts, _learns, _independence, _state):
-            rule(trial)
+        for each in (_trains, _interactions, _acts, _learns, _independence, _state):
+            each(trial)
+        if world.hidden:
+            _remembers(trial)
 
     with one_thread():
-        cause = f"the spec says that it takes {kind} actions: build it for {world.space}"
+        cause = f"the spec says that it takes these actions: build it for {world.space}"
         looked_at = "it trains, acts, learns and resumes with them, seeds apart"
-        rules.run(f"{kind} actions", looked_at, all_of_it, cause)
+        if world.hidden:
+            cause = "act(observations, begins=None, infos=None): begins is given where networks remember"
+            looked_at = "with networks that remember, it trains, acts, learns and resumes, seeds apart"
+        rules.run(rule, looked_at, all_of_it, cause)
     return rules.findings
 
 

@@ -142,14 +142,17 @@ class World:
     ----------
     make:
         Builds a number of lanes.
+    hidden:
+        Whether something has to be remembered, so that networks do.
     """
 
     make: Callable[[int], LaneEnv]
+    hidden: bool = False
 
     @classmethod
     def toy(cls, kind: str, hidden: bool = False) -> World:
         """Return the toy with a kind of actions."""
-        return cls(lambda lanes: Toy(lanes, kind, hidden))
+        return cls(lambda lanes: Toy(lanes, kind, hidden), hidden)
 
     @classmethod
     def of_task(cls, name: str) -> World:
@@ -228,7 +231,6 @@ class ToyGroup:
         self.envs.seed_lanes([s.numpy("environment", e) for s in self.streams for e in range(lanes)])
         self.outputs: list[int] = []
         factory = specs.resolve(spec.factory)
-        self._memory = asks_for_more(getattr(factory, "act", len))
         own = subject.options() if options is None else options
         self.algorithm = factory(self.envs, self._model, own, self.streams, torch.device("cpu"))
 
@@ -244,7 +246,7 @@ class ToyGroup:
         self.outputs.append(outputs)
         given = self.world.inputs if inputs is None else inputs
         generators = [s.torch("init", call) for s in self.streams]
-        model = _Remembering if self._memory else _Linear
+        model = _Remembering if self.world.hidden else _Linear
         return model(outputs, given, generators)
 
     def start(self) -> ToyGroup:

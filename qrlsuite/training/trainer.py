@@ -517,7 +517,8 @@ class Trainer:
                 f"write '{name} {specs.NO_MODEL}'"
             )
         self._informed = asks_for_more(self.algorithm.act)
-        if not self._informed and any(population.remembers(module) for module in self.models.built):
+        self._remembers = any(population.remembers(module) for module in self.models.built)
+        if self._remembers and not self._informed:
             raise OptionError(
                 f"model '{self.entry.model.name}' remembers what it saw in an episode, and algorithm '{name}' would "
                 f"make it forget: {_that_remember(self.entry.model.name)}"
@@ -739,16 +740,18 @@ class Trainer:
         Raises
         ------
         ValueError
-            If the algorithm asks where episodes begin, and `begins` is absent.
+            If `begins` is absent, and the algorithm or its model needs it.
         """
         stacked = np.ascontiguousarray(observations, np.float32)
         seen = stacked.reshape(self.S, len(stacked) // self.S, -1)
         more: tuple[Any, ...] = ()
-        if self._informed:
-            if begins is None:
+        if self._informed and begins is None:
+            optional = inspect.signature(self.algorithm.act).parameters["begins"].default is None
+            if not optional or self._remembers:
                 raise ValueError(
                     f"algorithm '{self.entry.algorithm.name}' remembers episodes: give act() where they begin"
                 )
+        elif self._informed and begins is not None:
             more = begins.reshape(seen.shape[:2]), _by_seed(infos or {}, *seen.shape[:2])
         with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
             actions: NDArray[Any] = self.algorithm.act(seen, *more)

@@ -13,8 +13,7 @@ from torch import nn
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.plugins.algorithms.drqn import DRQN
-from qrlsuite.plugins.models.recurrent import GRU, LSTM, RecurrentOptions
-from qrlsuite.population import stack
+from qrlsuite.plugins.models.recurrent import GRU, LSTM, RecurrentOptions, population
 from qrlsuite.testing.group import Toy
 from qrlsuite.training.trainer import Trainer
 from tests.algorithms.worlds import Group
@@ -32,9 +31,12 @@ def made(model: str = "gru", seeds: int = 2, **settings: Any) -> DRQN:
 @pytest.mark.parametrize(("unit", "cell"), [(GRU, nn.GRUCell), (LSTM, nn.LSTMCell)])
 def test_the_unit_is_that_of_torch_and_a_population_is_each_of_them(unit: Any, cell: Any) -> None:
     units = [unit(4, 3, RecurrentOptions(width=6), torch.Generator().manual_seed(s)) for s in range(3)]
-    together, x, state = stack(units), torch.randn(3, 5, 4), torch.randn(3, 5, units[0].remembers)
+    together, x, state = (
+        population(units, RecurrentOptions(width=6)),
+        torch.randn(3, 5, 4),
+        torch.randn(3, 5, units[0].remembers),
+    )
     outputs, after = together(x, state)
-    assert together.problem is None
     for s, one in enumerate(units):
         theirs = cell(4, 6)
         theirs.load_state_dict(
@@ -53,10 +55,8 @@ def test_the_unit_is_that_of_torch_and_a_population_is_each_of_them(unit: Any, c
 class Unit:
     """Seed s of a population of units in numpy and float64."""
 
-    def __init__(self, population: nn.Module, s: int) -> None:
-        self.p = {
-            name: value[s].numpy().astype(np.float64) for name, value in population.state_dict().items()
-        }
+    def __init__(self, units: nn.Module, s: int) -> None:
+        self.p = {name: value[s].numpy().astype(np.float64) for name, value in units.state_dict().items()}
 
     def __call__(self, x: NDArray[Any], h: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         p = self.p
@@ -143,7 +143,7 @@ def test_it_remembers_what_an_episode_showed_first() -> None:
 
 def test_a_model_that_remembers_is_not_made_to_forget(tiny_task: str) -> None:
     with pytest.raises(
-        OptionError, match=r"'ddqn' would make it forget: take one of drqn: qrlsuite run 'drqn gru'"
+        OptionError, match=r"'ddqn' would make it forget: take one of drqn, ppo: qrlsuite run 'drqn gru'"
     ):
         Trainer(resolve(tiny_task, "gru", "ddqn"), [0])
     trainer = Trainer(resolve(tiny_task, "gru", "drqn"), [0, 1])

@@ -185,7 +185,7 @@ def test_rollouts_run_across_ends(cut: bool) -> None:
 def test_the_critic_stands_in_for_what_is_cut_off(cut: bool) -> None:
     """With lambda 0, R = r + gamma V(s'), also at the epoch's end and at a time limit; not at a termination."""
     made, rollout = collect(cut)
-    advantages, returns = (t[0].view(4, 2).numpy() for t in made._estimate(rollout))
+    advantages, returns = (t[0].view(4, 2).numpy() for t in made._estimate(rollout)[:2])
     critic = Perceptron(made.critic)
     following = critic(rollout.arrived[0].numpy()).reshape(4, 2)
     if not cut:

@@ -350,3 +350,23 @@ def test_a_loop_runs_modules_as_they_are() -> None:
     }  # fmt: skip
     with pytest.raises(ValueError, match="at least one module"):
         population.loop([])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "batch"),
+    [(3, 18, 10), (3, 21, 14), (5, 128, 2), (6, 64, 3), (7, 64, 3), (33, 7, 14)],
+)
+def test_linear_layers_of_odd_sizes_do_not_depend_on_their_place(
+    inputs: int, outputs: int, batch: int
+) -> None:
+    x, w, b, g = (
+        torch.randn(5, *size) for size in ((batch, inputs), (outputs, inputs), (outputs,), (batch, outputs))
+    )
+    w.requires_grad_()
+    results = []
+    for members in ([0, 1, 2, 3, 4], [4, 1, 3]):
+        y = linear(x[members], w[members], b[members])
+        (gradient,) = torch.autograd.grad(y, w, g[members])
+        results.append((y.detach(), gradient[members]))
+    for whole, part in zip(*results):
+        assert torch.equal(whole[[4, 1, 3]], part)

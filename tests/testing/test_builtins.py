@@ -57,7 +57,13 @@ WHERE_OFFERED = {
     },
     **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
     ("algorithms", "drqn"): ["memory", "memory of episodes"],
-    ("algorithms", "ppo"): ["memory", "box actions", "multi-discrete actions", "multi-binary actions"],
+    ("algorithms", "ppo"): [
+        "memory",
+        "box actions",
+        "multi-discrete actions",
+        "multi-binary actions",
+        "memory of episodes",
+    ],
     ("algorithms", "sac"): ["memory", "discrete actions"],
 }
 """Rules about what a thing need not have."""
