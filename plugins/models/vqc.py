@@ -6,6 +6,13 @@ whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3
 layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as in earlier work on CartPole (Jerbi
 et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
 
+What an algorithm asks for, logits, values, means and logarithms of spreads, are outputs like any other. Expectation
+values lie in -1 .. 1, and what is behind the circuit takes them elsewhere. Means are in halves of an action's range, or
+pass through a hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its
+learning rate per step: `output_rate = 100` gives what is behind the circuit 0.1 beside 0.001, as Skolik et al. have it.
+`critic = "mlp"` takes a perceptron for what estimates values, as Lan (2021, "Variational quantum soft actor-critic",
+arXiv:2112.11921), whose policy alone is hybrid: also where a critic is given (s, a), which the circuit may not fit.
+
 One module serves all backends; the models differ in which backend computes the circuit.
 """
 
@@ -14,7 +21,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import field, fields
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -28,6 +35,7 @@ from qrlsuite.circuit.description import mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
+from qrlsuite.plugins.models import mlp
 from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
 from qrlsuite.population import linear
 
@@ -90,6 +98,22 @@ class VQCOptions:
         ),
         Since("0.2.0"),
     ] = True
+    output_rate: Annotated[
+        float,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="factor on the learning rate of what is behind the circuit, for values far beyond -1..1",
+        ),
+        Since("0.2.0"),
+    ] = 1.0
+    critic: Annotated[
+        Literal["circuit", "mlp"],
+        Field(
+            description="networks that estimate values beside a policy: circuits too, or perceptrons of 64 x 64 units"
+        ),
+        Since("0.2.0"),
+    ] = "circuit"
 
     @field_validator("ansatz_options")
     @classmethod
@@ -253,6 +277,11 @@ class _Hybrid(nn.Module):
         """Return the names of the circuit's parameters."""
         return {f"circuit.{name}" for name in self._runner.circuit.parameters}
 
+    def learning_rates(self) -> dict[str, float]:
+        """Return the factor on the learning rate of what is behind the circuit."""
+        rate = self._runner.options.output_rate
+        return {} if rate == 1.0 else {f"output.{name}": rate for name, _ in self.output.named_parameters()}
+
     def _stacked(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
         """Map (S, B, in) to (S, B, out) with parameters (S, ...)."""
         runner, options = self._runner, self._runner.options
@@ -337,7 +366,9 @@ def _scales(circuit: Circuit) -> set[str]:
     return {a.scale.parameter for operation in circuit for a in operation.angles if a.scale is not None}
 
 
-def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Generator) -> VQC:
+def build(
+    obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Generator, role: str = "network"
+) -> VQC | mlp.MLP:
     """Build one agent's model with every random number drawn from `generator`.
 
     Parameters
@@ -348,12 +379,16 @@ def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Gene
         Options of one of the `vqc-*` models; their class says which backend runs the circuit.
     generator:
         Source of the initial parameters and of the key of shot noise.
+    role:
+        `"critic"` may be a perceptron, as the options say.
 
     Raises
     ------
     OptionError
         If the ansatz cannot be built with these options, or does not fit the task without linear layers.
     """
+    if role == "critic" and options.critic == "mlp":
+        return mlp.build(obs_dim, out_dim, mlp.MLPOptions(), generator)
     runner = _Runner(options)
     circuit = runner.circuit
     state: dict[str, Tensor] = {}
@@ -362,7 +397,7 @@ def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Gene
             obs_dim, circuit.inputs, "torch", generator
         )
     else:
-        _require_fit(circuit, obs_dim, out_dim)
+        _require_fit(circuit, obs_dim, out_dim, role)
     for name, parameter in circuit.parameters.items():
         uniform = torch.rand(parameter.shape, generator=generator)
         state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
@@ -380,20 +415,25 @@ def build(obs_dim: int, out_dim: int, options: VQCOptions, generator: torch.Gene
     return VQC(runner, state)
 
 
-def _require_fit(circuit: Circuit, obs_dim: int, out_dim: int) -> None:
+def _require_fit(circuit: Circuit, inputs: int, outputs: int, role: str) -> None:
     """Refuse a circuit that cannot stand without linear layers."""
-    outputs = len(circuit.observables)
-    if circuit.inputs != obs_dim or outputs < out_dim:
-        raise OptionError(
-            f"linear = false: the circuit has {circuit.inputs} inputs and {outputs} expectation values, the task "
-            f"{obs_dim} observations and {out_dim} outputs: choose the qubits so that the inputs are as many, and the "
-            "expectation values no fewer"
-        )
+    values = len(circuit.observables)
+    if circuit.inputs == inputs and values >= outputs:
+        return
+    advice = "choose the qubits so that the inputs are as many, and the expectation values no fewer"
+    if role == "critic":
+        advice = "set critic=mlp, which takes a perceptron for it, or linear=true"
+    raise OptionError(
+        f"linear = false: the circuit has {circuit.inputs} inputs and {values} expectation values, the {role} "
+        f"{inputs} inputs and {outputs} outputs: {advice}"
+    )
 
 
-def population(modules: Sequence[VQC], options: VQCOptions) -> VQCPopulation:
+def population(modules: Sequence[VQC | mlp.MLP], options: VQCOptions) -> VQCPopulation | mlp.MLPPopulation:
     """Stack built models."""
-    return VQCPopulation(modules, options)
+    if isinstance(modules[0], mlp.MLP):
+        return mlp.population(cast("Sequence[mlp.MLP]", modules), mlp.MLPOptions())
+    return VQCPopulation(cast("Sequence[VQC]", modules), options)
 
 
 def memory(options: VQCOptions, agents: int, batch: int, copies: int) -> int:
