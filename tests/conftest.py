@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import hypothesis
 import pytest
 
 from tests.commands import FORKED, Command, popen
@@ -36,6 +37,11 @@ os.environ["PATH"] = (
 os.environ.setdefault(
     "HYPOTHESIS_STORAGE_DIRECTORY", str(Path(__file__).parents[1] / ".pytest_cache" / "hypothesis")
 )
+# how long drawing examples takes says nothing: no test depends on the machine's speed
+hypothesis.settings.register_profile(
+    "suite", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("suite")
 os.environ["QRLSUITE_LOAD_PLUGINS"] = ""  # whatever is installed; tests name the packages that they install
 
 
