@@ -10,7 +10,7 @@ from qrlsuite.specs import NO_MODEL, ModelSpec
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-BACKEND` for each circuit backend."""
+    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-BACKEND` and `qlstm-BACKEND` for each backend."""
     register(
         ModelSpec(
             name="mlp",
@@ -64,6 +64,19 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             population="qrlsuite.plugins.models.vqc:population",
             memory="qrlsuite.plugins.models.vqc:memory",
             faster="vqc-native",
+            backends=True,
+        )
+    )
+    register(
+        ModelSpec(
+            name="qlstm",
+            summary="Quantum long short-term memory, circuits that remember",
+            family="quantum",
+            options="qrlsuite.plugins.models.qlstm:QLSTMOptions",
+            build="qrlsuite.plugins.models.qlstm:build",
+            population="qrlsuite.plugins.models.qlstm:population",
+            memory="qrlsuite.plugins.models.qlstm:memory",
+            faster="qlstm-native",
             backends=True,
         )
     )

@@ -42,6 +42,7 @@ RULES = {
 }  # fmt: skip
 """Rules of each kind, after those that all have in common."""
 
+BACKENDS = ("native", "pennylane", "qiskit")
 WHERE_OFFERED = {
     ("circuit_backends", "native"): ["mean field", "shots"],
     ("circuit_backends", "pennylane"): ["shots"],
@@ -53,7 +54,13 @@ WHERE_OFFERED = {
     **{("studies", item.name): ["speeds"] for item in EVERYTHING if item.kind.kinds == "studies"},
     **{
         ("models", name): ["memory"]
-        for name in ("fourier", "gru", "lstm", "mlp", "vqc-native", "vqc-pennylane", "vqc-qiskit")
+        for name in (
+            "fourier",
+            "gru",
+            "lstm",
+            "mlp",
+            *(f"{m}-{b}" for m in ("vqc", "qlstm") for b in BACKENDS),
+        )
     },
     **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
     ("algorithms", "drqn"): ["memory", "memory of episodes"],
