@@ -12,16 +12,18 @@ recognized in its top-level module is registered: see `qrlsuite.shortforms`.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import importlib
 import importlib.abc
 import importlib.util
 import inspect
 import keyword
+import linecache
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path, PurePosixPath
@@ -30,11 +32,13 @@ from typing import Any, TypeVar
 
 import qrlsuite
 from qrlsuite import hookspecs, registry, shortforms, specs
-from qrlsuite.errors import FileError, PluginError, listed
+from qrlsuite.errors import FileError, OptionError, PluginError, QrlSuiteError, listed
 from qrlsuite.registry import Plugin, Registered, Registry
 
 MOST_BYTES, MOST_FILES = 16 << 20, 500
 """What a plugin may hold at most."""
+_MOST_WORDS = 300
+"""Characters of an error's message that are shown."""
 
 
 @dataclass(frozen=True)
@@ -446,12 +450,72 @@ def is_free(module: str) -> bool:
 
 def failure(error: BaseException) -> str:
     """Say what a plugin's code raised, and in which of its lines."""
-    frames = traceback.extract_tb(error.__traceback__)
-    names = {each.source.place(file): each for each in loaded() for file in each.source.files}
-    own = [frame for frame in frames if frame.filename in names] or frames[-1:]
-    return " ".join(registry.words(error).split()) + (
-        f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
-    )
+    what = " ".join(registry.words(error).split())
+    if not (where := place(error)):
+        last = traceback.extract_tb(error.__traceback__)[-1:]
+        where = "".join(f"{frame.filename}, line {frame.lineno}" for frame in last)
+    return f"{what[:_MOST_WORDS]} ({where})" if where else what[:_MOST_WORDS]
+
+
+def place(error: BaseException) -> str:
+    """Return the line of a plugin's code in which an error arose, or which called what raised it; `""` for none."""
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        if where := _line(frame.f_code.co_filename, frame.f_globals.get("__name__"), line):
+            return where
+    return ""
+
+
+def place_of(function: Any) -> str:
+    """Return file and line where a function of a plugin's code begins; `""` for another one."""
+    code = getattr(function, "__code__", None)
+    return _line(code.co_filename, function.__module__, code.co_firstlineno) if code is not None else ""
+
+
+def _line(file: str, module: Any, line: int) -> str:
+    """Return a line of a plugin by path or an installed one: `ring.py, line 9: return x`; `""` where it is of none."""
+    for source in (each.source for each in loaded()):
+        for name in source.files:
+            if source.place(name) == file:
+                text = source.files[name].decode(errors="replace").splitlines()[line - 1 : line]
+                return f"{name}, line {line}" + "".join(f": {each.strip()}" for each in text)
+    installed = {
+        each.module.partition(":")[0].partition(".")[0]
+        for each in registry.load().plugins
+        if each.distribution != hookspecs.PROJECT
+    }
+    if str(module).partition(".")[0] not in installed:
+        return ""
+    return f"{file}, line {line}: {linecache.getline(file, line).strip()}"
+
+
+def placed(error: OptionError) -> OptionError:
+    """Return an error of the suite with the line of a plugin's code that caused it; a plugin's own stays as it is."""
+    *_, (last, _) = traceback.walk_tb(error.__traceback__)
+    where = place(error)
+    if not where or where in str(error) or not str(last.f_globals.get("__name__")).startswith("qrlsuite."):
+        return error
+    return type(error)(f"{error} ({where})").with_traceback(error.__traceback__)
+
+
+@contextlib.contextmanager
+def blamed() -> Iterator[None]:
+    """Turn what a plugin's code raises into one message with its line; errors of the suite's own code stay.
+
+    Raises
+    ------
+    PluginError
+        With the line, and what to do.
+    """
+    try:
+        yield
+    except OptionError as error:
+        raise PluginError(str(placed(error))) from error
+    except QrlSuiteError:
+        raise
+    except Exception as error:
+        if not place(error):
+            raise
+        raise PluginError(f"{failure(error)}: mend it, and repeat the command") from error
 
 
 def _failure(source: Source, error: BaseException) -> str:

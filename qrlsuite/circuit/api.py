@@ -14,7 +14,6 @@ from __future__ import annotations
 import copy
 import functools
 import threading
-import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
@@ -110,7 +109,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         If the ansatz fails otherwise, or returns no circuit.
     """
     from qrlsuite import options as option_values
-    from qrlsuite import registry, specs
+    from qrlsuite import own, registry, specs
 
     if isinstance(qubits, bool) or not isinstance(qubits, int) or qubits < 1:
         raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
@@ -120,13 +119,12 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     chosen = option_values.build(specs.resolve(spec.options), options, f"ansatz '{name}'")
     try:
         circuit = specs.resolve(spec.build)(qubits, layers, chosen)
+    except OptionError as error:
+        raise own.placed(error) from None
     except QrlSuiteError:
         raise
     except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        raise PluginError(
-            f"ansatz '{name}' cannot be built: {registry.words(error)} ({last.filename}, line {last.lineno})"
-        ) from error
+        raise PluginError(f"ansatz '{name}' cannot be built: {own.failure(error)}") from error
     if not isinstance(circuit, Circuit):
         raise PluginError(f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit")
     circuit.require_simulable()

@@ -101,6 +101,8 @@ def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
 def of_seeds(store: EntryStore) -> list[SameCode]:
     """Return an entry's seeds by their code, those of one code first that the lowest seed has.
 
+    A seed of which no epoch was finished is left out: any code may begin it anew.
+
     Raises
     ------
     StoreError
@@ -110,12 +112,13 @@ def of_seeds(store: EntryStore) -> list[SameCode]:
     codes: dict[str, CodeIdentity | None] = {}
     before: Mapping[str, Any] = {}
     for seed in store.seeds() if store.path.is_dir() else ():
-        path = store.seed(seed).path / "run.json"
+        folder = store.seed(seed)
+        path = folder.path / "run.json"
         try:
-            record = store.seed(seed).record()
+            record = folder.record()
         except StoreError:  # is said where the seed is read
             continue
-        if record is None:
+        if record is None or not (record["epochs"] or folder.lines.exists() or folder.table.exists()):
             continue
         if not before or record.get("code") != before.get("code"):  # seeds mostly have the same
             code, before = read(record, path), record

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite import specs
+from qrlsuite import own, specs
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import EnvironmentFailure, PluginError
 from qrlsuite.experiment.task import ScoreSection
@@ -153,6 +153,6 @@ class MeteredEnv(LaneEnv):
         if isinstance(error, EnvironmentFailure):
             return error
         return EnvironmentFailure(
-            f"environment '{self.environment_name}' failed: {type(error).__name__}: {error}; "
+            f"environment '{self.environment_name}' failed: {own.failure(error)}; "
             "finished epochs are kept, and the same command tries again"
         )

@@ -12,7 +12,6 @@ import dataclasses
 import functools
 import inspect
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from torch import nn
 
 import qrlsuite
 from qrlsuite import actions as action_spaces
-from qrlsuite import population, registry, specs
+from qrlsuite import own, population, registry, specs
 from qrlsuite.circuit import CircuitModel
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError, QrlSuiteError, StoreError
@@ -63,15 +62,13 @@ def _building(spec: specs.Spec) -> Iterator[None]:
     """
     try:
         yield
+    except OptionError as error:
+        raise own.placed(error) from None
     except QrlSuiteError:
         raise
     except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
         owner = registry.load().get(type(spec), spec.name).distribution
-        raise PluginError(
-            f"{spec.title} of {owner} cannot be built: {registry.words(error)} "
-            f"({last.filename}, line {last.lineno})"
-        ) from error
+        raise PluginError(f"{spec.title} of {owner} cannot be built: {own.failure(error)}") from error
 
 
 def build_envs(entry: Entry, lanes: int, tick: Callable[[], None], fence: Fence | None = None) -> MeteredEnv:
@@ -341,7 +338,9 @@ class ModelBuilder:
             stacked = spec.population is None
             if stacked:  # a stack keeps one agent's plain attributes for all
                 both = options[0], next((own for own in options if own != options[0]), options[0])
-            unregistered.require_none(lambda which: agent(two[which], both[which]), given, spec.name, stacked)
+            unregistered.require_none(
+                lambda which: agent(two[which], both[which]), given, spec.name, stacked, outputs
+            )
             agents = [agent(streams, own) for streams, own in zip(self.streams, options)]
             fixed = population.count_fixed(agents[0])
             self.parameters.append((*population.count_parameters(agents[0]), fixed))
@@ -531,6 +530,7 @@ class Trainer:
         envs.inner.autoreset = False
         return envs
 
+    @own.blamed()
     def start(self, initial: Arrays | None = None) -> None:
         """Begin at epoch 0: every training environment gets the stream that its seed and place determine.
 
@@ -585,6 +585,7 @@ class Trainer:
         """Give every training environment its stream of epoch 0, from the beginning."""
         self.envs.seed_lanes([s.numpy("environment", lane) for s in self.streams for lane in range(self.E)])
 
+    @own.blamed()
     def train_epoch(self) -> Epoch:
         """Train and validate one epoch.
 
@@ -645,6 +646,7 @@ class Trainer:
         """
         return self._validate(epoch).scores.reshape(self.S, self.V)
 
+    @own.blamed()
     def capture(self) -> Arrays:
         """Return a copy of everything that the rest of the training depends on, seed-first, by name."""
         arrays = {
@@ -657,6 +659,7 @@ class Trainer:
             arrays |= {f"{PREFIX}{name}": array for name, array in self.statistics.state_dict().items()}
         return arrays
 
+    @own.blamed()
     def restore(self, epoch: int, arrays: Arrays) -> None:
         """Continue after an epoch, from what `capture` returned then.
 
@@ -680,6 +683,7 @@ class Trainer:
             raise StoreError(f"the checkpoint does not fit this version: {error}") from error
         self.epoch = epoch
 
+    @own.blamed()
     def policy(self) -> Arrays:
         """Return the parameters of the trained agents, seed-first, by name: what is published of them."""
         tensors = self.algorithm.policy_state()
@@ -722,6 +726,7 @@ class Trainer:
         self._require_scores(episodes.scores)
         return episodes
 
+    @own.blamed()
     def act(
         self,
         observations: NDArray[np.float32],
@@ -755,7 +760,13 @@ class Trainer:
             more = begins.reshape(seen.shape[:2]), _by_seed(infos or {}, *seen.shape[:2])
         with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
             actions: NDArray[Any] = self.algorithm.act(seen, *more)
-        return actions.reshape(len(stacked), *(self.envs.single_action_space.shape or ()))
+        shape = *seen.shape[:2], *(self.envs.single_action_space.shape or ())
+        if np.shape(actions) != shape:
+            raise PluginError(
+                f"algorithm '{self.entry.algorithm.name}': act returns the shape {np.shape(actions)}, and must return "
+                f"{shape}, seeds and lanes first ({own.place_of(type(self.algorithm).act)})"
+            )
+        return actions.reshape(len(stacked), *shape[2:])
 
     def _called(self) -> str:
         """Name what is called in an epoch: a generator that a single call moves is said of that call, see `Fence`."""

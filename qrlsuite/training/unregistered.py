@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from qrlsuite import own
 from qrlsuite.errors import PluginError
 
 BATCH = 2
@@ -84,7 +85,13 @@ def _inside(value: Any, path: str, cure: str, seen: set[int]) -> Iterator[tuple[
                 yield from _inside(item, f"{path}[{index}]", cure, seen)
 
 
-def require_none(build: Callable[[int], nn.Module], inputs: int, model: str, stacked: bool = True) -> None:
+def require_none(
+    build: Callable[[int], nn.Module],
+    inputs: int,
+    model: str,
+    stacked: bool = True,
+    outputs: int | None = None,
+) -> None:
     """Refuse a model that holds values which differ between two seeds, or which a forward pass changes.
 
     Parameters
@@ -96,6 +103,8 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str, sta
     stacked:
         Whether `qrlsuite.population.stack` makes the population: `torch.vmap` hands buffers to a pass and drops what
         it makes of them, so that a pass may change none.
+    outputs:
+        How many numbers a pass must return for each sample; None asks nothing of them.
 
     Raises
     ------
@@ -111,11 +120,13 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str, sta
     source = torch.Generator().manual_seed(0)
     try:
         with torch.no_grad(), torch.random.fork_rng(devices=()):
-            probe(torch.rand(BATCH, inputs, generator=source))
+            result = probe(torch.rand(BATCH, inputs, generator=source))
     except (
         Exception
     ):  # its own error, which training will meet and report; inputs of the task may be of another kind
         return
+    if outputs is not None:
+        _require_outputs(result, (BATCH, inputs), (BATCH, outputs), probe, model)
     for path, (value, cure) in held(probe).items():
         known = before.get(path)
         if not isinstance(value, float | complex) and (known is None or not _equal(value, known[0])):
@@ -128,6 +139,25 @@ def require_none(build: Callable[[int], nn.Module], inputs: int, model: str, sta
                 "state between passes (batch normalization, a recurrent state, running means), or give the model a "
                 "`population`"
             )
+
+
+def _require_outputs(
+    result: Any, given: tuple[int, int], wanted: tuple[int, int], module: nn.Module, model: str
+) -> None:
+    """Refuse what a fresh network returns for inputs between 0 and 1 where no task can use it."""
+    if not isinstance(result, Tensor):
+        what = type(result).__name__
+    elif tuple(result.shape) != wanted:
+        what = f"the shape {tuple(result.shape)}"
+    elif not bool(torch.isfinite(result).all()):
+        what = f"{result[~torch.isfinite(result)][0].item()} before any training"
+    else:
+        return
+    where = own.place_of(type(module).forward)
+    raise PluginError(
+        f"model '{model}': for inputs of the shape {given} (samples, inputs), forward returns {what}, and must return "
+        f"finite numbers of the shape {wanted} (samples, outputs)" + (f" ({where})" if where else "")
+    )
 
 
 def _equal(first: Any, second: Any) -> bool:

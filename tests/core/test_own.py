@@ -13,14 +13,14 @@ from types import ModuleType
 import pytest
 
 from qrlsuite import api, circuit, options, own, registry, shortforms, specs
-from qrlsuite.errors import FileError, PluginError, UnknownNameError
+from qrlsuite.errors import EnvironmentFailure, FileError, OptionError, PluginError, UnknownNameError
 from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.studies.looks import FILE, FOLDER
 from qrlsuite.studies.outcome import in_folder
 from qrlsuite.training.remote_task import pack, unpack, work_on
-from qrlsuite.training.trainer import first_network
+from qrlsuite.training.trainer import Trainer, first_network
 
 RING = '''
 from qrlsuite.circuit import Circuit
@@ -590,7 +590,8 @@ def test_a_builder_that_fails_is_named_with_its_line() -> None:
         write("bad.py", "def worse(qubits, layers):\n    return qubits.foo\ndef none(qubits, layers): ...\n")
     )
     with pytest.raises(
-        PluginError, match=r"^ansatz 'worse' cannot be built: AttributeError.*bad.py, line 2\)$"
+        PluginError,
+        match=r"^ansatz 'worse' cannot be built: AttributeError.*bad.py, line 2: return qubits.foo\)$",
     ):
         resolve("beam6g", "vqc-native ansatz=worse")
     with pytest.raises(PluginError, match=r"^ansatz 'none' returns NoneType, and must return a Circuit$"):
@@ -618,3 +619,76 @@ def test_without_the_plugin_nothing_is_left() -> None:
         circuit.ansatz("ring", 2, 1)
     assert not any(each.distribution == "ring.py" for each in registry.load().plugins)
     assert os.path.exists("ring.py")
+
+
+MISTAKES = """
+import gymnasium, numpy, torch
+from qrlsuite.circuit import Circuit
+
+def chain(qubits, layers, far: int = 0):
+    circuit = Circuit(qubits)
+    circuit.append("RX", qubits - 1 + far, circuit.input(0))
+    return circuit
+
+class Net(torch.nn.Module):
+    def __init__(self, inputs, outputs, mistake: str = "none"):
+        super().__init__()
+        self.mistake, self.layer = mistake, torch.nn.Linear(inputs, outputs)
+
+    def forward(self, x):
+        if self.mistake == "divides":
+            return self.layer(x) * (1 / 0)
+        return {"flat": self.layer(x)[:, 0], "zero": self.layer(x) / 0}.get(self.mistake)
+
+class Walk(gymnasium.Env):
+    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (2,)), gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return numpy.zeros(2, numpy.float32), {}
+
+    def step(self, action):
+        raise RuntimeError("it fell")
+
+class Idle:
+    def __init__(self, envs, build_model, streams, device): self.network = build_model(2)
+    def start(self): ...
+    def train_epoch(self, rounds): return {}
+    def act(self, observations): return observations.missing
+    def state_dict(self): return {}
+    def load_state_dict(self, state): ...
+    def policy_state(self): return {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("task", "entry", "expected"),
+    [
+        (
+            "beam6g",
+            "vqc-native qubits=3 ansatz=chain ansatz.far=1",
+            r"^RX on qubits \(3,\).*line 7: circuit.app",
+        ),
+        ("beam6g", "net mistake=flat", r"forward returns the shape \(2,\), and must .*line 15: def forward"),
+        ("beam6g", "net mistake=zero", r"forward returns -?(inf|nan) before any training"),
+        (
+            "beam6g",
+            "net mistake=divides",
+            r"^ZeroDivisionError.*, line 17: return self.layer\(x\) \*.*: mend",
+        ),
+        ("walk", "mlp", r"RuntimeError: it fell \(mistakes.py, line 27: raise"),
+        ("beam6g", "idle mlp", r"^AttributeError.*\(mistakes.py, line 33: def act.*: mend it, and repeat"),
+    ],
+)
+def test_a_mistake_in_a_users_file_is_one_line_that_names_its_place(
+    task: str, entry: str, expected: str
+) -> None:
+    own.load(write("mistakes.py", MISTAKES))
+
+    def train() -> None:
+        trainer = Trainer(resolve(task, entry), [0])
+        trainer.start()
+        trainer.train_epoch()
+
+    with pytest.raises((OptionError, PluginError, EnvironmentFailure), match=expected) as caught:
+        train()
+    assert "\n" not in str(caught.value)
