@@ -101,6 +101,8 @@ def field_names(cls: type[Any]) -> list[str]:
 
 def describe(cls: type[Any]) -> list[dict[str, Any]]:
     """Return name, type, default and description of every option, and where it was added later the version."""
+    from qrlsuite import __version__
+
     properties = pydantic.TypeAdapter(cls).json_schema().get("properties", {})
     added = later(cls)
     rows = []
@@ -114,20 +116,10 @@ def describe(cls: type[Any]) -> list[dict[str, Any]]:
         }
         if name in added:
             row["since"], _ = added[name]
-            row["description"] += f" ({_since(row['since'])})"
+            if Version(row["since"]) <= Version(__version__):  # others are new in what is not yet released
+                row["description"] += f" (since {row['since']})"
         rows.append(row)
     return rows
-
-
-def _since(version: str) -> str:
-    """Say which version brought an option; a version that is not yet released, without its number."""
-    from qrlsuite import __version__
-
-    return (
-        f"since {version}"
-        if Version(version) <= Version(__version__)
-        else f"not in {__version__} as released"
-    )
 
 
 def _values(schema: Mapping[str, Any]) -> str:

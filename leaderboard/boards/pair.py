@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow, percent
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted, steps_text
@@ -78,6 +79,8 @@ class PairVerdict:
         Epochs of the first that its final score is the mean of.
     adjusted:
         Whether the verdict and p are those of a board, adjusted for all of its pairs.
+    whole:
+        Environment steps at which the task's first board ranks.
     """
 
     labels: tuple[str, str]
@@ -86,10 +89,17 @@ class PairVerdict:
     scores: ScoreBoard | None
     n_last: int
     adjusted: bool = False
+    whole: int = 0
 
     @property
     def sentence(self) -> str:
-        """The verdict, its size and how sure it is."""
+        """The verdict, its size and how sure it is; of shorter runs than the task asks for, it begins with that."""
+        if self.times.horizon >= self.whole:
+            return self._said
+        return f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {self._said}"
+
+    @property
+    def _said(self) -> str:
         first, second = self.labels
         pair = self.times
         if (pair.at_cap == 1).all():
@@ -202,7 +212,7 @@ class PairVerdict:
         one, other = self.scores.mean
         p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
         return (
-            f"final score: {one:.4g} against {other:.4g}, difference {self.scores.difference[0, 1]:+.2g} "
+            f"final score: {one:.3f} against {other:.3f}, difference {self.scores.difference[0, 1]:+.2g} "
             f"({low:+.2g} to {high:+.2g}{p}); mean over the last tenth of the epochs ({self.n_last})"
         )
 
@@ -260,6 +270,7 @@ def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: flo
         if several
         else None,
         n_last=last_epochs(cut[0].values.shape[1]),
+        whole=min(ranking_of([first, second]).horizons),
     )
 
 
@@ -340,7 +351,8 @@ def pair_on(
         alone = times_pair(one, other, grid, board.alpha, board.horizon)
         times = replace(times, p_each=alone.p_each, differences=alone.differences)
     thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
-    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True)
+    whole = min(ranking_of([row.entry for row in rows]).horizons)
+    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True, whole=whole)
 
 
 def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:

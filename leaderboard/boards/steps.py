@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from qrlsuite.errors import PluginError, QrlSuiteError
 from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
@@ -24,7 +22,7 @@ from qrlsuite.leaderboard.boards.ranked import (
 from qrlsuite.leaderboard.boards.times import TimeRanking, rank_by_time
 from qrlsuite.leaderboard.rules import DEFAULT, TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, outperformance
+from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, final_scores, outperformance
 from qrlsuite.statistics.compare import TOO_FEW
 
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
@@ -74,7 +72,8 @@ class Row:
     entry: EntryResults
     tier: int | None
     reference: Complexity
-    median_score: float
+    final_score: float
+    """Mean over seeds, of each its mean over the last tenth of the epochs."""
     copeland: int
     wins: int
     losses: int
@@ -250,7 +249,7 @@ def _section(
                 entry=entry,
                 tier=place.tier,
                 reference=complexity_at(values, ranking, entry.steps_per_epoch, horizon),
-                median_score=float(np.median(values[:, -1])),
+                final_score=float(final_scores(learning_curves(entry).cut(horizon)).mean()),
                 copeland=place.copeland,
                 wins=int(better[board.names.index(place.name)].sum()),
                 losses=int(better[:, board.names.index(place.name)].sum()),
@@ -321,7 +320,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "interval": [row.reference.low, row.reference.high],
         "at_cap": row.reference.at_cap,
         "unsettled": row.reference.unsettled,
-        "median_score": row.median_score,
+        "final_score": row.final_score,
         "copeland": row.copeland,
         "wins": row.wins,
         "losses": row.losses,

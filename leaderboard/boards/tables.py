@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite.engine.sheet import Column, Sheet
+from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import p_text, percent
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.results.text import counted, hours_text, steps_text
@@ -88,9 +89,10 @@ def title(section: Section) -> str:
     """Return the heading of a section."""
     algorithms = {row.entry.algorithm for row in section.rows}
     only = f", {algorithms.pop()}" if len(algorithms) == 1 else ""
-    note = " (provisional: shorter than the task's horizon)" if section.provisional else ""
+    whole = steps_text(min(ranking_of([row.entry for row in section.rows]).horizons))
+    steps = f"{steps_text(section.horizon)}{f' of {whole}' * section.provisional} steps"
     by = f", tiers by rule '{section.rule}'" if section.by_tiers else ""
-    return f"{section.task}{only}, {steps_text(section.horizon)} steps{note}{by}"
+    return f"{section.task}{only}, {steps}{' (provisional)' * section.provisional}{by}"
 
 
 def names(entries: Sequence[EntryResults]) -> list[str]:
@@ -188,8 +190,8 @@ def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
         ),
         Column(
             "final score",
-            tuple(f"{row.median_score:.3f}" for row in rows),
-            meaning="median over seeds after the last epoch",
+            tuple(f"{row.final_score:.3f}" for row in rows),
+            meaning="mean over seeds and over the last tenth of the epochs",
         ),
         Column(
             "seeds",

@@ -72,7 +72,7 @@ def load(
 
 
 def board(
-    tasks: str | Sequence[str] | None = None,
+    task: str | Sequence[str] | None = None,
     *,
     by: str = "steps",
     runs: str | PathLike[str] = "runs",
@@ -87,8 +87,8 @@ def board(
 
     Parameters
     ----------
-    tasks:
-        A task; None means all, one after the other. Several are compared together: the entries that were trained on
+    task:
+        One; None means all, one after the other. Several are compared together: the entries that were trained on
         all of them with the same options, by means over the tasks.
     by:
         `steps`; `executions` (of circuits), `shots` or `core-hours`: what learning cost, within the same budget for
@@ -139,7 +139,7 @@ def board(
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
     [('ddqn vqc-native qubits=6', ''), ('ddqn mlp width=16', 'executes no circuits')]
     """
-    folder, task_names = Path(runs), several(tasks)
+    folder, task_names = Path(runs), several(task)
     collect.check_tasks(folder, task_names, published)
     together = task_names if len(task_names) > 1 else ()
     if rule is not None and (together or by != "steps"):
@@ -275,7 +275,7 @@ def compare(
 def plot(
     kind: str,
     *,
-    tasks: str | Sequence[str] | None = None,
+    task: str | Sequence[str] | None = None,
     entries: Sequence[str | EntryResults] = (),
     horizon: int | None = None,
     seeds: Seeds | None = None,
@@ -293,7 +293,7 @@ def plot(
     ----------
     kind:
         What to draw, such as `curves`, `bars` or `tiers`: `qrlsuite plot --help` lists the kinds.
-    tasks, entries, horizon, runs, published:
+    task, entries, horizon, runs, published:
         As for `board`. Without `entries` all of the task are drawn, the smallest model first.
     seeds:
         Draw these alone, of every entry (30: seeds 0 to 29), so that all have equal numbers; entries that lack one are
@@ -319,13 +319,13 @@ def plot(
 
     Examples
     --------
-    >>> plot("tiers", tasks="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
+    >>> plot("tiers", task="beam6g", runs="none-yet", published=True).savefig("tiers.pdf")  # doctest: +SKIP
     """
-    if "task" in settings:
-        raise OptionError(f"plot takes `tasks`, one or several: write tasks={settings['task']!r}")
+    if "tasks" in settings:
+        raise OptionError(f"plot takes `task`, one or several: write task={settings['tasks']!r}")
     drawn = compose(
         kind,
-        several(tasks),
+        several(task),
         entries,
         horizon=horizon,
         seeds=seeds,

@@ -20,7 +20,7 @@ from qrlsuite.results.survey import STATUSES
 
 def table(
     rows: fields.Rows = "entries",
-    tasks: str | Sequence[str] | None = None,
+    task: str | Sequence[str] | None = None,
     *,
     entries: Sequence[str | EntryResults] = (),
     horizon: int | None = None,
@@ -35,8 +35,8 @@ def table(
     ----------
     rows:
         What a row is: one of `entries`, of their `seeds`, or of the `epochs` of these, which are the learning curves.
-    tasks:
-        The entries of these; None means all.
+    task:
+        The entries of this one, or of several; None means all.
     entries:
         These only: what `load` accepts, or what it returns.
     horizon:
@@ -84,7 +84,7 @@ def table(
     """
     if rows not in fields.FIELDS:
         raise OptionError(f"rows = {rows!r}: a row is one of the entries, seeds or epochs")
-    folder, names = Path(runs), several(tasks)
+    folder, names = Path(runs), several(task)
     collect.check_tasks(folder, names, published)
     found, left_out = collect.select(folder, names, entries, published, horizon)
     for line in left_out:

@@ -167,13 +167,13 @@ def test_a_picture_of_equal_numbers(small: EntryResults, large: EntryResults) ->
     shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert ["30 seeds*" in text for text in shown] == [True, True]
     with pytest.warns(UserWarning, match="qubits=14: 30 seeds, and not all that were asked for"):
-        api.plot("bars", tasks="beam6g", seeds=iter(range(40)), **WHERE)
-    with pytest.raises(OptionError, match=r"plot takes `tasks`, one or several: write tasks='beam6g'"):
-        api.plot("bars", task="beam6g", **WHERE)
+        api.plot("bars", task="beam6g", seeds=iter(range(40)), **WHERE)
+    with pytest.raises(OptionError, match=r"plot takes `task`, one or several: write task='beam6g'"):
+        api.plot("bars", tasks="beam6g", **WHERE)
 
 
 def test_pictures_of_an_environment_take_its_options() -> None:
-    assert api.plot("field", tasks="beam6g", environment={"degree": 5}, resolution=20).axes
+    assert api.plot("field", task="beam6g", environment={"degree": 5}, resolution=20).axes
 
 
 def test_a_picture_names_what_it_leaves_out(
@@ -185,7 +185,7 @@ def test_a_picture_names_what_it_leaves_out(
     with pytest.warns(
         UserWarning, match=r"left out: ddqn mlp width=16: ends at 100000 steps; --horizon 100000"
     ):
-        api.plot("bars", tasks="beam6g", **WHERE)
+        api.plot("bars", task="beam6g", **WHERE)
 
 
 @pytest.mark.parametrize(
@@ -205,25 +205,25 @@ def test_a_picture_names_what_it_leaves_out(
             QrlSuiteError,
             "only entries of one task can be compared",
         ),
-        (lambda: api.plot("curve", tasks="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
+        (lambda: api.plot("curve", task="beam6g", **WHERE), UnknownNameError, "did you mean 'curves'"),
         (lambda: api.plot("curves", **WHERE), OptionError, "holds several tasks"),
         (
-            lambda: api.plot("field", tasks="beam6g", seeds=3),
+            lambda: api.plot("field", task="beam6g", seeds=3),
             OptionError,
             "picture 'field' shows no results: leave --seeds out",
         ),
         (
-            lambda: api.plot("bars", entries=["mlp width=64"], tasks="beam6g", seeds=101, **WHERE),
+            lambda: api.plot("bars", entries=["mlp width=64"], task="beam6g", seeds=101, **WHERE),
             OptionError,
             "has no complete run of seed 100",
         ),
         (
-            lambda: api.plot("bars", tasks="beam6g", epsilon=[0.1], **WHERE),
+            lambda: api.plot("bars", task="beam6g", epsilon=[0.1], **WHERE),
             OptionError,
             "did you mean 'epsilons'",
         ),
         (
-            lambda: api.plot("bars", tasks="beam6g", environment={"degree": 5}, **WHERE),
+            lambda: api.plot("bars", task="beam6g", environment={"degree": 5}, **WHERE),
             OptionError,
             "shows what was trained",
         ),

@@ -174,7 +174,7 @@ def test_a_run_from_before_is_resumed(train: Callable[..., Path], upgrade: Calla
 def test_it_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("qrlsuite.__version__", "0.1.1")
     (row,) = [row for row in options.describe(LaterAlgorithm) if row["name"] == "warm_up"]
-    assert row["description"] == "steps before learning (not in 0.1.1 as released)"
+    assert row["description"] == "steps before learning"
     monkeypatch.setattr("qrlsuite.__version__", "0.2.0")
     rows = {row["name"]: row for row in options.describe(LaterAlgorithm)}
     assert rows["warm_up"]["since"] == "0.2.0"
