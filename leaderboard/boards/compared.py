@@ -129,7 +129,7 @@ def compare_entries(
     comparison = compare(learning_curves(first), learning_curves(second), grid, rule)
     values = {field.name: getattr(comparison, field.name) for field in fields(comparison)}
     remarks = (
-        tables.external_entries([first, second])
+        tables.unlike_others([first, second])
         + tables.changed_thresholds([first, second])
         + [
             f"{entry.label}: settings chosen after seeing runs on protocol seeds, which may flatter"

@@ -120,7 +120,7 @@ class ScoreSection:
             "P: probability that a seed scores more than one of the next entry, ties one half",
         ]
         return [
-            *tables.external_entries(self.entries),
+            *tables.unlike_others(self.entries),
             *lines,
             *([f"fewer than {MIN_RUNS} seeds: {', '.join(self.unranked)}"] if self.unranked else []),
         ]

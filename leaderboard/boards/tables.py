@@ -10,6 +10,7 @@ from qrlsuite.engine.sheet import Column, Sheet
 from qrlsuite.leaderboard.boards.ranked import ranking_of
 from qrlsuite.leaderboard.boards.times import p_text, percent
 from qrlsuite.leaderboard.shelf.absent import absent
+from qrlsuite.notation import START
 from qrlsuite.results.text import counted, hours_text, steps_text
 from qrlsuite.statistics import Direction
 from qrlsuite.statistics.compare import TOO_FEW
@@ -80,7 +81,7 @@ def sheet(section: Section, explain: bool = False) -> Sheet:
     notes = _tier_notes(section) if section.by_tiers else _rank_notes(section)
     promise = [f"rule '{section.rule}': {section.promise}"] * section.by_tiers
     entries = [row.entry for row in section.rows]
-    warnings = [*external_entries(entries), *_diverged(section), *changed_thresholds(entries)]
+    warnings = [*unlike_others(entries), *_diverged(section), *changed_thresholds(entries)]
     remarks = (notes[0], *warnings, *notes[1:], *_marks(section), *promise, *facts(section))
     return Sheet(title(section), tuple(columns), remarks, explain, label=f"{section.task}-{section.horizon}")
 
@@ -329,11 +330,19 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
     return [f"thresholds changed after the first seed: {', '.join(labels)}"] if labels else []
 
 
-def external_entries(entries: Sequence[EntryResults]) -> list[str]:
-    """Say which entries have curves that another program made."""
-    labels = [entry.label for entry in entries if entry.external]
-    line = f"curves that other programs made, and nobody here can train or check again: {', '.join(labels)}"
-    return [line] * bool(labels)
+def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
+    """Say which entries have curves that another program made, and which began with trained agents."""
+    lines = {
+        "curves that other programs made, and nobody here can train or check again": [
+            entry.label for entry in entries if entry.external
+        ],
+        "warm-started, without the steps that their first agents took before": [
+            f"{entry.label.partition(f' {START}=')[0]} (from {entry.identity[START]})"
+            for entry in entries
+            if START in entry.identity
+        ],
+    }
+    return [f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels]
 
 
 def unequal_tuning(section: Section) -> list[str]:

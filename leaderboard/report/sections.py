@@ -81,8 +81,8 @@ class SectionView:
     protocol_seeds: int
     missing: str
     first_alone: str
-    external: str
-    """Which entries other programs trained."""
+    unlike_others: str
+    """Which entries other programs trained, and which began with trained agents."""
     tuning: str
     flattered: str
     """Entries whose settings were chosen on the protocol's seeds."""
@@ -163,7 +163,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
         protocol_seeds=section.rows[0].entry.task_file.protocol.seeds,
         missing=listed(missing) if missing else "",
         first_alone=", ".join(row.name for row in rows if row.row.entry.first_network_alone),
-        external=clean("".join(tables.external_entries([row.entry for row in section.rows]))),
+        unlike_others=clean("; ".join(tables.unlike_others([row.entry for row in section.rows]))),
         tuning=clean("; ".join(tables.unequal_tuning(section))),
         flattered=", ".join(row.name for row in rows if row.row.entry.on_protocol_seeds),
         ladder=ladder.draw(

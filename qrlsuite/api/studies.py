@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -11,13 +13,14 @@ from typing import Any, Literal
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from qrlsuite import registry, specs
+from qrlsuite import own, registry, specs
 from qrlsuite.api.arguments import Seeds, check_positive, several, where_of
 from qrlsuite.engine import budget as budgets
 from qrlsuite.engine import missing
 from qrlsuite.engine.terminal import Shown, again, command
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, nearest
+from qrlsuite.experiment import identity
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.pictures import FORMATS
@@ -95,7 +98,7 @@ def new_study(
     Parameters
     ----------
     path:
-        The file, NAME.toml. It can be edited until its first seed begins.
+        The file, NAME.toml. It names the plugins by path of its entries, and can be edited until its first seed begins.
     entries:
         Two or more: `"mlp width=64"`, `"vqc-native qubits=10"`; tuned: `"mlp preset=FILE.toml"`.
     task, epochs:
@@ -135,8 +138,21 @@ def new_study(
         reason=reason,
     )
     outcome = StudyOutcome(study, study.read())
-    write_atomically(file, study_files.dumps(study.file).encode())
+    write_atomically(file, (_plugins_of(study, file) + study_files.dumps(study.file)).encode())
     return outcome
+
+
+def _plugins_of(study: StudyWithLooks, file: Path) -> str:
+    """Return the line that names the plugins by path of a study's entries, relative to its file; `""` without any."""
+    used = {
+        source.path: source.name for entry in study.entries.values() for source in identity.plugins(entry)
+    }
+    paths = [
+        Path(os.path.relpath(path, file.absolute().parent)).as_posix()
+        for path, name in sorted(used.items())
+        if (known := own.of_distribution(name)) is not None and not known.cell
+    ]
+    return f"plugins = {json.dumps(paths)}\n\n" if paths else ""
 
 
 def read_study(

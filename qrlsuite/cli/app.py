@@ -91,13 +91,13 @@ RENAMED = {
     "decide run": "qrlsuite study run",
     "decide end": "qrlsuite study end",
     "decide plot": "qrlsuite study draw",
-    "decide show": "qrlsuite show",
-    "decide status": "qrlsuite show",
+    "decide show": "qrlsuite show STUDY",
+    "decide status": "qrlsuite show STUDY",
     "decide export": "qrlsuite export",
     "decide": "qrlsuite study",
     "study list": "qrlsuite list studies",
-    "study show": "qrlsuite show study",
-    "study status": "qrlsuite show study",
+    "study show": "qrlsuite show STUDY",
+    "study status": "qrlsuite show STUDY",
 }
 """Commands of earlier versions, one word or two, and what does their work now."""
 

@@ -17,6 +17,7 @@ from qrlsuite.errors import EnvironmentFailure, FileError, OptionError, PluginEr
 from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER
 from qrlsuite.studies.outcome import in_folder
 from qrlsuite.training.remote_task import pack, unpack, work_on
@@ -692,3 +693,14 @@ def test_a_mistake_in_a_users_file_is_one_line_that_names_its_place(
     with pytest.raises((OptionError, PluginError, EnvironmentFailure), match=expected) as caught:
         train()
     assert "\n" not in str(caught.value)
+
+
+def test_a_new_study_names_the_plugins_of_its_entries() -> None:
+    ring = own.load(write("ring.py", RING))
+    Path("studies").mkdir()
+    entries = ["vqc-native qubits=3 ansatz=ring", "mlp width=16"]
+    api.new_study("studies/ring.toml", entries, task="beam6g", runs="none")
+    own.unload(ring)
+    assert Path("studies/ring.toml").read_text().startswith('plugins = ["../ring.py"]\n')
+    assert study.load("studies/ring.toml").file.looks is not None
+    assert names() == {"ansatz": ["ring"]}

@@ -21,6 +21,7 @@ from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
@@ -103,7 +104,11 @@ def test_names_mean_the_cold_entry_or_the_warm_one(root: Path) -> None:
     assert collect.find(root / "runs", "mlp width=16", tasks=["other"]).folder == cold
     assert collect.find(root / "runs", warm.entry().label).folder == warm.path
     text = warm.entry().start
-    assert collect.find(root / "runs", f"other/mlp from={text} width=16").folder == warm.path
+    found = collect.find(root / "runs", f"other/mlp from={text} width=16")
+    assert found.folder == warm.path
+    (note,) = tables.unlike_others([found])
+    assert note.startswith("warm-started, ")
+    assert note.endswith(f" mlp width=16 (from {text})")
 
 
 def test_seeds_begin_with_their_agents_and_all_else_is_fresh(trained: Path) -> None:

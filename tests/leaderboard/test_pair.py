@@ -192,3 +192,9 @@ def test_the_board_says_of_a_pair_what_compare_says_with_its_own_p() -> None:
     assert alone.verdict.startswith("first needs ")
     assert on.sentence.startswith("not told apart: first needs ")
     assert on.times.p > alone.pair.times.p
+
+
+def test_a_verdict_of_short_runs_begins_with_their_steps() -> None:
+    short = [entry(name, spread(start)).cut(50) for name, start in (("first", 20), ("second", 40))]
+    said = compare_entries(*short).verdict
+    assert said.startswith("after 100k of 200k steps: first needs 4")
