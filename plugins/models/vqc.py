@@ -363,7 +363,8 @@ def build_circuit(options: VQCOptions) -> Circuit:
 
 def _scales(circuit: Circuit) -> set[str]:
     """Return the names of the parameters that multiply inputs."""
-    return {a.scale.parameter for operation in circuit for a in operation.angles if a.scale is not None}
+    angles = [angle for operation in circuit for angle in operation.angles]
+    return {a.scale.parameter for a in angles if a.scale is not None and a.input is not None}
 
 
 def build(

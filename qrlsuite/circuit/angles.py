@@ -43,10 +43,10 @@ class AngleTable:
         for operation in circuit:
             rows: list[int | float] = []
             for angle in operation.angles:
-                if angle.input is None and angle.weight is None:
+                if angle.input is None and angle.scale is None and angle.weight is None:
                     rows.append(angle.constant)
                     continue
-                if angle.factor is not None:
+                if angle.product is not None:
                     raise CircuitError("products of inputs are written as inputs by `create_backend`")
                 rows.append(len(constant))
                 constant.append(angle.constant)

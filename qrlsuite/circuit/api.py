@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import numpy as np
 
-from qrlsuite.circuit.description import MAX_QUBITS, Circuit, mean_field_refusal, without_products
+from qrlsuite.circuit.description import MAX_QUBITS, Circuit, Product, mean_field_refusal, without_products
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, nearest
 
 if TYPE_CHECKING:
@@ -225,14 +225,21 @@ class _WithProducts:
         return self.backend(extended(inputs, self.products), parameters, seeds)
 
 
-def extended(inputs: torch.Tensor, products: Sequence[tuple[int, int]]) -> torch.Tensor:
-    """Return inputs (..., in) with products of two of them behind, see `without_products`."""
+def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
+    """Return inputs (..., in) with products of them behind, see `without_products`."""
     import torch
 
     if not products:
         return inputs
-    first, second = zip(*products)
-    return torch.cat([inputs, inputs[..., list(first)] * inputs[..., list(second)]], dim=-1)
+    first, second, times = zip(*products)
+    factors = inputs
+    if None in first or None in second:  # 1 stands behind the inputs
+        factors = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1)
+    left, right = ([-1 if i is None else i for i in each] for each in (first, second))
+    further = factors[..., left] * factors[..., right]
+    if any(number != 1.0 for number in times):
+        further = further * inputs.new_tensor(times)
+    return torch.cat([inputs, further], dim=-1)
 
 
 def _make(factory: Any, circuit: Circuit, chosen: Any) -> CircuitBackend:

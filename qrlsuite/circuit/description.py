@@ -4,10 +4,10 @@ A `Circuit` is a list of operations on qubits 0..n-1. Every rotation angle is af
 
     angle = constant + scale * input + weight
 
-where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale
-with an input present counts as 1), and `input` may be a product of two inputs. Reading order is application order.
-Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured observables are Pauli Z on
-chosen qubits (default: every), or products of them.
+where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale with an
+input present counts as 1), and `input` may be a product of two inputs, a multiple, or a number. Reading order is
+application order. Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured
+observables are Pauli Z on chosen qubits (default: every), or products of them.
 
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
@@ -90,14 +90,20 @@ class Element:
     index: int
 
 
+Product = tuple[int | None, int | None, float]
+"""A product of inputs: the first (None for 1), the second (None for 1), and a number."""
+
+
 @dataclass(frozen=True, slots=True)
 class Angle:
-    """`constant + scale * input + weight`, in radians. Built with `+` and `*` from inputs and parameters.
+    """`constant + scale * input + weight`, in radians. Built with `+` and `*` from inputs, parameters and numbers.
 
     Attributes
     ----------
     factor:
         A second input, by which the first is multiplied.
+    times:
+        A number by which the input term is multiplied. A scale without an input is multiplied by this number alone.
     """
 
     constant: float = 0.0
@@ -105,26 +111,43 @@ class Angle:
     scale: Element | None = None
     weight: Element | None = None
     factor: int | None = None
+    times: float = 1.0
 
-    def __mul__(self, other: Angle) -> Angle:
-        """Multiply an input by another one or by a trainable scale (in any order); nothing else may be multiplied."""
+    def __mul__(self, other: Angle | float) -> Angle:
+        """Multiply inputs, a trainable scale and numbers (in any order); nothing else may be multiplied."""
+        if isinstance(other, int | float | np.integer | np.floating):
+            return self._multiple(float(other))
         for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
-            if a.is_bare_input and b.is_bare_weight:
-                return Angle(input=a.input, scale=b.weight, factor=a.factor)
+            times = a.times * b.times
+            if a.is_bare_input and (parameter := b._parameter):
+                return Angle(input=a.input, scale=parameter, factor=a.factor, times=times)
             if a.is_bare_input and b.is_bare_input and a.factor is b.factor is None:
-                return Angle(input=a.input, factor=b.input)
+                return Angle(input=a.input, factor=b.input, times=times)
             if a._is_scaled_input and b.is_bare_input and a.factor is b.factor is None:
-                return Angle(input=a.input, scale=a.scale, factor=b.input)
+                return Angle(input=a.input, scale=a.scale, factor=b.input, times=times)
         what = (
             "an angle is affine"
             if isinstance(other, Angle)
             else f"an angle cannot be multiplied by {other!r}"
         )
-        raise CircuitError(
-            f"{what}: only input * parameter, input * input and input * input * parameter can be multiplied"
-        )
+        raise CircuitError(f"{what}: only one or two inputs, one parameter and numbers can be multiplied")
 
     __rmul__ = __mul__
+
+    def _multiple(self, number: float) -> Angle:
+        """Return the angle times a number: of a sum of an input and a weight, no multiple can be written."""
+        if self.weight is None:
+            times = self.times * number if self._has_term else 1.0
+            return replace(self, constant=self.constant * number + 0.0, times=times)  # no -0.0
+        if self.input is None and self.scale is None:
+            return Angle(constant=self.constant * number + 0.0, scale=self.weight, times=number)
+        raise CircuitError(
+            f"a sum of an input and a parameter cannot be multiplied by {number:g}: multiply the input, and give the "
+            "parameter another range (low, high)"
+        )
+
+    def __neg__(self) -> Angle:
+        return self._multiple(-1.0)
 
     def __add__(self, other: Angle | float) -> Angle:
         """Add two angles: at most one input term and one weight may remain."""
@@ -132,18 +155,23 @@ class Angle:
             return replace(self, constant=self.constant + float(other))
         if not isinstance(other, Angle):
             return NotImplemented
-        if (self.input is not None and other.input is not None) or (self.weight and other.weight):
+        if (self._has_term and other._has_term) or (self.weight and other.weight):
             raise CircuitError("an angle holds at most one input term and one weight: scale * input + weight")
-        term = self if self.input is not None else other
-        return Angle(
-            constant=self.constant + other.constant,
-            input=term.input,
-            scale=term.scale,
-            weight=self.weight or other.weight,
-            factor=term.factor,
-        )
+        term = self if self._has_term else other
+        return replace(term, constant=self.constant + other.constant, weight=self.weight or other.weight)
 
     __radd__ = __add__
+
+    def __sub__(self, other: Angle | float) -> Angle:
+        return self + -other
+
+    def __rsub__(self, other: float) -> Angle:
+        return -self + other
+
+    @property
+    def _has_term(self) -> bool:
+        """Whether there is an input, or a multiple of a parameter, which stands in its place."""
+        return self.input is not None or self.scale is not None
 
     @property
     def is_bare_input(self) -> bool:
@@ -157,9 +185,16 @@ class Angle:
         )
 
     @property
-    def is_bare_weight(self) -> bool:
-        """Whether this is a single trainable parameter and nothing else."""
-        return self.input is None and self.weight is not None and self.constant == 0.0
+    def _parameter(self) -> Element | None:
+        """The one parameter of which this is a multiple, and nothing else."""
+        alone = self.input is None and self.constant == 0.0 and (self.scale is None) != (self.weight is None)
+        return (self.scale or self.weight) if alone else None
+
+    @property
+    def product(self) -> Product | None:
+        """The product that the input term stands for; None where that is an input, or there is none."""
+        plain = self.input is not None and self.factor is None and self.times == 1.0
+        return None if plain or not self._has_term else (self.input, self.factor, self.times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,15 +400,13 @@ class Circuit:
                 self.append(name, wire, *values)
 
     def _check(self, angle: Angle) -> None:
-        if not math.isfinite(angle.constant):
-            raise CircuitError("an angle's constant must be finite")
+        if not (math.isfinite(angle.constant) and math.isfinite(angle.times)):
+            raise CircuitError("an angle's numbers must be finite")
         for feature in (angle.input, angle.factor):
             if feature is not None and not 0 <= feature < self.inputs:
                 raise CircuitError(f"input {feature}: this circuit has inputs 0..{self.inputs - 1}")
         if angle.factor is not None and angle.input is None:
             raise CircuitError("a second input needs a first one to multiply")
-        if angle.scale is not None and angle.input is None:
-            raise CircuitError("a scale needs an input to multiply")
         for element in (angle.scale, angle.weight):
             if element is None:
                 continue
@@ -442,32 +475,25 @@ class Circuit:
         return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count}{kind})"
 
 
-def without_products(circuit: Circuit) -> tuple[Circuit, tuple[tuple[int, int], ...]]:
-    """Write products of inputs as inputs of their own, behind the others.
+def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Product, ...]]:
+    """Write products and multiples of inputs, and numbers before a parameter, as inputs behind the others.
 
     Returns
     -------
     tuple
-        A circuit without products (the same one where it has none), and the two factors of each further input.
+        A circuit without products (the same one where it has none), and the factors of each further input.
     """
-    pairs = [
-        (angle.input, angle.factor)
-        for operation in circuit
-        for angle in operation.angles
-        if angle.input is not None and angle.factor is not None
-    ]
-    if not pairs:
+    written = [angle.product for operation in circuit for angle in operation.angles]
+    if not any(written):
         return circuit, ()
-    products = tuple(dict.fromkeys(pairs))
+    products = tuple(dict.fromkeys(each for each in written if each is not None))
     plain = Circuit(circuit.qubits, circuit.inputs + len(products), circuit.mean_field)
     plain.parameters = dict(circuit.parameters)
     for operation in circuit:
         angles = [
             angle
-            if angle.input is None or angle.factor is None
-            else replace(
-                angle, input=circuit.inputs + products.index((angle.input, angle.factor)), factor=None
-            )
+            if (product := angle.product) is None
+            else replace(angle, input=circuit.inputs + products.index(product), factor=None, times=1.0)
             for angle in operation.angles
         ]
         plain.append(operation.gate, operation.wires, *angles, control=operation.control)
@@ -503,6 +529,6 @@ def _written(angle: Angle) -> str:
     inputs = [f"x{index}" for index in (angle.input, angle.factor) if index is not None]
     scale = [f"{angle.scale.parameter}[{angle.scale.index}]"] if angle.scale else []
     weight = [f"{angle.weight.parameter}[{angle.weight.index}]"] if angle.weight else []
-    return "+".join(
-        [repr(float(angle.constant)), *(["*".join([*scale, *inputs])] if inputs else []), *weight]
-    )
+    times = [] if angle.times == 1.0 or not angle._has_term else [repr(float(angle.times))]
+    term = [*times, *scale, *inputs]
+    return "+".join([repr(float(angle.constant)), *(["*".join(term)] if term else []), *weight])

@@ -24,10 +24,11 @@ BOX = {"facecolor": "white", "edgecolor": "black"}
 def angle_text(angle: Angle) -> str:
     """Write an angle as `constant + scale*input + weight`."""
     terms = []
-    if angle.input is not None:
-        scale = "" if angle.scale is None else f"{angle.scale.parameter}[{angle.scale.index}]*"
-        factor = "" if angle.factor is None else f"*x{angle.factor}"
-        terms.append(f"{scale}x{angle.input}{factor}")
+    if angle.input is not None or angle.scale is not None:
+        times = [] if angle.times == 1.0 else [f"{angle.times:.4g}"]
+        scale = [] if angle.scale is None else [f"{angle.scale.parameter}[{angle.scale.index}]"]
+        inputs = [f"x{each}" for each in (angle.input, angle.factor) if each is not None]
+        terms.append("*".join([*times, *scale, *inputs]))
     if angle.weight is not None:
         terms.append(f"{angle.weight.parameter}[{angle.weight.index}]")
     if angle.constant or not terms:

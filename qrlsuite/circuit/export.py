@@ -41,8 +41,9 @@ def export(circuit: Circuit, format: str) -> str:
 def _formula(angle: Angle, feature: Callable[[int], str], element: Callable[[Element], str]) -> str:
     """Write an angle as a Python or QASM expression."""
     terms = []
-    if angle.input is not None:
-        factors = [] if angle.scale is None else [element(angle.scale)]
+    if angle.input is not None or angle.scale is not None:
+        factors = [] if angle.times == 1.0 else [repr(angle.times)]
+        factors += [] if angle.scale is None else [element(angle.scale)]
         factors += [feature(i) for i in (angle.input, angle.factor) if i is not None]
         terms.append(" * ".join(factors))
     if angle.weight is not None:

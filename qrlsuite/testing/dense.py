@@ -72,10 +72,10 @@ def _mean_field_values(
 
 def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:
     value = angle.constant
-    if angle.input is not None:
+    if angle.input is not None or angle.scale is not None:
         scale = 1.0 if angle.scale is None else parameters[angle.scale.parameter].flat[angle.scale.index]
-        factor = 1.0 if angle.factor is None else inputs[angle.factor]
-        value += float(scale * inputs[angle.input] * factor)
+        first, second = (1.0 if each is None else inputs[each] for each in (angle.input, angle.factor))
+        value += float(scale * first * second * angle.times)
     if angle.weight is not None:
         value += float(parameters[angle.weight.parameter].flat[angle.weight.index])
     return value

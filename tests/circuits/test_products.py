@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend, expectations
 from qrlsuite.circuit.angles import AngleTable
-from qrlsuite.circuit.description import without_products
+from qrlsuite.circuit.description import canonical, without_products
 from qrlsuite.circuit.drawing import angle_text, draw_text
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import CircuitError, OptionError
@@ -35,6 +35,20 @@ def rich():
     return circuit
 
 
+def multiples():
+    """Return a circuit with numbers before inputs, products of these, and parameters."""
+    circuit = Circuit(3, inputs=2)
+    w, (x, y) = circuit.parameter("w", (4,)), map(circuit.input, range(2))
+    circuit.append("RY", 0, 2 * x + w[0])
+    circuit.append("RX", 1, -0.5 * w[1])
+    circuit.append("RY", 1, 0.3 - w[1] * (x * 3))
+    circuit.append("RZZ", (0, 1), (np.pi - x) * 0.5)
+    circuit.append("RY", 2, 1.5 * (x * y) + w[3])
+    circuit.append("RX", 2, (2 * w[2] + 1) * 0.25, control=0)
+    circuit.measure([0, (0, 1), 2])
+    return circuit
+
+
 @pytest.mark.parametrize("gate", ["RXX", "RYY", "RZZ"])
 def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
     circuit = Circuit(2, inputs=1)
@@ -58,9 +72,10 @@ def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
     assert shift_evaluations(circuit) == 2
 
 
+@pytest.mark.parametrize("make", [rich, multiples])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_values_and_gradients_on_every_backend(backend):
-    circuit = rich()
+def test_values_and_gradients_on_every_backend(backend, make):
+    circuit = make()
     inputs, parameters, cotangent = draw(circuit, 2, 2)
     got = evaluate(create_backend(backend, circuit), inputs, parameters, cotangent)
     x, w, c = inputs.numpy(), parameters["w"].numpy(), cotangent.numpy()
@@ -141,14 +156,21 @@ def test_products_are_drawn():
     angles = [angle_text(a) for op in circuit for a in op.angles]
     assert "w[4]*x1*x2 + w[5]" in angles
     assert "x0*x1" in draw_text(circuit, angles=True)
+    angles = [angle_text(a) for op in multiples() for a in op.angles]
+    assert angles[:4] == ["2*x0 + w[0]", "-0.5*w[1]", "-3*w[1]*x0 + 0.3", "-0.5*x0 + 1.571"]
+    assert "\nRX 1 0.0+-0.5*w[1]\n" in canonical(multiples())
 
 
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         (lambda c: c.input(0) * c.input(1) * c.input(0), "an angle is affine: only"),
-        (lambda c: c.input(0) * 3.14, "an angle cannot be multiplied by 3.14: only input . parameter"),
-        (lambda c: 2 * c.input(0), "an angle cannot be multiplied by 2: only input . parameter"),
+        (lambda c: c.input(0) * "2", "an angle cannot be multiplied by '2': only one or two inputs"),
+        (
+            lambda c: 2 * (c.input(0) + c.parameter("w", (1,))[0]),
+            "a sum of an input and a parameter cannot be",
+        ),
+        (lambda c: c.append("RX", 0, c.input(0) * float("inf")), "numbers must be finite"),
         (lambda c: c.append("RZZ", 0, 0.1), "RZZ takes 2 wires, 1 angle and no control"),
         (lambda c: c.append("RXY", (0, 1), 0.1), "unknown gate 'RXY'; did you mean"),
         (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, are needed"),

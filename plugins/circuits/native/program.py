@@ -255,7 +255,7 @@ class Compiler:
 
     def angle(self, angle: Angle) -> int:
         """Add an angle to the table; returns its index."""
-        if angle.factor is not None:
+        if angle.product is not None:
             raise CircuitError("products of inputs are written as inputs by `create_backend`")
         scale, weight = (
             NONE if element is None else self.offset[element.parameter] + element.index
