@@ -207,7 +207,7 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
 class _WithProducts:
     """A backend of a circuit whose angles have products of inputs, which the backend gets as further inputs."""
 
-    def __init__(self, backend: CircuitBackend, products: tuple[tuple[int, int], ...]) -> None:
+    def __init__(self, backend: CircuitBackend, products: tuple[Product, ...]) -> None:
         self.backend = backend
         self.products = products
         self.shots = backend.shots
