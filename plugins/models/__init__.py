@@ -10,7 +10,7 @@ from qrlsuite.specs import NO_MODEL, ModelSpec
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-BACKEND` and `qlstm-BACKEND` for each backend."""
+    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-`, `qlstm-` and `qfwp-BACKEND`."""
     register(
         ModelSpec(
             name="mlp",
@@ -77,6 +77,19 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             population="qrlsuite.plugins.models.qlstm:population",
             memory="qrlsuite.plugins.models.qlstm:memory",
             faster="qlstm-native",
+            backends=True,
+        )
+    )
+    register(
+        ModelSpec(
+            name="qfwp",
+            summary="Quantum fast weights, a circuit whose angles remember",
+            family="quantum",
+            options="qrlsuite.plugins.models.qfwp:QFWPOptions",
+            build="qrlsuite.plugins.models.qfwp:build",
+            population="qrlsuite.plugins.models.qlstm:population",
+            memory="qrlsuite.plugins.models.vqc:memory",
+            faster="qfwp-native",
             backends=True,
         )
     )

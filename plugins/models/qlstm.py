@@ -35,7 +35,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from torch import Tensor
+from torch import Tensor, nn
 
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
@@ -56,16 +56,39 @@ class QLSTMOptions(VQCOptions):
     ansatz: Annotated[str, Field(description="circuit family: iqp, cx, cz, skolik, or a plugin's")] = "cz"
 
 
-class _Cells(vqc._Hybrid):
-    """What one agent's module and a population have in common; circuits' parameters have an axis of the four gates."""
+class Remembering(vqc._Hybrid):
+    """What networks with circuits that remember have in common, of one agent or of S.
 
-    width: int
-    """Numbers of h, and of m."""
+    Parameters
+    ----------
+    runner, state:
+        The circuit, and parameters by name, with a leading axis S in a population.
+    remembers:
+        How many numbers an agent remembers.
+    alone:
+        Whether this is one agent's: (B, in) and a state (B, remembers) to outputs (B, out) and the next state; else all
+        of these have a leading axis S.
+    """
 
-    @property
-    def remembers(self) -> int:
-        """How many numbers an agent remembers."""
-        return 2 * self.width
+    def __init__(
+        self, runner: vqc._Runner, state: dict[str, Tensor], remembers: int, alone: bool = True
+    ) -> None:
+        super().__init__(runner, state)
+        self.remembers, self._alone = remembers, alone
+
+    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
+        """Return outputs and the next state; without a state those outputs alone that an episode begins with."""
+        seen = x[None] if self._alone else x
+        own = {name: p[None] if self._alone else p for name, p in self.named_parameters()}
+        before = seen.new_zeros((*seen.shape[:2], self.remembers))
+        if state is not None:
+            before = state[None] if self._alone else state
+        results = [each[0] if self._alone else each for each in self.step(seen, before, own)]
+        return results[0] if state is None else tuple(results)
+
+    def step(self, x: Tensor, before: Tensor, own: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return outputs (S, B, out) and the next state for (S, B, in) and a state, with parameters (S, ...)."""
+        raise NotImplementedError
 
     def circuit_states(self, x: Tensor) -> Tensor:
         """Refuse: they depend on what is remembered, too."""
@@ -73,74 +96,55 @@ class _Cells(vqc._Hybrid):
             "--entanglement: the states of circuits that remember are not known by observations alone"
         )
 
-    def _step(self, x: Tensor, state: Tensor | None, own: dict[str, Tensor]) -> Any:
-        """Map (S, B, in) and (S, B, remembers) to outputs and the next state, with parameters (S, ...)."""
-        runner, options = self._runner, self._runner.options
-        seeds, batch = x.shape[:2]
-        before = x.new_zeros((seeds, batch, self.remembers)) if state is None else state
-        shared = self._circuit_inputs(torch.cat([x, before[..., : self.width]], 2), own)
+    def measured(
+        self, inputs: Tensor, parameters: dict[str, Tensor], seeds: list[int] | None, circuits: int
+    ) -> Tensor:
+        """Return expectation values; every agent executes a number of circuits, and their gradients."""
+        values = self._runner.backend(inputs, parameters, seeds)
+        executions = self._runner.executions
+        executions.forward += circuits
+        if values.requires_grad:
+            values.register_hook(lambda grad: executions.count_backward(circuits))  # type: ignore[no-untyped-call]
+        return ACTIVATIONS[self._runner.options.activation_out](values)
+
+    def shown(self, values: Tensor, own: dict[str, Tensor]) -> Tensor:
+        """Return outputs (S, B, out) by what is behind the circuits."""
+        if self._runner.options.linear:
+            return linear(values, own["output.weight"], own["output.bias"])
+        factors = own["output.weight"][:, None]
+        return values[..., : factors.shape[2]] * factors
+
+
+class QLSTM(Remembering):
+    """Quantum LSTM; parameters of circuits have an axis of the four gates, behind S in a population."""
+
+    def step(self, x: Tensor, before: Tensor, own: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return outputs and the next state, see `Remembering`."""
+        (seeds, batch), width = x.shape[:2], self.remembers // 2
+        shared = self._circuit_inputs(torch.cat([x, before[..., :width]], 2), own)
         given = shared[:, None].expand(-1, GATES, -1, -1).reshape(seeds * GATES, batch, -1)
-        parameters = {name: own[f"circuit.{name}"].flatten(0, 1) for name in runner.circuit.parameters}
+        parameters = {name: own[f"circuit.{name}"].flatten(0, 1) for name in self._runner.circuit.parameters}
         drawn = self._shot_seeds()
         each = (
             None if drawn is None else [vqc._derived(seed, gate) for seed in drawn for gate in range(GATES)]
         )
-        values = runner.backend(given, parameters, each)
-        runner.executions.forward += GATES * batch
-        if values.requires_grad:
-            values.register_hook(lambda grad: runner.executions.count_backward(GATES * batch))  # type: ignore[no-untyped-call]
-        values = ACTIVATIONS[options.activation_out](values).view(seeds, GATES, batch, -1)
-        after = lstm_step(values[..., : self.width].transpose(1, 2).flatten(2), before.to(values.dtype))
-        shown = after[..., : self.width]
-        if options.linear:
-            outputs = linear(shown, own["output.weight"], own["output.bias"])
-        else:
-            factors = own["output.weight"][:, None]
-            outputs = shown[..., : factors.shape[2]] * factors
-        outputs = outputs.to(x.dtype)
-        return outputs if state is None else (outputs, after.to(x.dtype))
+        values = self.measured(given, parameters, each, GATES * batch).view(seeds, GATES, batch, -1)
+        after = lstm_step(values[..., :width].transpose(1, 2).flatten(2), before.to(values.dtype))
+        return self.shown(after[..., :width], own).to(x.dtype), after.to(x.dtype)
 
 
-class QLSTM(_Cells):
-    """One agent's quantum LSTM: (B, in) and a state (B, remembers) to outputs (B, out) and the next state."""
-
-    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
-        """Return outputs and the next state; without a state those outputs alone that an episode begins with."""
-        own = {name: p[None] for name, p in self.named_parameters()}
-        results = self._step(x[None], None if state is None else state[None], own)
-        return results[0] if state is None else tuple(each[0] for each in results)
-
-
-class QLSTMPopulation(_Cells):
-    """S quantum LSTMs: (S, B, in) and a state (S, B, remembers); parameters as in `QLSTM` with a leading axis S.
-
-    Raises
-    ------
-    OptionError
-        If the backend cannot run the circuit.
-    """
-
-    def __init__(self, modules: Sequence[QLSTM], options: QLSTMOptions) -> None:
-        runner = vqc._Runner(options)
-        _ = runner.backend  # prepared now, so that what it cannot do is known before training
-        states = [{**dict(m.named_parameters()), **dict(m.named_buffers())} for m in modules]
-        stacked = {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
-        super().__init__(runner, stacked)
-        self.width = modules[0].width
-
-    def forward(self, x: Tensor, state: Tensor | None = None) -> Any:
-        """Return outputs (S, B, out), and with a state the next one."""
-        return self._step(x, state, dict(self.named_parameters()))
-
-
-def build(obs_dim: int, out_dim: int, options: QLSTMOptions, generator: torch.Generator) -> QLSTM:
-    """Build one agent's quantum LSTM with every random number drawn from `generator`.
+def build(
+    obs_dim: int, out_dim: int, options: QLSTMOptions, generator: torch.Generator, role: str = "network"
+) -> nn.Module:
+    """Build one agent's quantum LSTM with every random number drawn from `generator`, see `vqc.build`.
 
     Raises
     ------
     OptionError
         If the ansatz cannot be built with these options, or does not fit the task without linear layers.
     """
+    if role == "critic" and options.critic == "mlp":
+        return vqc.build(obs_dim, out_dim, options, generator, role)
     runner = vqc._Runner(options)
     circuit, values = runner.circuit, len(runner.circuit.observables)
     width = values if options.linear else circuit.inputs - obs_dim
@@ -150,31 +154,62 @@ def build(obs_dim: int, out_dim: int, options: QLSTMOptions, generator: torch.Ge
             f"{obs_dim} observations and {out_dim} outputs: choose {obs_dim + out_dim} qubits or more, so that the "
             "inputs beyond the observations are as many as the outputs or more"
         )
+    state = initial(runner, obs_dim + width, width, out_dim, (GATES,), generator)
+    return QLSTM(runner, state, 2 * width)
+
+
+def initial(
+    runner: vqc._Runner,
+    inputs: int,
+    values: int,
+    outputs: int,
+    copies: tuple[int, ...],
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """Draw an agent's parameters, as `vqc` does.
+
+    Parameters
+    ----------
+    inputs, values, outputs:
+        Numbers before the circuits, of their expectation values that are shown, and behind the last layer.
+    copies:
+        How many values each parameter of the circuit has, as a shape.
+    """
+    circuit, options = runner.circuit, runner.options
     state: dict[str, Tensor] = {}
     if options.linear:
-        state["input.weight"], state["input.bias"] = initial_layer(
-            obs_dim + width, circuit.inputs, "torch", generator
-        )
+        state["input.weight"], state["input.bias"] = initial_layer(inputs, circuit.inputs, "torch", generator)
     for name, parameter in circuit.parameters.items():
-        uniform = torch.rand((GATES, *parameter.shape), generator=generator)
+        uniform = torch.rand((*copies, *parameter.shape), generator=generator)
         state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
         if name in vqc._scales(circuit):
             state[f"circuit.{name}"] *= options.init_scale
     if options.linear:
-        state["output.weight"], state["output.bias"] = initial_layer(width, out_dim, "torch", generator)
+        state["output.weight"], state["output.bias"] = initial_layer(values, outputs, "torch", generator)
     else:
-        state["output.weight"] = torch.ones(out_dim)
+        state["output.weight"] = torch.ones(outputs)
     state = {name: value.to(getattr(torch, options.dtype)) for name, value in state.items()}
     state["shot_key"] = torch.randint(2**63 - 1, (), generator=generator)
     state["shot_count"] = torch.zeros((), dtype=torch.int64)
-    made = QLSTM(runner, state)
-    made.width = width
-    return made
+    return state
 
 
-def population(modules: Sequence[QLSTM], options: QLSTMOptions) -> QLSTMPopulation:
-    """Stack built models."""
-    return QLSTMPopulation(modules, options)
+def population(modules: Sequence[Any], options: VQCOptions) -> nn.Module:
+    """Stack built networks that remember, or perceptrons of critics.
+
+    Raises
+    ------
+    OptionError
+        If the backend cannot run the circuit.
+    """
+    first = modules[0]
+    if not isinstance(first, Remembering):
+        return vqc.population(modules, options)
+    runner = vqc._Runner(options)
+    _ = runner.backend  # prepared now, so that what it cannot do is known before training
+    states = [{**dict(m.named_parameters()), **dict(m.named_buffers())} for m in modules]
+    stacked = {name: torch.stack([s[name].detach() for s in states]) for name in states[0]}
+    return type(first)(runner, stacked, first.remembers, alone=False)
 
 
 def memory(options: QLSTMOptions, agents: int, batch: int, copies: int) -> int:

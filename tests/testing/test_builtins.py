@@ -59,7 +59,7 @@ WHERE_OFFERED = {
             "gru",
             "lstm",
             "mlp",
-            *(f"{m}-{b}" for m in ("vqc", "qlstm") for b in BACKENDS),
+            *(f"{m}-{b}" for m in ("vqc", "qlstm", "qfwp") for b in BACKENDS),
         )
     },
     **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
