@@ -52,6 +52,8 @@ class Shares:
     horizons: tuple[int, ...]
     values: Mapping[str, tuple[FloatArray, ...]]
     refused: tuple[str, ...]
+    before: str = "below"
+    """The side of every task's thresholds where runs have not reached them; `short of` where tasks differ."""
 
     def rliable(self) -> dict[str, FloatArray]:
         """Return {entry: (runs, tasks)} as rliable takes it: 1 minus the shares, for there more is better."""
@@ -74,9 +76,9 @@ class AcrossSection:
             f"{task} ({steps_text(horizon)} steps)"
             for task, horizon in zip(self.shares.tasks, self.shares.horizons)
         )
-        what = "time below threshold as a share of the horizon"
+        what = f"time {self.shares.before} threshold as a share of the horizon"
         if self.by != "steps":
-            what = f"{self.by} below threshold as a share of what the cheapest entry spent"
+            what = f"{self.by} {self.shares.before} threshold as a share of what the cheapest entry spent"
         return f"across {', '.join(parts)}: {what}"
 
     @property
@@ -275,7 +277,14 @@ def shares(
             [learning_curves(entry).cut(end) for entry in members] if by == "steps" else _along(members, by)
         )
         by_task.append([horizon_shares(each, ranking_of([e]).grid) for e, each in zip(members, curves)])
-    return Shares(tuple(tasks), tuple(horizons), dict(zip(whole, zip(*by_task))), tuple(lines))
+    sides = {entry.task_file.ranking.before for of_entry in whole.values() for entry in of_entry.values()}
+    return Shares(
+        tuple(tasks),
+        tuple(horizons),
+        dict(zip(whole, zip(*by_task))),
+        tuple(lines),
+        sides.pop() if len(sides) == 1 else "short of",
+    )
 
 
 def _reaching(

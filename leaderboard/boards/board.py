@@ -27,6 +27,12 @@ AXES = ("steps", *costs.UNITS, *scores.OF_RUNS)
 """What entries may be ranked by."""
 
 
+def axes_of(entries: Sequence[EntryResults]) -> tuple[str, ...]:
+    """Return what entries may be ranked by: `AXES`, and the costs that a task of theirs names."""
+    named = {name for entry in entries for name in entry.task_file.ranking.costs}
+    return (*AXES, *sorted(named - set(AXES)))
+
+
 class Section(Protocol):
     """A table of a board: one task at one horizon, or several tasks."""
 
@@ -117,7 +123,7 @@ def build(
         Which entries have a row. All are compared: what is shown changes no verdict. None means all. By cost all have
         one, for the cheapest sets the budget of the others.
     by:
-        One of `AXES`.
+        One of `axes_of`: of `AXES`, or what the task's `[ranking] costs` names.
     together:
         Tasks over which the means of entries are compared, in one section.
 
@@ -129,9 +135,10 @@ def build(
         If a plugin's rule fails.
     """
     check_probability(alpha, "alpha")
-    if by not in AXES:
-        raise OptionError(f"by = '{by}': choose among {', '.join(AXES)}{nearest(by, AXES)}")
-    if together and by in scores.OF_RUNS:
+    axes = axes_of(entries)
+    if by not in axes:
+        raise OptionError(f"by = '{by}': choose among {', '.join(axes)}{nearest(by, axes)}")
+    if together and (by in scores.OF_RUNS or by not in AXES):
         raise OptionError(f"--by {by}: scores of several tasks have no common scale; name one task")
     if together:
         section = across.section(entries, together, horizon, alpha, refused, by)
@@ -145,8 +152,10 @@ def build(
             found, lines = steps.sections(task, members, rule, horizon, alpha, shown)
         elif by in costs.UNITS:
             found, lines = costs.sections(task, members, by, alpha)
-        else:
+        elif by in scores.OF_RUNS or by in members[0].task_file.ranking.costs:
             found, lines = scores.sections(task, members, horizon, by, alpha, shown)
+        else:
+            found, lines = [], [f"task '{task}': its [ranking] costs do not name '{by}'"]
         made += found
         problems += lines
     return Leaderboard(tuple(made), tuple(problems), by)

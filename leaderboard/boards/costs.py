@@ -20,7 +20,7 @@ import numpy as np
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import listed
 from qrlsuite.leaderboard.boards import tables
-from qrlsuite.leaderboard.boards.ranked import Complexity, cell_text, complexity_at, ranking_of
+from qrlsuite.leaderboard.boards.ranked import Complexity, complexity_at, ranking_of
 from qrlsuite.leaderboard.boards.times import ALPHA
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -189,6 +189,8 @@ class CostSection:
     part: float
     exact: bool
     alpha: float
+    before: str = "below"
+    """The side of a threshold where a run has not reached it: `below`, or `above`."""
 
     @property
     def title(self) -> str:
@@ -203,8 +205,8 @@ class CostSection:
 
     def columns(self) -> tuple[str, ...]:
         """Return the heads of the table that `cells` fills."""
-        below = f"{self.unit.name} below threshold ({self.level})"
-        names = ("rank", "entry", below, "per step", "sample complexity (5%-95%)", "at cap", "shots", "seeds")
+        spent = f"{self.unit.name} {self.before} threshold ({self.level})"
+        names = ("rank", "entry", spent, "per step", "sample complexity (5%-95%)", "at cap", "shots", "seeds")
         return (*names, "needs less than", "needs more than")
 
     def sheet(self, explain: bool = False) -> Sheet:
@@ -296,8 +298,8 @@ class CostSection:
             self.unit.meaning,
             "per step: what the entry's seeds took in all, divided by all their environment steps; the others: of one "
             "run; sample complexity: over all its epochs",
-            "below threshold: mean over seeds and thresholds; a run that does not get there counts with all of the "
-            "budget (at cap)",
+            f"{self.before} threshold: mean over seeds and thresholds; a run that does not get there counts with all "
+            "of the budget (at cap)",
         ]
         if self.compared is not None and not self.exact:
             lines.append(f"curves are read at {CELLS} equal parts of the budget")
@@ -397,7 +399,9 @@ def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: floa
         horizon = int(entry.curves.shape[1]) * entry.steps_per_epoch
         complexity = complexity_at(entry.curves, ranking, entry.steps_per_epoch, horizon)
         rows.append(CostRow(entry, paid[place], complexity, places.index(place) if place in places else None))
-    return CostSection(task, cell_text(ranking), unit, tuple(rows), compared, budget, part, exact, alpha)
+    return CostSection(
+        task, ranking.cell, unit, tuple(rows), compared, budget, part, exact, alpha, ranking.before
+    )
 
 
 def prices(entries: Sequence[EntryResults], unit: str) -> list[Price]:

@@ -81,6 +81,10 @@ class PairVerdict:
         Whether the verdict and p are those of a board, adjusted for all of its pairs.
     whole:
         Environment steps at which the task's first board ranks.
+    score_name:
+        What the final score is called: `score`, or the metric's name.
+    before:
+        The side of a threshold where a run has not reached it: `below`, or `above`.
     """
 
     labels: tuple[str, str]
@@ -90,6 +94,8 @@ class PairVerdict:
     n_last: int
     adjusted: bool = False
     whole: int = 0
+    score_name: str = "score"
+    before: str = "below"
 
     @property
     def sentence(self) -> str:
@@ -105,7 +111,7 @@ class PairVerdict:
         if (pair.at_cap == 1).all():
             return (
                 f"neither reached {_any_of(len(self.thresholds))} within {steps_text(pair.horizon)} steps: "
-                "train longer, or lower them"
+                f"train longer, or {'lower' if self.before == 'below' else 'raise'} them"
             )
         match pair.direction:
             case Direction.UNDECIDED:
@@ -198,7 +204,7 @@ class PairVerdict:
     def notes(self) -> list[str]:
         """What the table means."""
         return [
-            "steps below threshold: mean over seeds; a seed that never reaches it counts with "
+            f"steps {self.before} threshold: mean over seeds; a seed that never reaches it counts with "
             f"{steps_text(self.times.horizon)}",
             "p: adjusted for all thresholds; intervals: of each threshold by itself",
         ]
@@ -212,7 +218,7 @@ class PairVerdict:
         one, other = self.scores.mean
         p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
         return (
-            f"final score: {one:.3f} against {other:.3f}, difference {self.scores.difference[0, 1]:+.2g} "
+            f"final {self.score_name}: {one:.3f} against {other:.3f}, difference {self.scores.difference[0, 1]:+.2g} "
             f"({low:+.2g} to {high:+.2g}{p}); mean over the last tenth of the epochs ({self.n_last})"
         )
 
@@ -271,6 +277,8 @@ def judge_pair(first: EntryResults, second: EntryResults, grid: Grid, alpha: flo
         else None,
         n_last=last_epochs(cut[0].values.shape[1]),
         whole=min(ranking_of([first, second]).horizons),
+        score_name=first.task_file.score.called,
+        before=grid.before,
     )
 
 
@@ -352,7 +360,7 @@ def pair_on(
         times = replace(times, p_each=alone.p_each, differences=alone.differences)
     thresholds = tuple(f"{threshold:g}" for threshold in grid.thresholds)
     whole = min(ranking_of([row.entry for row in rows]).horizons)
-    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True, whole=whole)
+    return PairVerdict(labels, times, thresholds, None, 0, adjusted=True, whole=whole, before=grid.before)
 
 
 def fewer(difference: FloatArray, first: bool) -> tuple[float, float, float]:

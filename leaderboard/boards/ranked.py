@@ -88,14 +88,6 @@ def rule_of(entries: Sequence[EntryResults]) -> SignificanceRule:
     return rules.load(ranking_of(entries).rule or DEFAULT)
 
 
-def cell_text(ranking: RankingSection) -> str:
-    """Return the reference cell in words."""
-    cell = ranking.reference
-    if cell.epsilon is not None:
-        return f"epsilon {cell.epsilon:g}, delta {cell.delta:g}"
-    return f"return {cell.threshold:g}, delta {cell.delta:g}"
-
-
 def complexity_at(
     values: np.ndarray[Any, np.dtype[np.float64]], ranking: RankingSection, steps_per_epoch: int, horizon: int
 ) -> Complexity:

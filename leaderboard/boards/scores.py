@@ -1,4 +1,4 @@
-"""A task's entries by how well they do: by their final scores, or by the area under their learning curves."""
+"""A task's entries by how well they do: by their final scores, the area under their curves, or a metric at the end."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qrlsuite.engine.sheet import Sheet, flat_row
 from qrlsuite.errors import OptionError
@@ -26,7 +27,7 @@ from qrlsuite.statistics import (
 )
 
 OF_RUNS = {"score": final_scores, "area": areas}
-"""What may rank entries: a number of each run, more is better."""
+"""What may rank entries: a number of each run. So may what a task's `[ranking] costs` names, by its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,8 @@ class ScoreSection:
     Attributes
     ----------
     task, horizon, by, alpha:
-        The task, the environment steps at which all are cut, `score` or `area`, and the error for all pairs together.
+        The task, the environment steps at which all are cut, `score`, `area` or a metric, and the error for all pairs
+        together.
     entries:
         The ranked ones, in the order of `results`.
     results:
@@ -45,6 +47,10 @@ class ScoreSection:
         Epochs that a final score is the mean of.
     unranked:
         Labels of the entries with fewer than 20 seeds.
+    of:
+        What the numbers are: `score`, or the metric's name.
+    sign:
+        1 where more is better, -1 where less is.
     shown:
         Names of the entries that have a row; None means all. What is shown changes no rank.
     """
@@ -58,17 +64,20 @@ class ScoreSection:
     n_last: int
     unranked: tuple[str, ...]
     shown: frozenset[str] | None = None
+    of: str = "score"
+    sign: int = 1
 
     @property
     def title(self) -> str:
         """What is ranked."""
-        what = "final score" if self.by == "score" else "area under the learning curve"
+        what = "area under the learning curve" if self.by == "area" else f"final {self.of}"
         return f"{self.task}, {steps_text(self.horizon)} steps, by {what}"
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Indices of the entries by mean, most first."""
-        return self.results.order
+        """Indices of the entries by mean, the best first."""
+        names, mean = self.results.names, self.sign * self.results.mean
+        return tuple(sorted(range(len(names)), key=lambda index: (-mean[index], names[index])))
 
     def columns(self) -> tuple[str, ...]:
         """Return the heads of the table that `cells` fills."""
@@ -79,8 +88,8 @@ class ScoreSection:
             "seeds",
             f"mean ({level})",
             f"IQM ({level})",
-            "below the first",
-            "P(more than next)",
+            "below the first" if self.sign > 0 else "above the first",
+            f"P({'more' if self.sign > 0 else 'less'} than next)",
         )
 
     def cells(self, place: int) -> tuple[str, ...]:
@@ -95,29 +104,40 @@ class ScoreSection:
             str(len(self.entries[index].seeds)),
             _interval(results.mean[index], *results.mean_interval[index]),
             _interval(results.interquartile_mean[index], *results.interquartile_interval[index]),
-            _interval(results.difference[first, index], low, high) if place else "-",
-            f"{results.improvement[index, after[0]]:.2f}" if after else "-",
+            _interval(*self._turned(results.difference[first, index], low, high)) if place else "-",
+            f"{self._better(index, after[0]):.2f}" if after else "-",
         )
+
+    def _turned(self, value: float, low: float, high: float) -> tuple[float, float, float]:
+        """Return a difference as what the first is ahead by."""
+        return (value, low, high) if self.sign > 0 else (-value, -high, -low)
+
+    def _better(self, index: int, other: int) -> float:
+        """Return the probability that a seed of one entry is better than one of another."""
+        more = float(self.results.improvement[index, other])
+        return more if self.sign > 0 else 1 - more
 
     @property
     def ranks(self) -> list[tuple[int, int]]:
         """Best and worst rank of each entry that the significant pairs leave."""
-        return [(best, worst) for best, worst in rank_ranges(self.results.better == 1).tolist()]
+        return [(best, worst) for best, worst in rank_ranges(self.results.better == self.sign).tolist()]
 
     def notes(self) -> list[str]:
         """Explain the columns."""
         size, better = len(self.entries), self.results.better
         what = (
-            f"final score: mean over the last tenth of the epochs ({self.n_last}): one validation alone is noisy"
-            if self.by == "score"
-            else "area: mean score over all epochs"
+            f"area: mean {self.of} over all epochs"
+            if self.by == "area"
+            else f"final {self.of}: mean over the last tenth of the epochs ({self.n_last}): "
+            "one validation alone is noisy"
         )
         lines = [
             what,
             f"rank: what the significant pairs leave ({int((better == 1).sum())} of {size * (size - 1) // 2}: "
             f"permutation test, Holm, error {self.alpha:g} for all pairs together)",
             "IQM: mean of the middle half of the seeds; intervals: bootstrap of the seeds, of each entry by itself",
-            "P: probability that a seed scores more than one of the next entry, ties one half",
+            f"P: probability that a seed {'scores more' if self.sign > 0 else 'has less'} than one of the next entry, "
+            "ties one half",
         ]
         return [
             *tables.unlike_others(self.entries),
@@ -152,7 +172,7 @@ class ScoreSection:
             "task": self.task,
             "horizon": self.horizon,
             "by": self.by,
-            "last_epochs": self.n_last if self.by == "score" else None,
+            "last_epochs": None if self.by == "area" else self.n_last,
             "alpha": self.alpha,
             "entries": [
                 {
@@ -180,7 +200,7 @@ class ScoreSection:
 def rank_by_score(
     entries: Sequence[EntryResults], horizon: int, by: str = "score", alpha: float = 0.05
 ) -> ScoreSection:
-    """Rank the entries of one task at one horizon by their scores, more is better.
+    """Rank the entries of one task at one horizon by their scores, or by what its `[ranking] costs` names.
 
     Parameters
     ----------
@@ -189,7 +209,7 @@ def rank_by_score(
     horizon:
         Environment steps at which all are cut.
     by:
-        `score`, the mean over the last tenth of the epochs, or `area`, the mean over all.
+        `score`, the mean over the last tenth of the epochs; `area`, the mean over all; or a cost: less is better.
     alpha:
         In (0, 1): probability of any false difference among entries of equal laws.
 
@@ -198,22 +218,46 @@ def rank_by_score(
     OptionError
         If `by` is neither, no entry has 20 seeds, or the horizon is not a whole number of epochs.
     """
-    if by not in OF_RUNS:
-        raise OptionError(f"--by {by}: expected {' or '.join(OF_RUNS)}")
+    score, costs = entries[0].task_file.score, entries[0].task_file.ranking.costs
+    if by not in OF_RUNS and by not in costs:
+        raise OptionError(f"--by {by}: expected {' or '.join([*OF_RUNS, *costs])}")
     ranked = tuple(entry for entry in entries if len(entry.seeds) >= MIN_RUNS)
     if not ranked:
         raise OptionError(f"--by {by}: no entry has {MIN_RUNS} seeds")
-    curves = [LearningCurves(each.curves, each.steps_per_epoch, each.label).cut(horizon) for each in ranked]
+    values = [each.curves if by in OF_RUNS else _measured(each, by) for each in ranked]
+    curves = [
+        LearningCurves(of_runs, each.steps_per_epoch, each.label).cut(horizon)
+        for of_runs, each in zip(values, ranked)
+    ]
+    number = OF_RUNS.get(by, final_scores)
     return ScoreSection(
         task=ranked[0].task,
         horizon=horizon,
         by=by,
         alpha=alpha,
         entries=ranked,
-        results=compare_scores({str(k): OF_RUNS[by](each) for k, each in enumerate(curves)}, alpha),
+        results=compare_scores({str(k): number(each) for k, each in enumerate(curves)}, alpha),
         n_last=last_epochs(curves[0].values.shape[1]),
         unranked=tuple(entry.label for entry in entries if len(entry.seeds) < MIN_RUNS),
+        of=score.called if by in OF_RUNS else by,
+        sign=score.sign if by in OF_RUNS else -1,
     )
+
+
+def _measured(entry: EntryResults, name: str) -> NDArray[np.float64]:
+    """Return what an entry's environment measured, (N, T).
+
+    Raises
+    ------
+    OptionError
+        If an epoch of a seed has no value.
+    """
+    values = entry.metrics.get(name)
+    if values is None or np.isnan(values).any():
+        raise OptionError(
+            f"--by {name}: not every epoch of '{entry.label}' has it: it was trained or imported without"
+        )
+    return values
 
 
 def sections(

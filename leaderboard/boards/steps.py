@@ -6,14 +6,15 @@ a provisional section of their own length.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from qrlsuite.errors import PluginError, QrlSuiteError
+from qrlsuite.experiment.task import ScoreSection
 from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
-    cell_text,
     complexity_at,
     learning_curves,
     ranking_of,
@@ -22,7 +23,7 @@ from qrlsuite.leaderboard.boards.ranked import (
 from qrlsuite.leaderboard.boards.times import TimeRanking, rank_by_time
 from qrlsuite.leaderboard.rules import DEFAULT, TIMES
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, final_scores, outperformance
+from qrlsuite.statistics import MIN_RUNS, Board, SignificanceRule, final_scores, last_epochs, outperformance
 from qrlsuite.statistics.compare import TOO_FEW
 
 SUPPORT = ("winner", "loser", "cells", "at_cap", "total")
@@ -83,6 +84,8 @@ class Row:
     """Fewer seeds than the task's protocol asks for."""
     not_reached: bool = False
     """At the cap in every cell: below those that outperform it, not ranked among others like it."""
+    costs: Mapping[str, float | None] = field(default_factory=dict)
+    """By name, the mean over seeds and the last tenth of the epochs of what `[ranking] costs` names."""
     rests_on: Support | None = None
     """None in the first tier, and without a tier."""
 
@@ -118,6 +121,15 @@ class Section:
     """What that rule controls."""
     by_tiers: bool = False
     """Whether tables show tiers by that rule in the place of ranks: where it was asked for, or the task names it."""
+    score: ScoreSection = field(default_factory=ScoreSection)
+    """What is ranked."""
+    costs: tuple[str, ...] = ()
+    """What is shown beside it."""
+
+    @property
+    def before(self) -> str:
+        """The side of a threshold where a run has not reached it: `below`, or `above`."""
+        return self.score.before
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -143,6 +155,7 @@ class Section:
         count = values.pop("parameters")
         tuning = values.pop("tuning") or {}
         support = values.pop("rests_on") or {}
+        costs = values.pop("costs", {})
         times = self.times.flat(row.entry)
         tiers = {name: values.pop(name) for name in ("tier", "verdict")}
         return {
@@ -164,6 +177,7 @@ class Section:
             "rule": self.rule,
             **tiers,
             **{f"rests_on_{name}": support.get(name) for name in SUPPORT},
+            **{f"cost_{name}": value for name, value in costs.items()},
         }
 
 
@@ -257,6 +271,7 @@ def _section(
                 outperformed_by=tuple(labels[name] for name in place.outperformed_by),
                 provisional=len(entry.seeds) < protocol_seeds,
                 not_reached=place.name in capped,
+                costs={name: _last(entry, name, values.shape[1]) for name in ranking.costs},
                 rests_on=_support(board, place.rests_on, labels),
             )
         )
@@ -265,13 +280,24 @@ def _section(
         summary=entries[0].task_file.summary,
         horizon=horizon,
         provisional=provisional,
-        cell=cell_text(ranking),
+        cell=ranking.cell,
         rows=tuple(rows),
         pairs=board,
         times=rank_by_time(entries, ranking.grid, horizon, alpha, shown),
         rule=rule.name,
         promise=rule.promise,
+        score=entries[0].task_file.score,
+        costs=tuple(ranking.costs),
     )
+
+
+def _last(entry: EntryResults, name: str, epochs: int) -> float | None:
+    """Return the mean over seeds and the last tenth of the epochs of a metric; None where one has none."""
+    values = entry.metrics.get(name)
+    if values is None:
+        return None
+    last = float(values[:, epochs - last_epochs(epochs) : epochs].mean())
+    return None if math.isnan(last) else last
 
 
 def _support(board: Board, pair: tuple[str, str] | None, labels: Mapping[str, str]) -> Support | None:
@@ -321,6 +347,7 @@ def _row_dict(row: Row) -> dict[str, Any]:
         "at_cap": row.reference.at_cap,
         "unsettled": row.reference.unsettled,
         "final_score": row.final_score,
+        **({"costs": dict(row.costs)} if row.costs else {}),
         "copeland": row.copeland,
         "wins": row.wins,
         "losses": row.losses,

@@ -57,7 +57,7 @@ def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
             low, high = row.mean.interval
             lines.append(
                 f"shorter: {row.entry.label}, {counted(len(row.entry.seeds), 'seed')}, {steps_text(section.horizon)} "
-                f"steps, {_mean(row.mean.mean, low, high)} of them below threshold"
+                f"steps, {_mean(row.mean.mean, low, high)} of them {section.before} threshold"
                 + f"; diverged: {_of_seeds(row.entry)}"
                 * bool(row.entry.diverged)
             )
@@ -126,19 +126,19 @@ def _rank_columns(section: Section) -> list[Column]:
         ),
         Column("entry", tuple(names([row.entry for row in times.rows])), words=True),
         Column(
-            f"steps below threshold ({times.level})",
+            f"steps {section.before} threshold ({times.level})",
             tuple(_mean(row.mean.mean, *row.mean.interval) for row in times.rows),
             bars=tuple(
                 (row.mean.interval[0] / longest, row.mean.interval[1] / longest) for row in times.rows
             ),
-            meaning="environment steps that a run spends below a threshold, mean over seeds and the task's thresholds, "
-            "with its interval; a run that never reaches one counts with the horizon. The bar is solid to the "
-            "interval's lower end and shaded to its upper end",
+            meaning=f"environment steps that a run spends {section.before} a threshold, mean over seeds and the "
+            "task's thresholds, with its interval; a run that never reaches one counts with the horizon. The bar is "
+            "solid to the interval's lower end and shaded to its upper end",
         ),
         Column(
             "vs. first",
             tuple(differences),
-            meaning="steps below threshold, against the first entry of the table",
+            meaning=f"steps {section.before} threshold, against the first entry of the table",
         ),
         *_facts_columns(section, rows),
     ]
@@ -159,7 +159,7 @@ def _tier_columns(section: Section) -> list[Column]:
             bars=tuple(
                 (row.reference.low / section.horizon, row.reference.high / section.horizon) for row in rows
             ),
-            meaning=_COMPLEXITY.format(cell=section.cell),
+            meaning=_complexity(section),
         ),
         Column(
             "rests on",
@@ -176,7 +176,10 @@ def _tier_columns(section: Section) -> list[Column]:
     ]
 
 
-_COMPLEXITY = "steps until a share delta of the seeds score 1 - epsilon or more, here at {cell}"
+def _complexity(section: Section) -> str:
+    """Say what the sample complexity is."""
+    goal = "score 1 - epsilon or more" if section.times.kind == "epsilon" else "have reached a threshold"
+    return f"steps until a share delta of the seeds {goal}, here at {section.cell}"
 
 
 def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
@@ -187,12 +190,20 @@ def _facts_columns(section: Section, rows: Sequence[Row]) -> list[Column]:
         Column(
             "sample complexity",
             tuple(">= " * row.reference.unsettled + steps_text(row.reference.steps) for row in rows),
-            meaning=_COMPLEXITY.format(cell=section.cell),
+            meaning=_complexity(section),
         ),
         Column(
-            "final score",
+            f"final {section.score.called}",
             tuple(f"{row.final_score:.3f}" for row in rows),
             meaning="mean over seeds and over the last tenth of the epochs",
+        ),
+        *(
+            Column(
+                name,
+                tuple(cost_text(row.costs[name]) for row in rows),
+                meaning=f"mean over the last tenth of the epochs, less is better; --by {name} ranks by it",
+            )
+            for name in section.costs
         ),
         Column(
             "seeds",
@@ -220,6 +231,11 @@ def _row_of(section: Section, entry: EntryResults) -> Row:
     return next(row for row in section.rows if row.entry is entry)
 
 
+def cost_text(value: float | None) -> str:
+    """Write a cost; `-` where the environment measured none."""
+    return "-" if value is None else f"{value:.3g}"
+
+
 def tier_text(row: Row) -> str:
     """Return the tier, or in a word why there is none."""
     if row.tier is not None:
@@ -237,7 +253,7 @@ def _rank_notes(section: Section) -> list[str]:
     )
     lines = [
         f"rank: by significant outperformance: {pairs}",
-        f"steps below threshold: mean over seeds and thresholds; sample complexity at {section.cell}",
+        f"steps {section.before} threshold: mean over seeds and thresholds; sample complexity at {section.cell}",
     ]
     if any(row.ranks is None for row in times.rows):
         lines.append(TOO_FEW)

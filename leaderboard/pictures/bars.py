@@ -96,7 +96,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
                 axes.text(float(places[i, j]), high + 0.012 * horizon, "≥", ha="center", fontsize=9, zorder=5)
     axes.axhline(horizon, color="#505050", lw=0.9, ls=":")
     axes.set_xticks(
-        centers.T.ravel(), [f"{cells.level_name(grid)} = {v}" for v in cells.levels(grid)] * n_deltas
+        centers.T.ravel(), [f"{cells.level_name(entries[0])} = {v}" for v in cells.levels(grid)] * n_deltas
     )
     axes.tick_params(axis="x", length=0)
     for j, delta in enumerate(cells.probabilities(grid)):

@@ -74,7 +74,7 @@ def choose_grid(
     if epsilons is not None and thresholds is not None:
         raise OptionError("give epsilons or thresholds, not both")
     if thresholds is not None:
-        return Grid.absolute(thresholds, chosen_deltas)
+        return Grid.absolute(thresholds, chosen_deltas, ranking.goal)
     if epsilons is not None:
         if ranking.epsilons is None:
             raise OptionError(
@@ -86,7 +86,7 @@ def choose_grid(
         return own
     if ranking.epsilons is not None:
         return Grid.relative(ranking.epsilons, deltas)
-    return Grid.absolute(own.thresholds, deltas)
+    return Grid.absolute(own.thresholds, deltas, ranking.goal)
 
 
 def choose_horizon(entries: Sequence[EntryResults], requested: int | None = None) -> int:
@@ -105,13 +105,14 @@ def choose_horizon(entries: Sequence[EntryResults], requested: int | None = None
     return max(reached, default=shortest)
 
 
-def level_name(grid: Grid) -> str:
-    """Return what the rows of a grid are called."""
-    return "ε" if grid.epsilons is not None else "return"
+def level_name(entry: EntryResults) -> str:
+    """Return what the rows of a grid of an entry's task are called."""
+    name = entry.task_file.ranking.level_name
+    return "ε" if name == "epsilon" else style.plain(name)
 
 
 def levels(grid: Grid) -> list[str]:
-    """Return the rows of a grid as they are written: epsilons, or thresholds on the return."""
+    """Return the rows of a grid as they are written: epsilons, or thresholds on the return or a metric."""
     return [f"{value:g}" for value in (grid.levels)]
 
 

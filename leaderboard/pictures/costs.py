@@ -96,7 +96,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
         heights, [f"{name}: {style.seeds_text(e)}" for name, e in zip(style.labels(entries), entries)]
     )
     panels[0].set_ylim(-0.6, len(entries) - 0.4)
-    cell = f"{cells.level_name(grid)} = {cells.levels(grid)[0]}, δ = {cells.probabilities(grid)[0]}"
+    cell = f"{cells.level_name(entries[0])} = {cells.levels(grid)[0]}, δ = {cells.probabilities(grid)[0]}"
     figure.suptitle(
         f"{style.heading(entries)}: sample complexity Ŝ at {cell}", x=0.01, ha="left", fontsize="medium"
     )

@@ -61,7 +61,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
             axes.errorbar(steps, middle, [middle - low, high - middle], color=look.color, linewidth=2)
     relative = style.relative(entries)
     axes.set_xlabel("environment steps")
-    axes.set_ylabel("validation score (received / optimal)" if relative else "validation score")
+    axes.set_ylabel(style.score_name(entries))
     axes.xaxis.set_major_formatter(steps_text)
     axes.set_xlim(left=0)
     if relative:
@@ -73,5 +73,6 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     if many:
         figure.legend(loc="outside right upper", fontsize=8, alignment="left", **legend)
     else:
-        axes.legend(loc="lower right", **legend)
+        rising = entries[0].task_file.score.sign > 0
+        axes.legend(loc="lower right" if rising else "upper right", **legend)
     return figure

@@ -157,7 +157,8 @@ def _figure(
     for key in ("b", "c"):
         panels[key].sharey(panels["a"])
         panels[key].tick_params(labelleft=False)
-    panels["a"].set_ylabel("score: mean, standard deviation", fontsize=8.5)
+    ranked = style.plain(entries[0].task_file.score.called)
+    panels["a"].set_ylabel(f"{ranked}: mean, standard deviation", fontsize=8.5)
     step = entries[0].steps_per_epoch
     for key, drawn, size in (("d", few, n_few), ("e", many, n_many)):
         _distribution(panels[key], drawn, horizon, step)
@@ -174,7 +175,7 @@ def _figure(
     many_words = "resampled from all" if len(entries) == 2 else "halves of all"
     style.footnotes(
         figure,
-        f"Ŝ at {cells.level_name(grid)} = {level}, δ = {delta}, dotted: its threshold",
+        f"Ŝ at {cells.level_name(entries[0])} = {level}, δ = {delta}, dotted: its threshold",
         f"below: Ŝ of {len(difference)} random samples of {n_few} seeds, and of {n_many} ({many_words})",
         "the two samples: 5th and 95th percentile of the difference of Ŝ",
         cells.cut_note(entries, horizon),

@@ -72,7 +72,7 @@ def draw(outcome: StudyOutcome) -> Figure:
     axes.xaxis.set_major_formatter(
         FuncFormatter(lambda ratio, _: outcomes.percent(ratio - 1) if ratio != 1 else "0")
     )
-    axes.set_xlabel("pair A / B: how much longer B is below the thresholds than A")
+    axes.set_xlabel(f"pair A / B: how much longer B is {study.grid.before} the thresholds than A")
     _name_rows(axes, names)
     for tick, row in zip(axes.get_yticklabels(), rows):
         if not isinstance(row, PairDecision):
@@ -127,7 +127,7 @@ def draw_entries(outcome: StudyOutcome) -> Figure:
         _at_right(axes, height, ", ".join(seeds))
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: steps_text(steps)))
-    axes.set_xlabel("M: environment steps of a run below threshold")
+    axes.set_xlabel(f"M: environment steps of a run {study.grid.before} threshold")
     _name_rows(axes, list(rows))
     for model in models:
         look = style.style(models.index(model))

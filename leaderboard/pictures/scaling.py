@@ -92,9 +92,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     place, colors = 0, 0
     for panel in panels:
         for j, i in np.ndindex(n_deltas, n_levels):
-            cell_title = (
-                f"{cells.level_name(grid)} = {cells.levels(grid)[i]}, δ = {cells.probabilities(grid)[j]}"
-            )
+            cell_title = f"{cells.level_name(entries[0])} = {cells.levels(grid)[i]}, δ = {cells.probabilities(grid)[j]}"
             _draw_panel(axes[place], panel, measured, (i, j), horizon, cell_title, grid.size == 1, colors)
             place += 1
         colors = (colors + 2) % 6 if len(panels) > 1 else 0

@@ -80,7 +80,13 @@ def note(entries: Sequence[EntryResults]) -> str:
 
 def relative(entries: Sequence[EntryResults]) -> bool:
     """Whether the scores of all entries are fractions of the optimum."""
-    return all(entry.task_file.score.source == "info" for entry in entries)
+    return all(entry.task_file.score.of_optimum for entry in entries)
+
+
+def score_name(entries: Sequence[EntryResults]) -> str:
+    """Return what an axis of learning curves is called: `validation score`, or the metric's name in its place."""
+    [name] = {entry.task_file.score.called for entry in entries} or {"score"}
+    return f"validation {plain(name)}{' (received / optimal)' if relative(entries) else ''}"
 
 
 def tidy(axes: Axes) -> None:

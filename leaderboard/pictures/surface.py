@@ -105,7 +105,7 @@ def _maps(
         axes.set_xlabel("δ")
         axes.tick_params(labelbottom=True)
     for row in range(rows):
-        panels[row * columns].set_ylabel(cells.level_name(grid))
+        panels[row * columns].set_ylabel(cells.level_name(entries[0]))
     bar = figure.colorbar(image, ax=panels[: len(entries)].tolist(), shrink=0.9, pad=0.02, aspect=30)
     bar.ax.yaxis.set_major_formatter(steps_text)
     bar.outline.set_visible(False)
@@ -156,7 +156,7 @@ def _box(
         )
         text = f"{name}: {style.facts(entry)}"
         handles.append(Line2D([], [], color=look.color, marker=look.marker, lw=4, alpha=0.7, label=text))
-    axes.set_xlabel(cells.level_name(grid))
+    axes.set_xlabel(cells.level_name(entries[0]))
     axes.set_ylabel("δ")
     axes.set_zlabel("Ŝ (environment steps)", labelpad=8)
     axes.set_zlim(0, horizon)

@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 import qrlsuite
 from qrlsuite.leaderboard.boards.board import Leaderboard
+from qrlsuite.leaderboard.boards.tables import cost_text
 from qrlsuite.leaderboard.report import entries, sections
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
@@ -86,6 +87,7 @@ def render(
             scripts=[Markup(script) for script in scripts],
             clean=clean,
             counted=counted,
+            cost_text=cost_text,
         )
     )
 

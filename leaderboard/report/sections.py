@@ -183,7 +183,7 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
             for delta in bars.deltas
         ),
         thresholds=tuple(levels),
-        threshold_name="epsilon" if grid.epsilons else "return",
+        threshold_name=clean(ranking.level_name),
         threshold_symbol=symbol(grid),
         framed=any(cell.reference for line in surfaces[0] for cell in line),
         deltas=deltas,
@@ -283,7 +283,6 @@ def _data(
     """Return what the page's scripts need of a section."""
     reference = ranking.reference
     level = 1 - reference.epsilon if reference.epsilon is not None else reference.threshold
-    relative = section.rows[0].entry.task_file.score.source == "info"
     words = dict.fromkeys(pair.words(side) for pair in judgement.pairs for side in (pair.first, pair.second))
     numbers = {text: number for number, text in enumerate(words)}  # many pairs share their words
     return {
@@ -292,7 +291,7 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "names": [row.name for row in rows],
         "level": level,
-        "score": "validation score (received / optimal)" if relative else "validation score",
+        "score": f"validation {clean(section.score.called)}{' (received / optimal)' * section.score.of_optimum}",
         "levelName": symbol(judgement.grid),
         "levels": [f"{float(value):g}" for value in judgement.grid.levels],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],

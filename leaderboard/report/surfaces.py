@@ -67,9 +67,13 @@ def bar_grid(ranking: RankingSection) -> Grid:
     levels = ranking.epsilons or ranking.thresholds or []
     if ranking.epsilons and set(BARS[0]) <= set(ranking.epsilons):
         return Grid.relative(BARS[0], BARS[1])
-    chosen = sorted({levels[i] for i in (0, len(levels) // 2, -1)}, reverse=ranking.epsilons is not None)
-    make = Grid.relative if ranking.epsilons else Grid.absolute
-    return make(chosen, BARS[1])
+    chosen = sorted(
+        {levels[i] for i in (0, len(levels) // 2, -1)},
+        reverse=bool(ranking.epsilons) or ranking.goal == "below",
+    )
+    if ranking.epsilons:
+        return Grid.relative(chosen, BARS[1])
+    return Grid.absolute(chosen, BARS[1], ranking.goal)
 
 
 def symbol(grid: Grid) -> str:

@@ -389,6 +389,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         clocked=any(run.clocked for run in runs),
         codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
         refused=tuple(refused),
+        measured={run.seed: run.measured for run in runs if run.measured},
     )
     return entry.marked(store.mark)
 

@@ -22,6 +22,7 @@ from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
 from qrlsuite.results import probes, provenance
 from qrlsuite.results.seeds import parse_seeds, read_seeds
+from qrlsuite.results.store import MEASURED
 from qrlsuite.results.text import counted
 
 
@@ -85,6 +86,9 @@ class EntryResults(Shown):
         `executions` that it took; with `diverged`, the first epoch after which its agent's numbers were not finite.
     refused:
         One line for each seed that does not count, because a file of it is damaged or it is not what it says.
+    measured:
+        By seed and name, what the environment measured of each epoch's validation, see
+        `qrlsuite.results.store.SeedRun.measured`.
     """
 
     name: str
@@ -123,6 +127,7 @@ class EntryResults(Shown):
     unprobed: bool = False
     chosen_seeds: str = ""
     first_thresholds: tuple[float, ...] | None = None
+    measured: Mapping[int, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
 
     @classmethod
     def of_record(
@@ -214,6 +219,14 @@ class EntryResults(Shown):
         out = tuple(sorted(set(self.runs) - set(kept)))
         return replace(self, curves=np.stack(list(kept.values())), seeds=tuple(kept), left_out=out, runs={})
 
+    @property
+    def metrics(self) -> dict[str, NDArray[np.float64]]:
+        """By name, what the environment measured along the curves, (N, T) each; NaN where it did not."""
+        held = [self.measured.get(seed, {}) for seed in self.seeds]
+        length, nothing = self.curves.shape[1], np.full(self.curves.shape[1], np.nan)
+        names = sorted({name for own in held for name in own})
+        return {name: np.stack([own.get(name, nothing)[:length] for own in held]) for name in names}
+
     def cut(self, epochs: int) -> EntryResults | None:
         """Return the first epochs of every run that has reached a number of them; None for none."""
         reached = self.reaching(epochs)
@@ -265,7 +278,7 @@ class EntryResults(Shown):
         """Return the curves as an Arrow table of N x T rows, seed by seed: `to_pandas()`, or `polars.from_arrow`.
 
         Its columns are `task`, `entry` (the label), `seed`, `epoch` (from 1), `steps` (environment steps at the end
-        of the epoch) and `score` (mean validation score after it).
+        of the epoch), `score` (mean validation score after it), and `measured.NAME` for each metric of the environment.
         """
         n_runs, epochs = self.curves.shape
         epoch = np.tile(np.arange(1, epochs + 1), n_runs)
@@ -277,6 +290,7 @@ class EntryResults(Shown):
                 "epoch": epoch,
                 "steps": epoch * self.steps_per_epoch,
                 "score": self.curves.ravel(),
+                **{f"{MEASURED}.{name}": values.ravel() for name, values in self.metrics.items()},
             }
         )
 
@@ -294,7 +308,7 @@ class EntryResults(Shown):
             + (f", {len(self.diverged)} diverged" if self.diverged else ""),
             **({"left out": "; ".join(self.refused)} if self.refused else {}),
             "epochs": f"{epochs} of {self.steps_per_epoch} environment steps",
-            "last score": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
+            f"last {self.task_file.score.called}": f"median {np.median(self.curves[:, -1]):.3f} over seeds",
             "core-hours": f"{self.hours:.2f}" if self.hours or not self.external else "-",
             "read from": str(self.folder),
         }

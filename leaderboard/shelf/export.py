@@ -77,6 +77,7 @@ def export(entry: EntryResults, out: Path, force: bool = False, agents: bool = T
         fingerprint(built, entry.seeds),
         _found(runs),
         kept,
+        entry.metrics,
     )
     _replace(folder, content)
     published.read(folder)

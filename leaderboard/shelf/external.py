@@ -45,6 +45,7 @@ from qrlsuite.results.store import (
 )
 from qrlsuite.results.text import counted
 from qrlsuite.statistics import MIN_RUNS
+from qrlsuite.statistics.grid import Goal
 
 GRID_POINTS = 100
 """Points of a grid that is chosen here, at most, up to the end of the longest run."""
@@ -63,6 +64,8 @@ def import_points(
     maximum: float | None = None,
     thresholds: Sequence[float] = (),
     every: int | None = None,
+    goal: Goal | None = None,
+    metric: str | None = None,
 ) -> list[Imported]:
     """Write curves to a results folder as the seeds of external entries.
 
@@ -78,6 +81,10 @@ def import_points(
         Scores that count as reached, of a new task; by default .6, .7, .8 and .9 of the maximum.
     every:
         Environment steps between two grid points of a new task.
+    goal:
+        `below` where less is better, of a new task with thresholds; None is `above`.
+    metric:
+        What the score is called where less is better.
 
     Returns
     -------
@@ -90,7 +97,7 @@ def import_points(
         If the task is not known and nothing says what a good score is, options contradict the task, a run begins after
         the first grid point, or a score is none of the task. Nothing is written then.
     """
-    given = _require_options(maximum, thresholds, every)
+    given = _require_options(maximum, thresholds, every, goal)
     name = task or EXTERNAL
     known = _known_task(name, runs)
     if known is None:
@@ -98,12 +105,14 @@ def import_points(
         curves = _cut(
             {run: _on_grid(own, step, run, f"every={_first(points)}") for run, own in points.items()}
         )
-        _require_reachable(curves, given)
-        file = _new_task(name, step, curves, maximum, given)
+        _require_reachable(curves, given, goal == "below")
+        file = _new_task(name, step, curves, maximum, given, _score_of(goal, metric, maximum))
         definition = _definition(file)
     else:
         file, definition, name = known
         _require_same_options(file, maximum, given, every)
+        if goal not in (None, file.score.goal):
+            raise OptionError(f"goal={goal}: task '{file.name}' has {file.score.goal}; leave it out")
         step = file.protocol.interactions
         curves = _cut({run: _on_grid(own, step, run, "another --task") for run, own in points.items()})
     best = file.score.max_return if maximum is None else maximum
@@ -123,7 +132,17 @@ def import_points(
     ]
 
 
-def _require_options(maximum: float | None, thresholds: Sequence[float], every: int | None) -> list[float]:
+def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> dict[str, Any]:
+    """Return the section `[score]` of a new task."""
+    if goal != "below":
+        return {"source": "return", "max_return": maximum}
+    plain = re.sub(r"[^a-z0-9]+", "-", (metric or "score").lower()).strip("-")[:64].rstrip("-")
+    return {"metric": plain if specs.NAME.fullmatch(plain) else "score", "goal": "below"}
+
+
+def _require_options(
+    maximum: float | None, thresholds: Sequence[float], every: int | None, goal: Goal | None
+) -> list[float]:
     """Return the thresholds, sorted.
 
     Raises
@@ -133,6 +152,12 @@ def _require_options(maximum: float | None, thresholds: Sequence[float], every: 
     """
     if maximum is not None and not (math.isfinite(maximum) and maximum > 0):
         raise OptionError(f"maximum={maximum}: give the best possible score, a number above 0")
+    if goal not in (None, "above", "below"):
+        raise OptionError(f"goal={ascii(goal)[1:-1]}: write above, or below where less is better")
+    if goal == "below" and maximum is not None:
+        raise OptionError(
+            "goal=below: give thresholds=A,B,... in place of maximum, which is the best high score"
+        )
     levels = sorted(float(level) for level in thresholds)
     if not all(map(math.isfinite, levels)) or len(set(levels)) < len(levels):
         raise OptionError(f"thresholds={','.join(f'{level:g}' for level in levels)}: give numbers, each once")
@@ -199,14 +224,18 @@ def _on_grid(own: Points, every: int, run: Run, instead: str) -> NDArray[np.floa
     return own.scores[np.searchsorted(own.steps, grid, side="right") - 1]
 
 
-def _require_reachable(curves: Mapping[Run, NDArray[np.float64]], thresholds: list[float]) -> None:
-    """Refuse thresholds that every run is above from its first point on, as fractions of a maximum of 500 are."""
-    lowest = min(float(curve[0]) for curve in curves.values())
-    if thresholds and thresholds[-1] <= lowest:
-        highest = max(float(curve.max()) for curve in curves.values())
+def _require_reachable(
+    curves: Mapping[Run, NDArray[np.float64]], thresholds: list[float], below: bool
+) -> None:
+    """Refuse thresholds that every run has reached from its first point on, as fractions of a maximum of 500 are."""
+    firsts = [float(curve[0]) for curve in curves.values()]
+    if thresholds and (max(firsts) <= thresholds[0] if below else thresholds[-1] <= min(firsts)):
+        low = min(float(curve.min()) if below else float(curve[0]) for curve in curves.values())
+        high = max(float(curve.max()) for curve in curves.values())
         raise OptionError(
-            f"thresholds={','.join(f'{level:g}' for level in thresholds)}: every run is above them from its first "
-            f"point on. Write scores as the files have them, which lie between {lowest:g} and {highest:g}"
+            f"thresholds={','.join(f'{level:g}' for level in thresholds)}: every run is "
+            f"{'below' if below else 'above'} them from its first point on. Write scores as the files have them, which "
+            f"lie between {low:g} and {high:g}"
         )
 
 
@@ -228,6 +257,7 @@ def _new_task(
     curves: Mapping[Run, NDArray[np.float64]],
     maximum: float | None,
     thresholds: list[float],
+    score: Mapping[str, Any],
 ) -> TaskFile:
     """Return the file of a task that these curves are the first of.
 
@@ -239,9 +269,14 @@ def _new_task(
     if maximum is None and not thresholds:
         raise OptionError(
             f"'{printable(name)}' is a new task: say what a good score is with maximum=BEST (the best possible), "
-            "thresholds=A,B,... (scores that count as reached), or --task TASK of the suite"
+            "thresholds=A,B,... (scores that count as reached; with goal=below less is better), or --task TASK of the "
+            "suite"
         )
-    ranking: dict[str, Any] = {"thresholds": thresholds, "reference": {"threshold": (thresholds or [0])[-1]}}
+    hardest = 0 if score.get("goal") == "below" else -1
+    ranking: dict[str, Any] = {
+        "thresholds": thresholds,
+        "reference": {"threshold": (thresholds or [0])[hardest]},
+    }
     if maximum is not None:
         epsilons = [round(1 - level / maximum, 12) for level in reversed(thresholds)] or _EPSILONS
         reference = _REFERENCE if not thresholds else epsilons[0]
@@ -262,7 +297,7 @@ def _new_task(
             "interactions": every,
             "validation_episodes": 1,
         },
-        "score": {"source": "return", "max_return": maximum},
+        "score": score,
         "ranking": {
             **ranking,
             "reference": {**ranking["reference"], "delta": _DELTA},
@@ -507,7 +542,8 @@ def told(done: Sequence[Imported]) -> list[str]:
     best = imported["maximum"]
     scale = f"scores over {best:g}; " if best is not None else ""
     levels = ", ".join(f"{level:g}" for level in sorted(file.ranking.grid.thresholds))
+    less = f" on {file.score.called}, less is better" if file.score.goal == "below" else ""
     return [
         f"grid: {imported['grid']}",
-        f"{scale}thresholds {levels}; horizon {file.ranking.horizons[0]} steps",
+        f"{scale}thresholds {levels}{less}; horizon {file.ranking.horizons[0]} steps",
     ]

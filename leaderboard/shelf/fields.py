@@ -21,7 +21,8 @@ from qrlsuite.engine.terminal import printable
 from qrlsuite.errors import OptionError, UnknownNameError, listed, nearest
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
-from qrlsuite.statistics import areas, final_scores
+from qrlsuite.results.store import MEASURED
+from qrlsuite.statistics import areas, final_scores, last_epochs
 from qrlsuite.statistics.times import times_below
 
 Rows = Literal["entries", "seeds", "epochs"]
@@ -64,7 +65,12 @@ NAMES = (
     Field("external", _TRUTH, "whether another program made the curves"),
 )
 SCORES = (
-    Field("steps_below_threshold", _REAL, "mean over the task's thresholds; what boards rank by", _STEPS),
+    Field(
+        "steps_below_threshold",
+        _REAL,
+        "mean over the task's thresholds (above them where less is better); what boards rank by",
+        _STEPS,
+    ),
     Field("final_score", _REAL, "mean score of the last tenth of the epochs"),
     Field("area", _REAL, "mean score of all epochs"),
     Field("core_hours", _REAL, "of training and validation", "core-hours"),
@@ -113,7 +119,8 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
     Returns
     -------
     pyarrow.Table
-        With the columns of `FIELDS[rows]`, and one for each option that an entry has, null where another has it not.
+        With the columns of `FIELDS[rows]`, and one for each option that an entry has and for each metric of its
+        environment (`measured.NAME`, like the score of the row), null where another has it not.
         A column of whole and other numbers has float64, one of numbers and texts has texts; lists are JSON.
     """
     make: dict[Rows, Callable[[EntryResults], dict[str, Sequence[Any] | NDArray[Any]]]] = {
@@ -122,6 +129,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
         "epochs": _of_epochs,
     }
     options = _option_columns(entries)
+    metrics = sorted({name for entry in entries for name in entry.metrics})
     fields = FIELDS[rows]
     schema = pyarrow.schema(
         [
@@ -129,6 +137,7 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
             for each in fields
         ]
         + [pyarrow.field(name, column.type) for name, column in options.items()]
+        + [pyarrow.field(f"{MEASURED}.{name}", _REAL) for name in metrics]
     )
     parts = []
     for place, entry in enumerate(entries):
@@ -140,8 +149,19 @@ def table(entries: Sequence[EntryResults], rows: Rows) -> pyarrow.Table:
             for each in fields
         ]
         columns += [pyarrow.repeat(column[place], count) for column in options.values()]
+        columns += [_metric(entry, name, rows) for name in metrics]
         parts.append(pyarrow.table(columns, schema=schema))
     return pyarrow.concat_tables(parts) if parts else schema.empty_table()
+
+
+def _metric(entry: EntryResults, name: str, rows: Rows) -> pyarrow.Array:
+    """Return a metric of an entry: of every epoch, of every seed by its last tenth, or the mean of these."""
+    values = entry.metrics.get(name, np.full(entry.curves.shape, np.nan))
+    if rows == "epochs":
+        return pyarrow.array(values.ravel(), _REAL, from_pandas=True)
+    last = values[:, -last_epochs(values.shape[1]) :].mean(axis=1)
+    found = [*last.tolist(), *[math.nan] * len(entry.left_out)] if rows == "seeds" else [float(last.mean())]
+    return pyarrow.array(np.array(found), _REAL, from_pandas=True)
 
 
 def facts(entry: EntryResults) -> dict[str, Any]:

@@ -7,6 +7,7 @@ when it is repeated. Seeds that are here already stay as they are.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -31,6 +32,7 @@ from qrlsuite.results import checkpoint, codes, provenance
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
+    MEASURED,
     Arrays,
     EntryStore,
     SeedRun,
@@ -232,6 +234,9 @@ def _from_export(
                 differing.append(seed)
             continue
         rows: list[dict[str, Any]] = [{"epoch": t, "score": float(v)} for t, v in enumerate(curve, start=1)]
+        for name, values in exported.metrics(row).items():
+            for line, value in zip(rows, values.tolist()):
+                line[f"{MEASURED}.{name}"] = None if math.isnan(value) else value
         if executions := int(exported.executions[row]):
             rows[-1]["executions"] = {"imported": executions}
         diverged, probe = exported.diverged.get(seed), exported.probe

@@ -1,7 +1,7 @@
 """Published entries: an entry's validation curves and how they were made, in three small files, and its agents.
 
     <task>/<entry>/entry.json       what was run, with every option, versions and processors
-                   curves.parquet   seed, epoch, score: the mean of each validation
+                   curves.parquet   seed, epoch, score: the mean of each validation, and what else was measured
                    seeds.parquet    per seed: hours, circuit executions, and what it looked like before training
                    agents.safetensors  the trained parameters of all or some seeds, seed-first; need not be there
 
@@ -36,6 +36,7 @@ from qrlsuite.notation import parse_entry
 from qrlsuite.registry import load as registered
 from qrlsuite.results import codes, parquet, probes, provenance
 from qrlsuite.results.store import (
+    MEASURED,
     Arrays,
     EntryStore,
     SeedRun,
@@ -74,6 +75,8 @@ class PublishedEntry:
         (N, T) float64.
     hours, executions:
         (N,): core-hours and circuit executions per seed.
+    measured:
+        By name, what the environment measured of each validation (N, T); NaN where it did not.
     origins:
         (N,): for each seed the index of its provenance in the record.
     fingerprint:
@@ -85,6 +88,7 @@ class PublishedEntry:
     task_file: TaskFile
     seeds: tuple[int, ...]
     curves: NDArray[np.float64]
+    measured: Mapping[str, NDArray[np.float64]]
     hours: NDArray[np.float64]
     executions: NDArray[np.int64]
     origins: NDArray[np.int64]
@@ -171,7 +175,14 @@ class PublishedEntry:
             codes=codes.distinct([codes.read(self.record, self.folder / "entry.json")]),
             source="published",
             chosen_seeds=self.chosen_seeds,
+            measured={seed: self.metrics(row) for row, seed in enumerate(self.seeds)}
+            if self.measured
+            else {},
         )
+
+    def metrics(self, row: int) -> dict[str, NDArray[np.float64]]:
+        """Return what the environment measured of one seed, (T,) by name."""
+        return {name: values[row] for name, values in self.measured.items()}
 
 
 class PublishedAgents(EntryStore):
@@ -236,7 +247,8 @@ class _PublishedSeed(SeedStore):
         entry = self._published.published
         row = entry.seeds.index(self.seed)
         seconds, executions = 3600 * float(entry.hours[row]), int(entry.executions[row])
-        return SeedRun(self.seed, self.record(), entry.curves[row][:, None], seconds, executions)
+        scores, measured = entry.curves[row][:, None], entry.metrics(row)
+        return SeedRun(self.seed, self.record(), scores, seconds, executions, measured=measured)
 
     def parameters(self) -> Arrays:
         """Return the trained agent's parameters by name."""
@@ -318,7 +330,16 @@ def _read(folder: Path, label: bool) -> PublishedEntry:
     for name in ("seeds", "epochs"):
         count = published[name]
         _require(type(count) is int and 0 < count < 10**9, folder, f"{name}: {count!r}")
-    seeds, curves = _curves(folder, task_file, published["seeds"] * published["epochs"])
+    names = published.get("measured", [])
+    _require(
+        isinstance(names, list)
+        and len(names) <= _MOST_METRICS
+        and all(isinstance(name, str) and NAME.fullmatch(name) for name in names)
+        and names == sorted(set(names)),
+        folder,
+        f"measured: {ascii(names)[:100]} does not name metrics",
+    )
+    seeds, curves, measured = _curves(folder, task_file, published["seeds"] * published["epochs"], names)
     _check_found(folder, published, seeds)
     facts = _table(folder / SEEDS, _SEED_COLUMNS, published["seeds"], 10_000)
     _require(facts["seed"] == list(seeds), folder, f"{SEEDS} and {CURVES} hold different seeds")
@@ -347,7 +368,9 @@ def _read(folder: Path, label: bool) -> PublishedEntry:
         folder,
         f"{SEEDS} has rows of different lengths",
     )
-    return PublishedEntry(folder, record, task_file, seeds, curves, hours, executions, origins, beginning)
+    return PublishedEntry(
+        folder, record, task_file, seeds, curves, measured, hours, executions, origins, beginning
+    )
 
 
 def _check_found(folder: Path, published: Mapping[str, Any], seeds: Sequence[int]) -> None:
@@ -473,9 +496,15 @@ _SEED_COLUMNS = {
 }
 
 
-def _curves(folder: Path, task_file: TaskFile, rows: int) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-    """Read (N,) seeds and (N, T) curves of N T rows."""
-    table = _table(folder / CURVES, _CURVE_COLUMNS, rows, len(_CURVE_COLUMNS))
+_MOST_METRICS = 100
+
+
+def _curves(
+    folder: Path, task_file: TaskFile, rows: int, metrics: Sequence[str]
+) -> tuple[tuple[int, ...], NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Read (N,) seeds, (N, T) curves of N T rows, and by name the metrics (N, T) beside them."""
+    columns = {**_CURVE_COLUMNS, **{f"{MEASURED}.{name}": "double" for name in metrics}}
+    table = _table(folder / CURVES, columns, rows, len(columns))
     numbers = np.array(table["seed"], np.int64)
     epochs, scores = np.array(table["epoch"], np.int64), np.array(table["score"], np.float64)
     seeds, counts = np.unique(numbers, return_counts=True)
@@ -498,7 +527,12 @@ def _curves(folder: Path, task_file: TaskFile, rows: int) -> tuple[tuple[int, ..
     require_scores(scores, task_file, folder)
     curves = round_means(scores[order].reshape(len(seeds), length))
     _refuse_copies(folder, seeds.tolist(), curves)
-    return tuple(seeds.tolist()), curves
+    measured = {
+        name: np.array(table[f"{MEASURED}.{name}"], np.float64)[order].reshape(curves.shape)
+        for name in metrics
+    }
+    _require(not any(np.isinf(values).any() for values in measured.values()), folder, "a metric is infinite")
+    return tuple(seeds.tolist()), curves, measured
 
 
 def _refuse_copies(folder: Path, seeds: list[int], curves: NDArray[np.float64]) -> None:
@@ -547,6 +581,7 @@ def files(
     beginning: Fingerprint,
     found: Mapping[str, Any],
     agents: Mapping[int, Arrays],
+    measured: Mapping[str, NDArray[np.float64]],
 ) -> dict[str, bytes]:
     """Encode an entry's files, by name; equal entries give equal bytes.
 
@@ -564,6 +599,8 @@ def files(
         `diverged` and `probe`, as `PublishedEntry` has them; where there are none, their names are left out.
     agents:
         By seed the trained parameters, of no seed or more.
+    measured:
+        (N, T) by name, as `PublishedEntry` has them.
     """
     distinct: list[Mapping[str, Any]] = []
     for made in made_with:
@@ -582,6 +619,7 @@ def files(
             "provenance": distinct,
             **found,
             **stated,
+            **({"measured": sorted(measured)} if measured else {}),
         },
     }
     return {
@@ -592,6 +630,7 @@ def files(
                 "seed": np.repeat(np.array(seeds, np.int64), length),
                 "epoch": np.tile(np.arange(1, length + 1, dtype=np.int64), count),
                 "score": np.asarray(curves, np.float64).ravel(),
+                **{f"{MEASURED}.{name}": values.ravel() for name, values in measured.items()},
             }
         ),
         SEEDS: _encode(

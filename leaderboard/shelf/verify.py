@@ -98,12 +98,15 @@ class Retrained:
     parameters:
         What may stand in the entry's record: numbers of all networks; and, where no number of networks stands in it, of
         the first alone.
+    measured:
+        By name, what the environment measured of each, (T,).
     """
 
     curves: NDArray[np.float64]
     executions: NDArray[np.int64]
     agents: tuple[Mapping[str, NDArray[Any]], ...]
     parameters: tuple[Mapping[str, int], ...]
+    measured: tuple[Mapping[str, NDArray[np.float64]], ...]
 
 
 def find(path: Path) -> list[Path]:
@@ -247,6 +250,9 @@ def _train_again(
             and not _equal(agents[seed], again.agents[row])
         ):
             return False, "verified", f"seed {seed} trained again is another agent than the published one"
+        other = _other_metric(entry, place, again.measured[row])
+        if equal[row] and elsewhere[entry.origins[place]] is None and other is not None:
+            return False, "verified", f"seed {seed} trained again has other values of the metric '{other}'"
     count, trained = len(entry.seeds), len(places)
     left = f"{count - trained} of {count} seeds, hours"
     begun = f"{trained} {'seed' if trained == 1 else 'seeds'} trained again"
@@ -305,6 +311,7 @@ def retrain(
         np.concatenate([part.executions for part in parts]),
         tuple(agent for part in parts for agent in part.agents),
         parts[0].parameters,
+        tuple(measured for part in parts for measured in part.measured),
     )
 
 
@@ -317,12 +324,15 @@ def _group(
     trainer.progress.epochs = epochs
     trainer.start()
     curves, executions = [], np.zeros(len(seeds), np.int64)
+    measured: dict[str, NDArray[np.float64]] = {}
     for _ in range(epochs):
         epoch = trainer.train_epoch()
         curves.append(learning_curve(np.asarray(epoch.scores, np.float32)))
         executions += [
             sum(n for name, n in own.items() if name != "shots") for own in epoch.executions or [{}]
         ]
+        for name, values in epoch.measured.items():
+            measured.setdefault(name, np.full((len(seeds), epochs), np.nan))[:, trainer.epoch - 1] = values
         trainer.progress.epoch = trainer.epoch
     classical, quantum, fixed = trainer.models.parameters[0]
     first = {"classical": classical, "quantum": quantum, "fixed": fixed}
@@ -330,7 +340,9 @@ def _group(
     agents = tuple(
         {name: np.atleast_1d(values[s]) for name, values in policy.items()} for s in range(len(seeds))
     )
-    return Retrained(np.stack(curves, axis=1), executions, agents, (trainer.models.trained(), first))
+    counts = trainer.models.trained(), first
+    own = tuple({name: values[s] for name, values in measured.items()} for s in range(len(seeds)))
+    return Retrained(np.stack(curves, axis=1), executions, agents, counts, own)
 
 
 def _counts(
@@ -418,6 +430,20 @@ def _differs(entry: PublishedEntry, place: int, again: NDArray[np.float64]) -> s
     return (
         f"seed {entry.seeds[place]} trained again differs from epoch {epoch + 1} on ({again[epoch]:.6f}, published "
         f"{stated[epoch]:.6f}), with the same versions on the same processor"
+    )
+
+
+def _other_metric(entry: PublishedEntry, place: int, again: Mapping[str, NDArray[np.float64]]) -> str | None:
+    """Name a published metric of a seed that training it again does not give; None where all agree."""
+    stated = entry.metrics(place)
+    nothing = np.full(entry.curves.shape[1], np.nan)
+    return next(
+        (
+            name
+            for name, values in stated.items()
+            if not np.array_equal(values, again.get(name, nothing), equal_nan=True)
+        ),
+        None,
     )
 
 

@@ -92,7 +92,8 @@ def board(
         all of them with the same options, by means over the tasks.
     by:
         `steps`; `executions` (of circuits), `shots` or `core-hours`: what learning cost, within the same budget for
-        all; `score`, the mean of the last tenth of the epochs, or `area`, that of all. Entries whose record does not
+        all; `score`, the mean of the last tenth of the epochs, or `area`, that of all; or a metric that the task's
+        `[ranking] costs` names, by the last tenth of the epochs, less first. Entries whose record does not
         hold a cost, or not so that it can be compared, have no rank, and a `price.problem` that says why.
     runs, published:
         As for `load`. Published entries that answer the question of one study are not ranked beside others of their

@@ -59,6 +59,8 @@ class Evaluation(Shown):
     episodes: int
     seed: int
     entanglement: tuple[Entanglement, ...] = ()
+    score: str = "score"
+    """What the task ranks: `score`, or the name of a metric."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values: mean, percentiles and extremes of every policy."""
@@ -101,7 +103,7 @@ class Evaluation(Shown):
             pad_edge=False,
         )
         names = ["policy", "agents", "return: mean", "median", "5%", "95%"]
-        names += ["score: mean", "median", "5%", "95%"] * relative
+        names += [f"{self.score}: mean", "median", "5%", "95%"] * relative
         shown = [i for i, name in enumerate(names) if wide or i < 2 or name.endswith("mean")]
         for name in (names[i] for i in shown):
             table.add_column(
@@ -148,7 +150,7 @@ class Evaluation(Shown):
     def _notes(self) -> list[str]:
         """Say how the agents were chosen, and what the choice promised against what came."""
         notes = [
-            "return: sum of rewards; score: relative, as the task defines it; percentiles over all episodes"
+            f"return: sum of rewards; {self.score}: as the task defines it; percentiles over all episodes"
         ]
         for each in self.policies:
             if not each.seeds:
@@ -261,7 +263,13 @@ def evaluate(
         for each, store in zip(played, stores)
     ]
     return Evaluation(
-        entry.task.name, entry.task.hash, (*played, *elsewhere, *references), episodes, seed, measured
+        entry.task.name,
+        entry.task.hash,
+        (*played, *elsewhere, *references),
+        episodes,
+        seed,
+        measured,
+        entry.task.file.score.called,
     )
 
 

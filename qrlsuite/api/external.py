@@ -13,6 +13,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import external
 from qrlsuite.leaderboard.shelf.importing import Imported
 from qrlsuite.results import points
+from qrlsuite.statistics.grid import Goal
 
 
 def import_curves(
@@ -28,6 +29,7 @@ def import_curves(
     thresholds: Sequence[float] = (),
     every: int | None = None,
     metric: str | None = None,
+    goal: Goal | None = None,
     runs: str | PathLike[str] = "runs",
 ) -> list[Imported]:
     """Import learning curves that other programs made, as *external* entries to compare.
@@ -55,6 +57,8 @@ def import_curves(
         else a round number that gives 100 points or fewer.
     metric:
         The column of a csv file or a table, or the scalar of TensorBoard or W&B, that is the score.
+    goal:
+        `below` where less of it is better, for a new task with `thresholds`.
     runs:
         The results folder.
 
@@ -86,4 +90,4 @@ def import_curves(
         found = points.read_files([Path(fspath(each)) for each in curves], metric)
     else:
         found = points.read_table(curves, metric)
-    return external.import_points(found, Path(runs), task, maximum, thresholds, every)
+    return external.import_points(found, Path(runs), task, maximum, thresholds, every, goal, metric)

@@ -407,15 +407,18 @@ class RunDisplay:
         if at_work and not summary["seeds"]:
             return
         score = summary["median_score"]
+        ranked, goal = self.entry.task.file.score.called, self.entry.task.file.score.goal
         score_text = (
-            f", median score {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
+            f", median {ranked} {score:.3f} after epoch {summary['epochs']}" if score is not None else ""
         )
         self.console.print(f"{counted(summary['seeds'], 'seed')} complete{score_text}")
         if summary["threshold_reached"] is False:
             self.console.print(
-                f"no seed reached a threshold: the lowest is {summary['lowest_threshold']:.4g}, the best score seen "
-                f"{summary['best_score']:.4g}. Entries that reach none cannot be told apart: train longer "
-                "(--epochs), or lower the thresholds ([ranking] in the task file) before the next entry is trained",
+                f"no seed reached a threshold: the {'lowest' if goal == 'above' else 'highest'} is "
+                f"{summary['lowest_threshold']:.4g}, the best {ranked} seen {summary['best_score']:.4g}. Entries that "
+                f"reach none cannot be told apart: train longer (--epochs), or "
+                f"{'lower' if goal == 'above' else 'raise'} the thresholds ([ranking] in the task file) before the "
+                "next entry is trained",
                 markup=False,
                 soft_wrap=True,
             )

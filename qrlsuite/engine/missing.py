@@ -289,7 +289,8 @@ def summarize(work: Missing) -> dict[str, Any]:
     curves = {seed: store.seed(seed).read() for seed in work.seeds if store.seed(seed).record()}
     runs = [run for run in curves.values() if len(run.scores) >= epochs]
     complete = [run.curve[:epochs] for run in runs]
-    grid = work.entry.task.file.ranking.grid
+    file = work.entry.task.file
+    grid, sign = file.ranking.grid, file.score.sign
     return {
         "task": work.entry.task.name,
         "entry": work.entry.name,
@@ -298,8 +299,8 @@ def summarize(work: Missing) -> dict[str, Any]:
         "seeds": len(complete),
         "epochs": epochs,
         "median_score": float(np.median([curve[-1] for curve in complete])) if complete else None,
-        "best_score": float(np.max(complete)) if complete else None,
-        "lowest_threshold": min(grid.thresholds),
+        "best_score": sign * float(np.max(sign * np.stack(complete))) if complete else None,
+        "lowest_threshold": sign * min(sign * level for level in grid.thresholds),
         "threshold_reached": bool(reached(np.stack(complete), grid).any()) if complete else None,
         "diverged": sum(run.diverged is not None and run.diverged <= epochs for run in runs),
     }

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import (
     Field,
+    PrivateAttr,
     SerializerFunctionWrapHandler,
     model_serializer,
     model_validator,
@@ -19,7 +20,7 @@ import qrlsuite
 from qrlsuite import files, options, own, registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError, nearest
 from qrlsuite.experiment.preset import TuningRecord
-from qrlsuite.statistics.grid import Grid
+from qrlsuite.statistics.grid import Goal, Grid
 
 FORMAT_VERSION = 1
 
@@ -62,7 +63,7 @@ class ProtocolSection(options.Table):
 
 
 class ScoreSection(options.Table):
-    """How an episode's score in [0, 1] comes about."""
+    """What of an episode is ranked: a score in [0, 1], its return, or a metric of the environment."""
 
     source: Annotated[
         Literal["info", "return"],
@@ -78,6 +79,55 @@ class ScoreSection(options.Table):
             description="best possible return, above 0, for source = 'return'; without it, rank on thresholds",
         ),
     ] = None
+    metric: Annotated[
+        str | None,
+        Field(
+            pattern=specs.WHOLE_NAME,
+            max_length=64,
+            description="what of the environment's info['metrics'] is ranked in place of a score, on thresholds",
+        ),
+    ] = None
+    goal: Annotated[
+        Goal, Field(description="above: a metric is to be the threshold or more; below: that or less")
+    ] = "above"
+
+    @model_serializer(mode="wrap")
+    def _without_absent_metric(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what no metric needs: tasks keep the hashes that earlier versions gave them."""
+        written: dict[str, Any] = write(self)
+        if self.metric is None:
+            del written["metric"], written["goal"]
+        return written
+
+    @model_validator(mode="after")
+    def _of_one_source(self) -> ScoreSection:
+        if self.metric is None and self.goal == "below":
+            raise ValueError("goal = 'below' is for a metric: scores and returns are to be high")
+        if self.metric is not None and (self.source == "return" or self.max_return is not None):
+            raise ValueError(
+                f"metric = '{self.metric}' comes from the environment's info: source = \"info\", without max_return"
+            )
+        return self
+
+    @property
+    def sign(self) -> int:
+        """1 where more is better, -1 where less is."""
+        return 1 if self.goal == "above" else -1
+
+    @property
+    def before(self) -> str:
+        """The side of a threshold where a run has not reached it: `below`, or `above` where less is better."""
+        return "below" if self.goal == "above" else "above"
+
+    @property
+    def called(self) -> str:
+        """What sentences call it: `score`, or the metric's name."""
+        return self.metric or "score"
+
+    @property
+    def of_optimum(self) -> bool:
+        """Whether it is the environment's own score, a share of the best possible."""
+        return self.source == "info" and self.metric is None
 
 
 class Cell(options.Table):
@@ -111,11 +161,16 @@ class RankingSection(options.Table):
     rule: Annotated[
         str | None, Field(description="rule by which its boards compare; the paper's where absent")
     ] = None
+    costs: Annotated[
+        list[Annotated[str, Field(pattern=specs.WHOLE_NAME, max_length=64)]],
+        Field(description="what of info['metrics'] boards show beside the score, less is better: violations"),
+    ] = []
+    _score: ScoreSection = PrivateAttr(ScoreSection())
 
     @model_serializer(mode="wrap")
-    def _without_absent_rule(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out an absent rule: files stay as earlier versions wrote them, and can read them."""
-        return {name: value for name, value in write(self).items() if name != "rule" or value is not None}
+    def _without_absent(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out an absent rule, and costs if there are none: earlier versions can read the files."""
+        return {name: value for name, value in write(self).items() if name not in ("rule", "costs") or value}
 
     @model_validator(mode="after")
     def _consistent(self) -> RankingSection:
@@ -148,7 +203,34 @@ class RankingSection(options.Table):
         return self._grid([epsilon], [threshold], [self.reference.delta])
 
     def _grid(self, epsilons: Any, thresholds: Any, deltas: list[float]) -> Grid:
-        return Grid.absolute(thresholds, deltas) if self.epsilons is None else Grid.relative(epsilons, deltas)
+        if self.epsilons is not None:
+            return Grid.relative(epsilons, deltas)
+        return Grid.absolute(thresholds, deltas, self.goal)
+
+    @property
+    def goal(self) -> Goal:
+        """The side of the thresholds that is the goal."""
+        return self._score.goal
+
+    @property
+    def before(self) -> str:
+        """The other side, `below` or `above`: what boards count are steps there."""
+        return self._score.before
+
+    @property
+    def level_name(self) -> str:
+        """What thresholds are: `epsilon`, `return`, or the metric's name."""
+        return "epsilon" if self.epsilons is not None else self._score.metric or "return"
+
+    @property
+    def cell(self) -> str:
+        """The reference cell in words: `epsilon 0.15, delta 0.75`."""
+        return f"{self.reference_level}, delta {self.reference.delta:g}"
+
+    @property
+    def reference_level(self) -> str:
+        """The reference cell's threshold in words: `return 200`."""
+        return f"{self.level_name} {self.reference_grid.levels[0]:g}"
 
 
 Family = Literal["all", "classical", "quantum"]
@@ -179,6 +261,19 @@ class TaskFile(options.Table):
             description="[tuning.NAME.ALGORITHM.FAMILY]: how the settings of that preset were found; entries keep it"
         ),
     ] = {}
+
+    @model_validator(mode="after")
+    def _goal_of_ranking(self) -> TaskFile:
+        self.ranking._score = self.score
+        if self.score.metric is not None and self.ranking.epsilons is not None:
+            raise ValueError(
+                f"score.metric = '{self.score.metric}' has no known maximum: ranking.thresholds and a reference with a "
+                "threshold in place of epsilons"
+            )
+        for name in self.ranking.costs:
+            if self.ranking.costs.count(name) > 1 or name == self.score.metric:
+                raise ValueError(f"ranking.costs: '{name}' is shown twice")
+        return self
 
     @model_validator(mode="after")
     def _preset_exists(self) -> TaskFile:
@@ -345,7 +440,8 @@ def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | N
     """Return a file's content, with that of the task which it extends, and load the plugins that it names.
 
     Where it has `extends = TASK`, the content is that task's, with this file's values in place of its own. Tables are
-    merged key by key. Every other value, a list too, replaces the one of the extended task.
+    merged key by key. Every other value, a list too, replaces the one of the extended task; thresholds replace its
+    epsilons.
 
     Parameters
     ----------
@@ -366,6 +462,11 @@ def _whole(text: str, source: str, below: tuple[str, ...] = (), folder: Path | N
     except UnknownNameError as error:
         raise FileError(f"{source}: extends: {error}") from None
     base = _whole(files.read(path, "task file"), path.name, (*below, name), path.parent)
+    ranking, changed = base.get("ranking"), data.get("ranking")
+    if isinstance(ranking, dict) and isinstance(changed, dict) and "thresholds" in changed:
+        for table in (ranking, ranking.get("reference")):  # they take the place of tolerances
+            if isinstance(table, dict):
+                table.pop("epsilons", None), table.pop("epsilon", None)
     return _merged(base, data)
 
 

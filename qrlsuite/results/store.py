@@ -21,11 +21,12 @@ import contextlib
 import functools
 import itertools
 import json
+import math
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,11 @@ from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import genuine, parquet
+from qrlsuite.specs import NAME
 
 FORMAT_VERSION = 1
+MEASURED = "measured"
+"""Before the name of a metric of the environment in an epoch's record: `measured.violations`."""
 _MARK = re.compile(r"@[0-9a-f]{8}")
 _SEED_FOLDER = re.compile(r"seed-(\d{4}|[1-9]\d{4,})", re.ASCII)
 MOST_AGENT_BYTES = 200_000_000
@@ -252,6 +256,9 @@ class SeedRun:
         is executed once.
     diverged:
         The first epoch after which numbers of the agent were not finite; None where they always were.
+    measured:
+        By name, what the environment measured of every epoch's validation, means over its episodes (T,); NaN where it
+        did not.
     """
 
     seed: int
@@ -261,6 +268,7 @@ class SeedRun:
     executions: int
     clocked: bool = False
     diverged: int | None = None
+    measured: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def finished(self) -> bool:
@@ -462,7 +470,21 @@ class SeedStore:
         shaped = scores if rows else np.empty((0, 0), np.float32)
         seconds, clocked = self._timed()
         executions = self._executions(rows)
-        return SeedRun(self.seed, record, shaped, seconds, executions, clocked, first_diverged(rows))
+        first = first_diverged(rows)
+        measured = self._measured(rows)
+        return SeedRun(self.seed, record, shaped, seconds, executions, clocked, first, measured)
+
+    def _measured(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
+        """Return the metrics of every epoch's validation, (T,) by name; NaN where an epoch has none."""
+        found: dict[str, NDArray[np.float64]] = {}
+        for place, row in enumerate(rows):
+            for name, value in _metrics(row):
+                known = value is None or (type(value) in (int, float) and math.isfinite(value))
+                if not known or not NAME.fullmatch(name):
+                    raise StoreError(f"{self.path}: {ascii(name)[:40]} = {ascii(value)[:40]} is no metric")
+                own = found.setdefault(name, np.full(len(rows), np.nan))
+                own[place] = np.nan if value is None else value
+        return found
 
     def _executions(self, rows: Sequence[Mapping[str, Any]]) -> int:
         total = 0
@@ -475,6 +497,15 @@ class SeedStore:
                     raise StoreError(f"{self.path}: {count!r} is not a number of circuit executions")
                 total += count
         return total
+
+
+def _metrics(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Return names and values of an epoch's metrics: `measured.NAME` of a line, a mapping in a table."""
+    for name, value in row.items():
+        if name == MEASURED and isinstance(value, Mapping):
+            yield from value.items()
+        elif name.startswith(f"{MEASURED}."):
+            yield name.partition(".")[2], value
 
 
 def first_diverged(rows: Iterable[Mapping[str, Any]]) -> int | None:

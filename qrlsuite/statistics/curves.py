@@ -59,12 +59,14 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
 
 
 def reached(curves: Curve, grid: Grid) -> BoolArray:
-    """Return, shape (E, T, N), whether run i has V_t >= V* at epoch t.
+    """Return, shape (E, T, N), whether run i is on the goal's side of V* at epoch t: V_t >= V*, or V_t <= V*.
 
     Thresholds are rounded to the precision of the curves: a float32 score of 0.7 reaches 0.7.
     """
     thresholds = np.array(grid.thresholds).astype(curves.dtype)
-    return curves.T[None] >= thresholds[:, None, None]
+    values, levels = curves.T[None], thresholds[:, None, None]
+    there: BoolArray = values >= levels if grid.goal == "above" else values <= levels
+    return there
 
 
 @dataclass(frozen=True, eq=False, slots=True)

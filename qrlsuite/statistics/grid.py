@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Context, Decimal, InvalidOperation
 from fractions import Fraction
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _DIGITS = Context(prec=12)
+
+Goal = Literal["above", "below"]
+"""Which side of a threshold is the goal: `above` for scores and returns, `below` for regrets and costs."""
 
 
 def whole(value: object, name: str, *, at_least: int) -> int:
@@ -94,16 +97,20 @@ class Grid:
     Attributes
     ----------
     thresholds:
-        E values V*; a run has reached the goal at epoch t where V_t >= V*. In the unit of the curves.
+        E values V*; a run has reached the goal at epoch t where V_t >= V*, or V_t <= V* if the goal is `below`. In the
+        unit of the curves.
     deltas:
         D probabilities in (0, 1]: the fraction of runs that must have reached the goal.
     epsilons:
         E tolerances with V* = 1 - epsilon, or None in the general case.
+    goal:
+        The side of the thresholds where runs are to be.
     """
 
     thresholds: tuple[float, ...]
     deltas: tuple[Fraction, ...]
     epsilons: tuple[float, ...] | None = None
+    goal: Goal = "above"
 
     @classmethod
     def relative(cls, epsilons: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]) -> Grid:
@@ -122,8 +129,22 @@ class Grid:
         return cls(thresholds, _probabilities(deltas), tuple(float(epsilon) for epsilon in tolerances))
 
     @classmethod
-    def absolute(cls, thresholds: ArrayLike | Sequence[Any], deltas: ArrayLike | Sequence[Any]) -> Grid:
+    def absolute(
+        cls,
+        thresholds: ArrayLike | Sequence[Any],
+        deltas: ArrayLike | Sequence[Any],
+        goal: Goal = "above",
+    ) -> Grid:
         """Return the grid of thresholds V* given directly (paper, appendix, "general case").
+
+        Parameters
+        ----------
+        thresholds:
+            In the unit of the curves.
+        deltas:
+            In (0, 1].
+        goal:
+            `above` if a run is there while V >= V*, `below` if it is while V <= V*.
 
         Raises
         ------
@@ -131,7 +152,12 @@ class Grid:
             If a threshold is not finite, a delta is outside (0, 1], a number is there twice, or a list is empty.
         """
         levels = tuple(float(level) for level in _values(thresholds, "thresholds"))
-        return cls(levels, _probabilities(deltas))
+        return cls(levels, _probabilities(deltas), goal=goal)
+
+    @property
+    def before(self) -> str:
+        """The side of a threshold on which a run has not reached it: `below`, or `above` if the goal is below."""
+        return "below" if self.goal == "above" else "above"
 
     @property
     def is_relative(self) -> bool:

@@ -23,7 +23,9 @@ from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
 
 
 def times_below(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray:
-    """Return T, shape (N, E): the environment steps that each run spends below each threshold.
+    """Return T, shape (N, E): the environment steps that each run spends on the wrong side of each threshold.
+
+    That is below it, or above it where the grid's goal is `below`.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ def times_below(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray
 
 
 def epochs_of_runs(curves: Curve, grid: Grid) -> IntArray:
-    """Return, shape (N, E), the number of epochs below each threshold, for checked curves of shape (N, T)."""
+    """Return, shape (N, E), the number of epochs before each threshold, for checked curves of shape (N, T)."""
     epochs: IntArray = (curves.shape[1] - np.count_nonzero(reached(curves, grid), axis=1)).T.astype(np.int64)
     return epochs
 

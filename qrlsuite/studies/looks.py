@@ -148,10 +148,11 @@ class StudyWithLooks:
         self.questions = [asked.text for asked in self.looks.questions for _ in asked.pairs]
         try:
             self.design = self._design(names)
-            grid = Grid.relative if self.looks.epsilons is not None else Grid.absolute
-            self.grid = grid(
-                self.looks.epsilons or self.looks.thresholds or [], [0.5]
-            )  # no rule here needs delta
+            if self.looks.epsilons is not None:  # no rule here needs delta
+                self.grid = Grid.relative(self.looks.epsilons, [0.5])
+            else:
+                goal = members[0].entry.task.file.ranking.goal
+                self.grid = Grid.absolute(self.looks.thresholds or [], [0.5], goal)
         except OptionError as error:
             raise OptionError(f"{self.source}: {error}") from None
         self._check_block()

@@ -208,9 +208,10 @@ class StudyOutcome(Shown):
                 "for all pairs together). Each threshold is tested separately: where this interval contains 0, the "
                 "threshold that decided follows with its own. An early stop overstates the difference."
             )
-            yield _entries_sheet(facts["entries"])
+            yield _entries_sheet(facts["entries"], study.grid.before)
             yield Text(
-                "steps below threshold: of a run of the entry, mean over seeds and thresholds, at its last look"
+                f"steps {study.grid.before} threshold: of a run of the entry, mean over seeds and thresholds, at its "
+                "last look"
             )
         if state.begun_at:
             yield Text(f"first seed begun {state.begun_at}")
@@ -377,8 +378,8 @@ def _sheet(outcome: StudyOutcome, pairs: Sequence[tuple[PairDecision, Mapping[st
     return Sheet.of("", heads, rows, words=(heads[0], "verdict", "B against A", "interval", "needs"))
 
 
-def _entries_sheet(entries: Sequence[Mapping[str, Any]]) -> Sheet:
-    """Return the table of the entries."""
+def _entries_sheet(entries: Sequence[Mapping[str, Any]], before: str) -> Sheet:
+    """Return the table of the entries; `before` a threshold is its other side, `below` or `above`."""
     rows = []
     for facts in entries:
         time = ""
@@ -386,5 +387,5 @@ def _entries_sheet(entries: Sequence[Mapping[str, Any]]) -> Sheet:
             low, high = map(steps_text, facts["mean_time_interval"])
             time = f"{steps_text(facts['mean_time'])} ({low} to {high})"
         rows.append((facts["name"], str(facts["seeds"]), time, hours_text(facts["core_hours"])))
-    heads = ("entry", "seeds", "steps below threshold (95%)", "core-hours")
+    heads = ("entry", "seeds", f"steps {before} threshold (95%)", "core-hours")
     return Sheet.of("", heads, rows, words=("entry",))

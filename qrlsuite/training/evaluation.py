@@ -103,7 +103,7 @@ def distribution(values: FloatArray) -> dict[str, float]:
 
 
 def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], int]:
-    """Choose the runs with the highest last validation score, earlier seeds first where equal.
+    """Choose the runs with the best last validation score, earlier seeds first where equal.
 
     Only finished runs count, of these only those with the most epochs that any has, and of these, if any have
     agents, only these: an entry may have been imported with some.
@@ -138,7 +138,8 @@ def best_runs(store: EntryStore, count: int) -> tuple[list[int], list[float], in
         )
     published = {seed: score for seed, score in last.items() if records[seed].get("agent") is not False}
     last = published or last
-    chosen = sorted(last, key=lambda seed: (-last[seed], seed))[:count]
+    most = -1 if store.record()["task_file"].get("score", {}).get("goal") == "below" else 1
+    chosen = sorted(last, key=lambda seed: (-most * last[seed], seed))[:count]
     return chosen, [last[seed] for seed in chosen], len(last)
 
 
@@ -275,7 +276,7 @@ def trained(
     Parameters
     ----------
     best:
-        How many runs: those with the highest last *validation* score. The evaluation's episodes are others, so
+        How many runs: those with the best last *validation* score. The evaluation's episodes are others, so
         its mean is not raised by the choice.
     episodes:
         Complete episodes of each agent.
@@ -468,6 +469,6 @@ def play(
 
 
 def knows_scores(entry: Entry) -> bool:
-    """Return whether the entry's task scores episodes relative to a maximum."""
+    """Return whether what the entry's task ranks is another number than an episode's return."""
     section = entry.task.file.score
     return section.source == "info" or section.max_return is not None

@@ -47,7 +47,7 @@ def lines_of(epoch: Epoch) -> list[dict[str, Any]]:
     lines = []
     for s, scores in enumerate(epoch.scores):
         line: dict[str, Any] = {"epoch": epoch.number, "scores": store.shortest(scores)}
-        measured = {f"measured.{name}": values for name, values in epoch.measured.items()}
+        measured = {f"{store.MEASURED}.{name}": values for name, values in epoch.measured.items()}
         for name, values in {**epoch.metrics, **measured}.items():
             value = float(values[s])
             line[name] = value if math.isfinite(value) else None

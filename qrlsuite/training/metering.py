@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qrlsuite import own, specs
 from qrlsuite.environment import LaneEnv, State, batched_spaces
-from qrlsuite.errors import EnvironmentFailure, PluginError
+from qrlsuite.errors import EnvironmentFailure, PluginError, nearest
 from qrlsuite.experiment.task import ScoreSection
 from qrlsuite.training.fences import Fence
 
@@ -95,6 +95,8 @@ class MeteredEnv(LaneEnv):
                     f"{self.returns[ended][~np.isfinite(scores)][0]}: are there rewards that are nan or infinite?"
                 )
             return scores
+        if self.score.metric is not None:
+            return self._metric(self.score.metric, ended, infos)
         score = infos.get("final_info", {}).get("score")
         if score is None:
             raise EnvironmentFailure(
@@ -107,6 +109,23 @@ class MeteredEnv(LaneEnv):
                 f"environment '{self.environment_name}' gave a score outside [0, 1]: {scores[:5].tolist()}"
             )
         return scores
+
+    def _metric(self, name: str, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return the metric that is ranked, of the episodes that have just ended in the lanes `ended`."""
+        measured = infos.get("final_info", {}).get("metrics", {})
+        if name not in measured:
+            others = nearest(name, [ascii(other)[1:-1] for other in measured]) if measured else ""
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}' gave no info['metrics']['{name}'] at the end of an episode, "
+                f"which the task ranks ([score] metric){others}"
+            )
+        values = np.asarray(measured[name], np.float64)[ended]
+        if not np.isfinite(values).all():
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}' gave an episode info['metrics']['{name}'] = "
+                f"{values[~np.isfinite(values)][0]:g}, which cannot be ranked: every episode needs a finite number"
+            )
+        return values
 
     def _measure(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> None:
         """Keep the metrics of the episodes that have just ended in the lanes `ended`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,8 +25,8 @@ class Merit:
     objective:
         Which of the three is minimized.
     time:
-        M: environment steps that a run spends below threshold up to the horizon, mean over runs and the thresholds of
-        the task's ranking grid (`qrlsuite.statistics.times`).
+        M: environment steps that a run spends short of a threshold up to the horizon, mean over runs and the
+        thresholds of the task's ranking grid (`qrlsuite.statistics.times`).
     cell:
         S_hat at the task's reference cell, environment steps.
     area:
@@ -35,6 +36,8 @@ class Merit:
     score:
         Mean validation score over all runs and epochs: settles ties, which are common where runs are too short
         to reach the threshold.
+    better:
+        1 where more of the score is better, -1 where less is.
     quantum:
         The smallest difference that the objective can show, environment steps.
     """
@@ -46,6 +49,7 @@ class Merit:
     unsettled: bool
     score: float
     quantum: float
+    better: int = 1
 
     @property
     def value(self) -> float:
@@ -56,11 +60,13 @@ class Merit:
     def order(self) -> tuple[float, float, float]:
         """Sorts trials from best to worst."""
         second = float(self.cell) if self.objective == "area" else self.area
-        return (self.value, second, -self.score)
+        return (self.value, second, -self.better * self.score)
 
     @property
     def signal(self) -> float:
         """The objective for samplers that learn: ties are settled by the score, below the smallest difference."""
+        if self.better < 0:  # a regret or a cost, which may be any number
+            return self.value + self.quantum * math.atan(self.score) / (2 * math.pi)
         return self.value + self.quantum * (0.5 - min(max(self.score, 0.0), 1.0)) / 2
 
 
@@ -80,15 +86,15 @@ def merit(
         unsettled=bool(unsettled(curves, ranking.reference_grid)[0, 0]),
         score=float(curves.mean()),
         quantum=float(steps_per_epoch) / parts[objective],
+        better=1 if ranking.goal == "above" else -1,
     )
 
 
 def cell_text(ranking: RankingSection, objective: Objective) -> str:
     """Say in words what is minimized."""
-    cell = ranking.reference
-    level = f"epsilon {cell.epsilon:g}" if cell.epsilon is not None else f"return {cell.threshold:g}"
     if objective == "time":
-        return f"M, the mean number of steps below threshold over the task's {len(ranking.grid.levels)} thresholds"
+        steps = f"M, the mean number of steps {ranking.before} threshold"
+        return f"{steps} over the task's {len(ranking.grid.levels)} thresholds"
     if objective == "cell":
-        return f"S_hat at {level}, delta {cell.delta:g}"
+        return f"S_hat at {ranking.cell}"
     return f"mean of S_hat over the {ranking.grid.size} cells of the ranking grid"

@@ -73,7 +73,7 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     object.__setattr__(several[0], "task_file", lying)
     for order in (several, several[::-1]):
         assert ranked.ranking_of(order) == ranking
-        assert board.build(order).sections[0].cell == ranked.cell_text(ranking)
+        assert board.build(order).sections[0].cell == ranking.cell
     assert ranked.ranking_of(several[:2]) == ranked.ranking_of(several[1::-1])
 
 

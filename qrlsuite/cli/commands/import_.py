@@ -28,7 +28,8 @@ def import_entries(
             "of other programs: csv (entry,seed,step,score), monitor.csv or evaluations.npz of Stable-Baselines3, "
             "event files of TensorBoard, *.wandb. Options of files: maximum=BEST, the best possible score, of which "
             "scores become fractions; metric=NAME, the column or scalar that is the score; for a new task "
-            "thresholds=A,B,..., scores that count as reached, and every=STEPS between grid points.",
+            "thresholds=A,B,..., scores that count as reached, goal=below where less is better, and every=STEPS "
+            "between grid points.",
         ),
     ],
     task: Annotated[
@@ -118,5 +119,6 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "thresholds": _numbers,
     "every": int,
     "metric": str,
+    "goal": str,
 }
 """Options of files, by name, and how they are read."""

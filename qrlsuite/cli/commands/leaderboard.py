@@ -24,6 +24,7 @@ from qrlsuite.cli.arguments import (
 from qrlsuite.engine.sheet import WIDE, Sheet, csv_rows
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.errors import OptionError, UnknownNameError
+from qrlsuite.leaderboard.boards.board import AXES
 from qrlsuite.leaderboard.boards.times import ALPHA
 
 
@@ -36,17 +37,6 @@ class Format(StrEnum):
     csv = "csv"
     html = "html"
     latex = "latex"
-
-
-class By(StrEnum):
-    """What entries are ranked by."""
-
-    steps = "steps"
-    executions = "executions"
-    shots = "shots"
-    core_hours = "core-hours"
-    score = "score"
-    area = "area"
 
 
 def leaderboard(
@@ -78,13 +68,15 @@ def leaderboard(
     ] = None,
     alpha: AlphaOption = ALPHA,
     by: Annotated[
-        By,
+        str,
         typer.Option(
             "--by",
+            metavar="|".join(AXES),
             help="What entries are ranked by: environment steps, executions, shots or core-hours below threshold, the "
-            "final score, or the area under the learning curve.",
+            "final score, the area under the learning curve, or a cost that the task's [ranking] names.",
+            autocompletion=lambda: list(AXES),
         ),
-    ] = By.steps,
+    ] = "steps",
     pairs: Annotated[bool, typer.Option("--pairs", help="Print the matrix of all pairs, too.")] = False,
     explain: Annotated[
         bool, typer.Option("--explain", help="Say below the table what its columns and marks mean.")
@@ -110,20 +102,21 @@ def leaderboard(
     --by executions, shots or core-hours ranks entries by what their learning cost, as their records say, within
     the same budget for all; --entry then compares these alone. Entries whose record does not hold the cost, or not so
     that it can be compared, have no rank.
-    --by score ranks by the mean score of the last tenth of the epochs, and --by area by that of all epochs.
+    --by score ranks by the mean score of the last tenth of the epochs, and --by area by that of all epochs. Metrics of
+    the environment that the task file names in [ranking] costs are columns; --by their names ranks by them, less first.
 
     Examples: qrlsuite leaderboard --task beam6g --format markdown; qrlsuite leaderboard --study ppo --published
     """
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     tasks = list(task or ())
-    if pairs and (len(tasks) > 1 or by is not By.steps):
+    if pairs and (len(tasks) > 1 or by != "steps"):
         raise OptionError(
             "--pairs: only the board of one task by steps has the matrix of pairs; --format json has the others'"
         )
 
     asked: dict[str, Any] = {
-        "by": by.value,
+        "by": by,
         "runs": runs,
         "published": published,
         "study": study,
