@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
@@ -77,6 +78,92 @@ def batched_spaces(
     env.single_action_space = action
     env.observation_space = gymnasium.vector.utils.batch_space(observation, lanes)
     env.action_space = gymnasium.vector.utils.batch_space(action, lanes)
+
+
+def endings(
+    done: NDArray[np.bool_], observations: NDArray[np.float32], **final: NDArray[Any]
+) -> dict[str, Any]:
+    """Return the infos of a step in which the episodes of the lanes `done` (num_envs,) ended.
+
+    Parameters
+    ----------
+    observations:
+        (num_envs, ...), before any reset.
+    final:
+        What is known of an episode at its end, (num_envs,) by name, such as `score`.
+    """
+    ended = done.reshape(-1, *[1] * (observations.ndim - 1))
+    known = {name: np.where(done, values, 0.0) for name, values in final.items()}
+    return {
+        "final_obs": np.where(ended, observations, np.float32(0.0)),
+        "_final_obs": done.copy(),
+        "final_info": known | {f"_{name}": done.copy() for name in final},
+        "_final_info": done.copy(),
+    }
+
+
+class OneLane(gymnasium.Env[Any, Any]):
+    """One lane of a `LaneEnv` as a `gymnasium.Env`, so that an environment is written once, for both forms.
+
+    With a generator for its stream, a lane plays the same episodes.
+
+    Parameters
+    ----------
+    lanes:
+        With one lane. Flat observations have the shape of `unflattened_space` here, where there is one.
+
+    Raises
+    ------
+    ValueError
+        If there are several lanes.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, lanes: LaneEnv) -> None:
+        if lanes.num_envs != 1:
+            raise ValueError(f"one lane, not {lanes.num_envs}")
+        self.lanes = lanes
+        self.lanes.autoreset = False
+        flat = lanes.single_observation_space
+        self.observation_space = flat if lanes.unflattened_space is None else lanes.unflattened_space
+        self.action_space = lanes.single_action_space
+        self._running = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        self.lanes.seed_lanes([self.np_random])
+        observations, _ = self.lanes.reset(options=options)
+        self._running = True
+        return self._shown(observations), {}
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            If no episode is running.
+        gymnasium.error.InvalidAction
+            If the action is none of the space.
+        """
+        if not self._running:
+            raise ResetNeeded("call reset() before step(): no episode is running")
+        observations, rewards, terminated, truncated, infos = self.lanes.step(np.asarray(action)[None])
+        self._running = not (terminated[0] or truncated[0])
+        final = dict(infos.get("final_info", {}))
+        metrics = {name: float(values[0]) for name, values in final.pop("metrics", {}).items()}
+        info: dict[str, Any] = {n: float(v[0]) for n, v in final.items() if not n.startswith("_")}
+        if metrics:
+            info["metrics"] = metrics
+        return self._shown(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def _shown(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        shown: NDArray[np.float32] = observations[0].reshape(self.observation_space.shape or ())
+        return shown
 
 
 def arrived(observations: NDArray[Any], infos: Mapping[str, Any]) -> NDArray[Any]:

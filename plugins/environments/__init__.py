@@ -13,7 +13,7 @@ _BEAM6G = f"{_HERE}.beam6g"
 
 @hookimpl
 def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
-    """Register BeamManagement6G, CartPole, Planted, and whatever else Gymnasium knows."""
+    """Register BeamManagement6G, BeamAngle, CartPole, Planted, Room, and whatever else Gymnasium knows."""
     register(
         EnvironmentSpec(
             name="beam6g",
@@ -40,6 +40,31 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
                     options=f"{_BEAM6G}.pictures:FieldOptions",
                 ),
             ),
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="beam-angle",
+            summary="BeamAngle: steer one antenna's beam after a moving user, by its angle",
+            options=f"{_BEAM6G}.angle:AngleOptions",
+            gymnasium_id="qrlsuite/BeamAngle-v1",
+            entry_point=f"{_BEAM6G}.angle:BeamAngle",
+            vector=f"{_BEAM6G}.angle:make_vector",
+            policies={
+                "optimal": f"{_BEAM6G}.angle:BestAngle",
+                "same angle": f"{_BEAM6G}.angle:SameAngle",
+            },
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="room",
+            summary="Room: find the goal in a walled room, seen as an image",
+            options=f"{_HERE}.room:RoomOptions",
+            gymnasium_id="qrlsuite/Room-v1",
+            entry_point=f"{_HERE}.room:Room",
+            vector=f"{_HERE}.room:make_vector",
+            policies={"shortest way": f"{_HERE}.room:ShortestWay"},
         )
     )
     register(

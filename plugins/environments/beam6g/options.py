@@ -60,7 +60,7 @@ class BeamOptions:
                 "at least 2 are needed: the action is the choice of an antenna, and "
                 "the observation divides its index by their number minus one"
             )
-        return tuple(_checked(i, antenna) for i, antenna in enumerate(antennas))
+        return tuple(checked(i, antenna) for i, antenna in enumerate(antennas))
 
     @field_validator("degree")
     @classmethod
@@ -72,7 +72,7 @@ class BeamOptions:
         return degree
 
 
-def _checked(index: int, antenna: Antenna) -> Antenna:
+def checked(index: int, antenna: Antenna) -> Antenna:
     """Return an antenna with a unit orientation, or raise a ValueError that says what is wrong."""
     (x, y), (d_x, d_y) = antenna
     if not all(math.isfinite(value) for value in (x, y, d_x, d_y)):
