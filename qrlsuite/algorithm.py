@@ -80,7 +80,7 @@ class Algorithm(Protocol):
         """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,)."""
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        """Return the greedy actions (S, B, ...) for observations (S, B, obs), in the shape and type of their space.
+        """Return the actions of validation (S, B, ...) for observations (S, B, obs), in their space's shape and type.
 
         An algorithm that draws them has an attribute `draws` that is true. It draws from streams of its own, so that
         training goes on as if no action had been drawn.

@@ -15,9 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
-from qrlsuite.leaderboard.shelf import PLANS, collect, importing, published
+from qrlsuite.leaderboard.shelf import PLANS, collect, import_seeds, published
 from qrlsuite.leaderboard.shelf.export import export as export_entry
-from qrlsuite.leaderboard.shelf.importing import Imported
+from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
 from qrlsuite.results.store import EntryStore, write_atomically
 from qrlsuite.studies.looks import FILE, LOG, Run, StudyWithLooks
@@ -183,7 +183,9 @@ def import_study(folder: Path, runs: Path) -> list[Imported]:
     source = PublishedStudy(folder)
     study = StudyWithLooks(load(folder), runs)
     study.begin()
-    done = [importing.import_seeds(store, study.folder, source.hash) for store in importing.sources(folder)]
+    done = [
+        import_seeds.import_seeds(store, study.folder, source.hash) for store in import_seeds.sources(folder)
+    ]
     log = study.folder / LOG
     if (
         folder / LOG

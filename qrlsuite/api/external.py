@@ -10,8 +10,8 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.shelf import external
-from qrlsuite.leaderboard.shelf.importing import Imported
+from qrlsuite.leaderboard.shelf import import_curves as curve_files
+from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results import points
 from qrlsuite.statistics.grid import Goal
 
@@ -90,4 +90,4 @@ def import_curves(
         found = points.read_files([Path(fspath(each)) for each in curves], metric)
     else:
         found = points.read_table(curves, metric)
-    return external.import_points(found, Path(runs), task, maximum, thresholds, every, goal, metric)
+    return curve_files.import_points(found, Path(runs), task, maximum, thresholds, every, goal, metric)

@@ -45,7 +45,7 @@ class ProtocolSection(options.Table):
         int, Field(ge=1, description="environment steps per epoch, all environments together")
     ]
     validation_episodes: Annotated[
-        int, Field(ge=1, description="fresh greedy episodes after every epoch")
+        int, Field(ge=1, description="fresh validation episodes after every epoch")
     ] = 100
 
     @model_validator(mode="after")

@@ -639,7 +639,7 @@ class Trainer:
         return np.asarray(found, np.bool_)
 
     def validate(self, epoch: int) -> Floats:
-        """Play every seed's fresh greedy episodes of an epoch; returns their scores (S, V).
+        """Play every seed's fresh validation episodes of an epoch; returns their scores (S, V).
 
         Circuit executions are counted by each seed's own steps, and the models' buffers, such as how many passes with
         shots there were, are left as they were: neither depends on the company that a seed is trained in.
@@ -733,7 +733,7 @@ class Trainer:
         begins: NDArray[np.bool_] | None = None,
         infos: Infos | None = None,
     ) -> NDArray[Any]:
-        """Return the greedy actions (S * L, ...) for observations (S * L, ...) of seed-major lanes.
+        """Return the actions that the algorithm's `act` chooses, (S * L, ...), for observations (S * L, ...) of lanes.
 
         Parameters
         ----------

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from qrlsuite import api
-from qrlsuite.leaderboard.shelf import importing, published
+from qrlsuite.leaderboard.shelf import import_seeds, published
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
@@ -49,7 +49,7 @@ def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores
     folder = export(loaded, tmp_path / "export")
     there = published.read(folder)
     assert (there.entry_results().diverged, there.probe) == ((0, 1), probe)
-    importing.import_seeds(EntryStore(folder), tmp_path / "imported")
+    import_seeds.import_seeds(EntryStore(folder), tmp_path / "imported")
     (here,) = (tmp_path / "imported").glob("*/*")
     assert EntryStore(here).seed(0).read().diverged == 1
     assert (EntryStore(here).seed(1).record() or {})["probe"] == probe

@@ -19,7 +19,7 @@ from qrlsuite import api
 from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import QrlSuiteError, StoreError
-from qrlsuite.leaderboard.shelf import collect, importing, published, verify
+from qrlsuite.leaderboard.shelf import collect, import_seeds, published, verify
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
@@ -54,7 +54,7 @@ def folder(trained: Path, tmp_path: Path) -> Path:
 
 
 def runs_of(root: Path) -> EntryStore:
-    (store,) = importing.sources(root / "runs")
+    (store,) = import_seeds.sources(root / "runs")
     return store
 
 
@@ -100,8 +100,8 @@ def test_curves_alone_are_published_on_request_and_say_what_to_type(folder: Path
         StoreError, match=r"curves without agents.*; qrlsuite run --task tiny 'ddqn mlp width=16'"
     ):
         published.PublishedAgents(bare, tmp_path / "runs")
-    (source,) = importing.sources(bare)
-    taken = importing.import_seeds(source, tmp_path / "new")
+    (source,) = import_seeds.sources(bare)
+    taken = import_seeds.import_seeds(source, tmp_path / "new")
     assert taken.notes[-1] == "seeds 0:3 came without agents: they cannot be evaluated"
     with pytest.raises(StoreError, match="no trained parameters"):
         evaluation.trained(taken.store, 1, 5)
@@ -123,8 +123,8 @@ def test_agents_are_added_to_an_entry_with_the_same_curves(folder: Path, tmp_pat
     assert all((bare / name).read_bytes() == before[name] for name in ("curves.parquet", "seeds.parquet"))
     played = evaluation.trained(published.PublishedAgents(bare, tmp_path / "runs"), 3, 5)
     assert sorted(played.seeds) == [0, 2]
-    (source,) = importing.sources(bare)
-    taken = importing.import_seeds(source, tmp_path / "new")
+    (source,) = import_seeds.sources(bare)
+    taken = import_seeds.import_seeds(source, tmp_path / "new")
     assert taken.notes[-1] == "seeds 1:2 came without agents: they cannot be evaluated"
     assert sorted(evaluation.trained(taken.store, 3, 5).seeds) == [0, 2]
 
@@ -185,9 +185,9 @@ def test_wrong_agents_are_refused_by_verify_and_import(case: str, folder: Path, 
     assert message in found.message
     assert "\x1b" not in found.message
     if case != "another model":  # is said where they are played: an import builds no model
-        (source,) = importing.sources(folder)
+        (source,) = import_seeds.sources(folder)
         with pytest.raises(StoreError):
-            importing.import_seeds(source, tmp_path / "new")
+            import_seeds.import_seeds(source, tmp_path / "new")
         assert not (tmp_path / "new").exists()
 
 

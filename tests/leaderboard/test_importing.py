@@ -15,7 +15,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.leaderboard.shelf import collect, importing
+from qrlsuite.leaderboard.shelf import collect, import_seeds
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.options import parse_setting
 from qrlsuite.results import checkpoint
@@ -60,7 +60,7 @@ def exported(elsewhere: Path) -> Path:
 @pytest.fixture
 def copied(elsewhere: Path, tmp_path: Path) -> EntryStore:
     shutil.copytree(elsewhere, tmp_path / "copied")
-    (store,) = importing.sources(tmp_path / "copied")
+    (store,) = import_seeds.sources(tmp_path / "copied")
     return store
 
 
@@ -68,9 +68,9 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def take(source: Path, runs: Path) -> importing.Imported:
-    (found,) = importing.sources(source)
-    return importing.import_seeds(found, runs)
+def take(source: Path, runs: Path) -> import_seeds.Imported:
+    (found,) = import_seeds.sources(source)
+    return import_seeds.import_seeds(found, runs)
 
 
 def test_only_what_is_missing_is_trained_and_seeds_go_on(elsewhere: Path, task: str, tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_only_what_is_missing_is_trained_and_seeds_go_on(elsewhere: Path, task: 
     before = files(own.seed(1).path)
     done = take(elsewhere, runs)
     assert (done.new, done.known, done.notes) == ((0,), (1,), ())
-    (source,) = importing.sources(elsewhere)
+    (source,) = import_seeds.sources(elsewhere)
     assert files(own.seed(0).path) == files(source.seed(0).path)
     assert files(own.seed(1).path) == before
     assert [group.seeds for group in plan_groups(own, range(3), 2, 1)] == [(2,)]
@@ -101,7 +101,7 @@ def test_an_exported_entry_counts_with_the_same_curves(
     done = take(exported, runs)
     assert done.new == (0, 1)
     assert done.notes == ("an export holds no checkpoints: these seeds cannot be trained to more epochs",)
-    (source,) = importing.sources(elsewhere)
+    (source,) = import_seeds.sources(elsewhere)
     for s in (0, 1):
         assert done.store.seed(s).agent.read_bytes() == source.seed(s).agent.read_bytes()
     (here,), _ = collect.collect(runs)
@@ -146,7 +146,7 @@ def test_stopped_anywhere_it_goes_on(
         patch.setattr(Path, "rename", interrupted)
         with pytest.raises(KeyboardInterrupt):
             take(source, runs)
-    (store,) = importing.sources(runs)
+    (store,) = import_seeds.sources(runs)
     assert store.seeds() == [0]
     done = take(source, runs)
     assert (done.new, done.known) == ((1,), (0,))
@@ -163,19 +163,19 @@ def test_a_seed_that_differs_stays_as_it_is_here(copied: EntryStore, elsewhere: 
     rows = folder.epochs()
     rows[0]["scores"] = [0.5] * len(rows[0]["scores"])
     folder.table.write_bytes(table_bytes(rows))
-    done = importing.import_seeds(copied, tmp_path / "runs")
+    done = import_seeds.import_seeds(copied, tmp_path / "runs")
     assert done.notes == ("seeds 1:2 have other curves there than here: those here stay",)
 
 
 def test_seeds_in_training_are_left_there(copied: EntryStore, task: str, tmp_path: Path) -> None:
     claim = acquire(copied, [1])
-    done = importing.import_seeds(copied, tmp_path / "runs")
+    done = import_seeds.import_seeds(copied, tmp_path / "runs")
     assert done.new == (0,)
     assert "seeds 1:2 are left there: they are being trained" in done.notes[0]
     claim.release()
     claim = acquire(done.store, [0])
     with pytest.raises(SeedsClaimedError):
-        importing.import_seeds(copied, tmp_path / "runs")
+        import_seeds.import_seeds(copied, tmp_path / "runs")
     claim.release()
 
 
@@ -184,7 +184,7 @@ def test_other_versions_are_named(copied: EntryStore, tmp_path: Path) -> None:
     record = json.loads(path.read_text())
     record["provenance"][0]["versions"]["torch"] = "0.9"
     path.write_text(json.dumps(record))
-    (note,) = importing.import_seeds(copied, tmp_path / "runs").notes
+    (note,) = import_seeds.import_seeds(copied, tmp_path / "runs").notes
     assert note.startswith("made with torch ")
     assert "0.9" in note
 
@@ -210,7 +210,7 @@ def test_what_is_refused_leaves_nothing(
 ) -> None:
     change(copied, path, **values)
     with pytest.raises(StoreError, match=message) as refused:
-        importing.import_seeds(copied, tmp_path / "runs")
+        import_seeds.import_seeds(copied, tmp_path / "runs")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "runs").exists()
 

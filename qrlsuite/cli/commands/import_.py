@@ -13,8 +13,8 @@ from qrlsuite import api
 from qrlsuite.cli.arguments import JsonOption, RunsOption
 from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard.shelf import external, importing, published_studies
-from qrlsuite.leaderboard.shelf.importing import Imported
+from qrlsuite.leaderboard.shelf import import_curves, import_seeds, published_studies
+from qrlsuite.leaderboard.shelf.import_seeds import Imported
 from qrlsuite.results.seeds import format_seeds
 from qrlsuite.results.text import counted
 
@@ -74,7 +74,7 @@ def import_entries(
     if json_output:
         typer.echo(json.dumps({"entries": [each.as_dict() for each in done]}))
     elif files:
-        for line in external.told(done):
+        for line in import_curves.told(done):
             typer.echo(line)
         typer.echo(f"next: {command('leaderboard', '--task', done[0].task, runs=runs)}")
     else:
@@ -85,7 +85,7 @@ def _taken(folder: Path, runs: Path) -> Iterator[Imported]:
     if published_studies.is_published(folder):
         yield from published_studies.import_study(folder, runs)
     else:
-        yield from (importing.import_seeds(source, runs) for source in importing.sources(folder))
+        yield from (import_seeds.import_seeds(source, runs) for source in import_seeds.sources(folder))
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Path], dict[str, Any]]:

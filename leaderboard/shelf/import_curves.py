@@ -28,7 +28,7 @@ from qrlsuite.experiment import task as tasks
 from qrlsuite.experiment.entry import EXTERNAL
 from qrlsuite.experiment.task import TaskFile, digest
 from qrlsuite.leaderboard.shelf.curves import require_scores
-from qrlsuite.leaderboard.shelf.importing import Imported, differences, differs, unplaced
+from qrlsuite.leaderboard.shelf.import_seeds import Imported, differences, differs, unplaced
 from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance
 from qrlsuite.results.claims import acquire
