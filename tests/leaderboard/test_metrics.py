@@ -19,7 +19,7 @@ from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.boards import board, tables
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.report import render
-from qrlsuite.leaderboard.shelf import collect, external, importing, published, verify
+from qrlsuite.leaderboard.shelf import collect, import_curves, import_seeds, published, verify
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
@@ -129,7 +129,7 @@ def test_an_export_holds_metrics_which_are_checked(walked: tuple[Path, EntryResu
     for name, values in entry.metrics.items():
         np.testing.assert_array_equal(read.metrics[name], values)
     assert verify.verify(folder, rerun=2, choice=1).ok
-    importing.import_seeds(EntryStore(folder), tmp_path / "runs")
+    import_seeds.import_seeds(EntryStore(folder), tmp_path / "runs")
     [again], _ = collect.select(tmp_path / "runs")
     np.testing.assert_array_equal(again.metrics["late"], entry.metrics["late"])
 
@@ -213,7 +213,7 @@ def test_curves_of_other_programs_may_be_costs(tmp_path: Path) -> None:
         "below",
         "regret 7, delta 0.5",
     )
-    assert "thresholds 7, 8.5 on regret, less is better" in external.told(done)[1]
+    assert "thresholds 7, 8.5 on regret, less is better" in import_curves.told(done)[1]
     [section] = api.board(runs=tmp_path).sections
     assert [row.entry.label for row in section.times.rows] == ["external a", "external b"]
     for more, problem in (
