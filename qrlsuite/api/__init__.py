@@ -19,21 +19,47 @@ the same name.
 
 from __future__ import annotations
 
-from qrlsuite.api.entries import board, compare, load, plot
-from qrlsuite.api.external import import_curves
-from qrlsuite.api.own import register
-from qrlsuite.api.playing import play
-from qrlsuite.api.studies import new_study, read_study, run_study
-from qrlsuite.api.tables import table
-from qrlsuite.api.training import evaluate, train, tune
-from qrlsuite.engine.terminal import show_figures_in_notebook
+import importlib
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from qrlsuite.api.entries import board, compare, load, plot
+    from qrlsuite.api.external import import_curves
+    from qrlsuite.api.own import register
+    from qrlsuite.api.playing import play
+    from qrlsuite.api.studies import new_study, read_study, run_study
+    from qrlsuite.api.tables import table
+    from qrlsuite.api.training import evaluate, train, tune
 
 __all__ = [
     "board", "compare", "evaluate", "import_curves", "load", "new_study", "play", "plot", "read_study", "register",
     "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
-show_figures_in_notebook()
+_MODULES = {
+    "entries": ("board", "compare", "load", "plot"),
+    "external": ("import_curves",),
+    "own": ("register",),
+    "playing": ("play",),
+    "studies": ("new_study", "read_study", "run_study"),
+    "tables": ("table",),
+    "training": ("evaluate", "train", "tune"),
+}
+"""Where the functions are; a module is imported when the first of its functions is asked for."""
+
+if "IPython" in sys.modules:
+    from qrlsuite.engine.terminal import show_figures_in_notebook
+
+    show_figures_in_notebook()
+
+
+def __getattr__(name: str) -> Any:
+    for module, functions in _MODULES.items():
+        if name in functions:
+            found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
