@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,14 +33,15 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
         A task, or its file, whose environment is taken in place of the toys.
     """
     assert isinstance(subject.spec, specs.AlgorithmSpec)
-    if task is not None:
-        return _check(subject, World.of_task(task))
     first, *others = subject.spec.actions
     asks = inspect.signature(getattr(specs.resolve(subject.spec.factory), "act", len)).parameters.get(
         "begins"
     )
     optional = asks is not None and asks.default is None
-    findings = _check(subject, World.toy(first, hidden=asks is not None and not optional))
+    hidden = asks is not None and not optional
+    if task is not None:
+        return _check(subject, replace(World.of_task(task), hidden=hidden))
+    findings = _check(subject, World.toy(first, hidden=hidden))
     if all(finding.ok for finding in findings):
         worlds = {f"{kind} actions": World.toy(kind) for kind in others}
         if optional:
@@ -102,7 +103,7 @@ def _check_more(subject: Subject, world: World, rule: str) -> list[Finding]:
             _remembers(trial)
 
     with one_thread():
-        cause = f"the spec says that it takes these actions: build it for {world.space}"
+        cause = f"the spec says that it takes {rule}: build it for {world.space}"
         looked_at = "it trains, acts, learns and resumes with them, seeds apart"
         if world.hidden:
             cause = "act(observations, begins=None, infos=None): begins is given where networks remember"

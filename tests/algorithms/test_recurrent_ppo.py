@@ -137,7 +137,7 @@ def test_a_seed_does_not_depend_on_its_company(name: str, model: str, tiny_task:
 def test_it_remembers_what_an_episode_showed_first(model: str, solves: bool) -> None:
     """The context is shown at an episode's first step alone: without a memory, two of three later choices are wrong."""
     ppo = made(model, lr=2e-2, gamma=0.0, length=8, batch=32, repeats=5)
-    for _ in range(30):
+    for _ in range(20):
         ppo.train_epoch(32)
     rewards = ppo._collect(100).rewards.mean((1, 2))
     assert rewards.min() > 0.9 if solves else rewards.max() < 0.7
