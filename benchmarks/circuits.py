@@ -131,8 +131,8 @@ def fma_loop() -> tuple[Call, float]:
     """Return a loop of independent fused multiply-adds on the simulator's vectors, and its operations."""
     import numba
 
-    from qrlsuite.plugins.circuits.native import kernels
-    from qrlsuite.plugins.circuits.native.vectors import fma, load, store
+    from qrlsuite.compiled import vectors
+    from qrlsuite.compiled.vectors import fma, load, store
 
     @numba.njit(nogil=True, fastmath={"contract"}, error_model="numpy")
     def loop(rows: np.ndarray, count: int) -> None:
@@ -144,8 +144,8 @@ def fma_loop() -> tuple[Call, float]:
             i, j, k, m = fma(i, x, y), fma(j, x, y), fma(k, x, y), fma(m, x, y)
         store(rows, 3, a + b + c + d + e + f + g + h + i + j + k + m)
 
-    count, lanes = 300_000, kernels.lanes(np.float32)
-    rows = kernels.aligned((4, lanes), np.float32)
+    count, lanes = 300_000, vectors.lanes(np.float32)
+    rows = vectors.aligned((4, lanes), np.float32)
     rows[:] = 0.5
     return lambda: loop(rows, count), 2.0 * 12 * count * lanes
 

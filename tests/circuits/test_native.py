@@ -359,7 +359,7 @@ def test_other_processors(processor: str, chosen: str, tmp_path: Path) -> None:
     if processor == "haswell" and "fma" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2 and FMA")
     program = (
-        "import sys; from numba import types; from qrlsuite.plugins.circuits.native.vectors import LANES; "
+        "import sys; from numba import types; from qrlsuite.compiled.vectors import LANES; "
         "assert LANES == {types.float32: int(sys.argv[1]) // 4, types.float64: int(sys.argv[1]) // 8}, LANES; "
         "sys.argv[3] or sys.exit(); import pytest; "
         "sys.exit(pytest.main(['-q', '-x', '-p', 'no:cacheprovider', sys.argv[2], '-k', sys.argv[3]]))"
@@ -401,19 +401,26 @@ def test_code_for_arm_has_vectors_and_fused_multiplications() -> None:
 
 def test_the_compile_cache_depends_on_every_source_file_and_the_processor(tmp_path: Path) -> None:
     """A changed source is never served from a stale cache, and two processes may fill it at once."""
-    from qrlsuite.plugins.circuits.native import cache
+    from qrlsuite.compiled import cache
 
-    package = tmp_path / "native"
-    package.mkdir()
+    for name in ("compiled", "native"):
+        (tmp_path / name).mkdir()
     for path in Path(cache.__file__).parent.glob("*.py"):
-        (package / path.name).write_bytes(path.read_bytes())
+        (tmp_path / "compiled" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "native/kernels.py").touch()
     program = (
-        "import importlib.util, sys; s = importlib.util.spec_from_file_location('c', sys.argv[1]); "
-        "m = importlib.util.module_from_spec(s); s.loader.exec_module(m); print(m.FOLDER)"
+        "import importlib.util, pathlib, sys; s = importlib.util.spec_from_file_location('c', sys.argv[1]); "
+        "m = importlib.util.module_from_spec(s); s.loader.exec_module(m); print(m.folder(pathlib.Path(sys.argv[2])))"
     )
 
     def folder(**variables: str) -> str:
-        command = [sys.executable, "-c", program, str(package / "cache.py")]
+        command = [
+            sys.executable,
+            "-c",
+            program,
+            str(tmp_path / "compiled/cache.py"),
+            str(tmp_path / "native"),
+        ]
         env = {"QRLSUITE_CACHE": str(tmp_path), **variables}
         return subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout
 
@@ -422,8 +429,10 @@ def test_the_compile_cache_depends_on_every_source_file_and_the_processor(tmp_pa
     assert first.startswith(str(tmp_path))
     generic = folder(NUMBA_CPU_NAME="generic")
     assert len({first, generic, folder(NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="+neon")}) == 3
-    (package / "vectors.py").write_text((package / "vectors.py").read_text() + "\n")
-    assert folder() != first
+    for changed in ("compiled/vectors.py", "native/kernels.py"):
+        (tmp_path / changed).write_text((tmp_path / changed).read_text() + "\n")
+        before, first = first, folder()
+        assert before != first
 
 
 CALL = """

@@ -25,7 +25,7 @@ TOP = {
 """What a plugin or a user may import, beside `qrlsuite.api`."""
 
 ROOMS = (
-    ("statistics",),
+    ("statistics", "compiled"),
     ("contracts",),  # the modules of TOP
     ("circuit",),
     ("experiment",),
@@ -40,7 +40,7 @@ ROOMS = (
 )
 """A room imports from itself and from the rows above it."""
 LEVELS = {room: level for level, row in enumerate(ROOMS) for room in row}
-PLUGINS_MAY = ("contracts", "statistics", "circuit", "testing")
+PLUGINS_MAY = ("contracts", "statistics", "compiled", "circuit", "testing")
 ENGINE_CONTRACT = "qrlsuite.engine.api"
 """What an engine may import besides."""
 

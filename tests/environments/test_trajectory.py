@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.interpolate import UnivariateSpline, make_interp_spline
 
-from qrlsuite.plugins.environments.beam6g import trajectory
+from qrlsuite.plugins.environments.beam6g import compiled, trajectory
 from tests.conftest import golden
 
 EPISODES = golden("beam6g")
@@ -20,18 +20,24 @@ def sampled(count, degree, seed=0, rejection="tolerant"):
     return trajectory.sample([np.random.default_rng(seed)], [count], degree, rejection)
 
 
+def on_grid(curve, values, grid):
+    """Paths (B, T) through support values (B, n), as the compiled loops see them."""
+    paths = np.empty((len(values), grid.size))
+    for b, path in enumerate(paths):
+        compiled._on_grid(curve.coefficients(values), b, curve.borders, curve.starts(grid), grid, path)
+    return paths
+
+
 @pytest.mark.parametrize("degree", DEGREES)
 def test_spline_is_that_of_scipy(degree):
     values = np.random.default_rng(1).uniform(0, 6, (3, degree))
     curve = trajectory.spline(degree)
     grid = np.linspace(0, 1, 301)
     times, order = np.linspace(0, 1, degree), min(4, degree - 1)
-    coefficients = curve.coefficients(values)
     expected = make_interp_spline(times, values.T, k=order)(grid).T
-    np.testing.assert_allclose(curve.on_grid(coefficients, grid), expected, atol=1e-10)
-    np.testing.assert_allclose(curve.at(coefficients, np.tile(grid, (3, 1))), expected, atol=1e-10)
+    np.testing.assert_allclose(on_grid(curve, values, grid), expected, atol=1e-10)
     released = UnivariateSpline(times, values[0], k=order, s=0)(grid)
-    np.testing.assert_allclose(curve.on_grid(coefficients, grid)[0], released, atol=1e-10)
+    np.testing.assert_allclose(on_grid(curve, values[:1], grid)[0], released, atol=1e-10)
 
 
 def test_straight_path_is_walked_evenly():
@@ -148,7 +154,7 @@ def test_a_path_that_leaves_between_the_coarse_points_is_rejected():
     # It leaves near t = 0 only, for about 4 of the 1000 points, all before the second of the coarse 28.
     support = np.array([[[0.0, 3.0], [1.494, 3.0], [6.0, 3.0]]])
     curve = trajectory.spline(3)
-    x = curve.on_grid(curve.coefficients(support[:, :, 0]), np.linspace(0, 1, 1000))[0]
+    x = on_grid(curve, support[:, :, 0], np.linspace(0, 1, 1000))[0]
     outside = np.flatnonzero(x < -1e-9)
     assert outside.min() > 0
     assert outside.max() < trajectory._STRIDE

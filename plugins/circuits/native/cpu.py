@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit
-from qrlsuite.plugins.circuits.native.cache import announce
+from qrlsuite.compiled.cache import announce
 from qrlsuite.plugins.circuits.native.program import compile_circuit
 
 KEEP_BYTES = 256 << 20
@@ -50,7 +51,7 @@ class _Records:
         self.dtype = dtype
         room = self.spare.pop(dtype, None)
         if room is None or len(room) < chunks:
-            room = simulator.kernels.aligned((chunks, *rows), NUMPY[dtype])
+            room = simulator.vectors.aligned((chunks, *rows), NUMPY[dtype])
         self.array = room
 
     def __del__(self) -> None:
@@ -62,13 +63,15 @@ class Simulator:
     """Runs one circuit on the CPU; not to be shared between threads."""
 
     def __init__(self, circuit: Circuit) -> None:
-        announce()
+        announce(Path(__file__).parent, "the circuit simulator")
+        from qrlsuite.compiled import vectors
         from qrlsuite.plugins.circuits.native import kernels, mean_field
 
+        self.vectors = vectors
         self.kernels: Any = mean_field if circuit.mean_field else kernels
         self.program = (mean_field.compile_circuit if circuit.mean_field else compile_circuit)(circuit)
         self.tables = self.kernels.tables(self.program)
-        self.lanes = {dtype: self.kernels.lanes(kind) for dtype, kind in NUMPY.items()}
+        self.lanes = {dtype: vectors.lanes(kind) for dtype, kind in NUMPY.items()}
         self.spare: dict[torch.dtype, np.ndarray[Any, Any]] = {}
         self._workspaces: dict[torch.dtype, _Workspace] = {}
 
@@ -84,11 +87,11 @@ class Simulator:
             rows = self.kernels.record_rows(program)
             self._workspaces[dtype] = _Workspace(
                 scratch=self.kernels.scratch(program, lanes, kind),
-                record=self.kernels.aligned((1, sum(rows), lanes), kind),
-                pair=self.kernels.aligned((2, rows[0] + APART, lanes), kind),
-                overlap=self.kernels.aligned((4, lanes), kind),
-                sums=self.kernels.aligned((program.parameters, lanes), kind),
-                slopes=self.kernels.aligned((program.inputs, lanes), kind),
+                record=self.vectors.aligned((1, sum(rows), lanes), kind),
+                pair=self.vectors.aligned((2, rows[0] + APART, lanes), kind),
+                overlap=self.vectors.aligned((4, lanes), kind),
+                sums=self.vectors.aligned((program.parameters, lanes), kind),
+                slopes=self.vectors.aligned((program.inputs, lanes), kind),
             )
         return self._workspaces[dtype]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.plugins.circuits.native.cache import inlined, kernel
+from qrlsuite.compiled.cache import inlined, kernel
 
 SMALL = 10.0
 """Below this mean a binomial draw counts up from 0."""

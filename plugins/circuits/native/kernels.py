@@ -7,15 +7,14 @@ filled chunk compute on inputs of zero and are dropped.
 
 from __future__ import annotations
 
-import math
 from collections import namedtuple
 from typing import Any, NamedTuple
 
-import numpy as np
-from numba.np.numpy_support import from_dtype
 from numpy.typing import NDArray
 
-from qrlsuite.plugins.circuits.native.cache import inlined, kernel
+from qrlsuite.compiled.cache import inlined, kernel
+from qrlsuite.compiled.trigonometry import sine_cosine
+from qrlsuite.compiled.vectors import aligned, load, splat, store, total
 from qrlsuite.plugins.circuits.native.program import (
     AXIS_X,
     AXIS_Y,
@@ -36,8 +35,6 @@ from qrlsuite.plugins.circuits.native.sweeps import (
     unpermute,
     unrotate,
 )
-from qrlsuite.plugins.circuits.native.trigonometry import sine_cosine
-from qrlsuite.plugins.circuits.native.vectors import LANES, load, splat, store, total
 
 Tables = namedtuple(
     "Tables",
@@ -57,19 +54,6 @@ class Scratch(NamedTuple):
 def tables(program: Program) -> Tables:
     """Return a program's arrays for the kernels."""
     return Tables(*(getattr(program, name) for name in Tables._fields))
-
-
-def lanes(dtype: Any) -> int:
-    """Return the number V of samples that are computed side by side."""
-    return LANES[from_dtype(np.dtype(dtype))]
-
-
-def aligned(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-    """Allocate an array that begins at a multiple of 64 bytes, so that no vector straddles two cache lines."""
-    room = np.empty(math.prod(shape) * np.dtype(dtype).itemsize + 64, np.uint8)
-    first = -room.ctypes.data % 64
-    array: NDArray[Any] = room[first : first + len(room) - 64].view(dtype).reshape(shape)
-    return array
 
 
 def scratch(program: Program, lanes: int, dtype: Any) -> Scratch:

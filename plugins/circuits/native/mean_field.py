@@ -29,26 +29,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.circuit.description import Angle, Circuit, Operation
-from qrlsuite.plugins.circuits.native.cache import inlined, kernel
+from qrlsuite.compiled.cache import inlined, kernel
+from qrlsuite.compiled.vectors import aligned, constant, load, splat, store, total
 from qrlsuite.plugins.circuits.native.kernels import (
     Scratch,
-    aligned,
     chain,
     fill_inputs,
-    lanes,
     prepare,
     split,
 )
 from qrlsuite.plugins.circuits.native.program import AXIS_X, AXIS_Z, HADAMARD, NONE, PHASE, ROTATE, Compiler
-from qrlsuite.plugins.circuits.native.vectors import constant, load, splat, store, total
 
 __all__ = [
     "MeanFieldProgram",
-    "aligned",
     "backward",
     "compile_circuit",
     "forward",
-    "lanes",
     "record_rows",
     "scratch",
     "tables",

@@ -160,7 +160,7 @@ class ShotSampler:
         simulator, kind = self.simulator, NUMPY[x.dtype]
         width, runs = simulator.lanes[x.dtype], x.shape[1]
         work = simulator.workspace(x.dtype)
-        records: NDArray[Any] = simulator.kernels.aligned((-(-runs // width), *work.record.shape[1:]), kind)
+        records: NDArray[Any] = simulator.vectors.aligned((-(-runs // width), *work.record.shape[1:]), kind)
         values = np.empty((1, runs, len(simulator.program.observables)), kind)
         given = np.ascontiguousarray(x.detach().numpy())
         flat = np.zeros((1, 0), kind)

@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from qrlsuite.plugins.circuits.native.cache import inlined
+from qrlsuite.compiled.cache import inlined
+from qrlsuite.compiled.vectors import load, splat, store
 from qrlsuite.plugins.circuits.native.program import ON_CONTROL, ON_TARGET
-from qrlsuite.plugins.circuits.native.vectors import load, splat, store
 
 HALF_ROOT = 0.7071067811865476
 

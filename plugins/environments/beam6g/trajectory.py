@@ -12,9 +12,8 @@ quartic interpolant (Boole's rule), and the same quartic is inverted by Newton's
 where a path has almost a cusp. Largest error of a position among 6000 paths of degree 3, 4, 5, 6, 8, against
 8000 panels: 1e-11, 6e-9, 6e-8, 2e-7, 7e-7.
 
-**A trajectory never depends on its batch**: there are elementwise operations, sums in a fixed order and
-cumulative sums, no BLAS product and no pairwise sum. So one trajectory has the same bits alone as among
-10,000.
+**A trajectory never depends on its batch**: its compiled loops (`compiled`) and numpy's elementwise operations sum in a
+fixed order, without BLAS products and pairwise sums. So one trajectory has the same bits alone as among 10,000.
 """
 
 from __future__ import annotations
@@ -43,8 +42,6 @@ SLOW = 0.05
 _STRIDE = 37
 """Every 37th of the checked points comes first: these 28 reject most candidates at little cost."""
 _NEWTON = 4
-_WORK = 1 << 16
-"""Array elements worked on at once, so that they stay in cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,39 +73,10 @@ class Spline:
             result += self.matrix[:, :, i, None] * columns[i]
         return result
 
-    def on_grid(self, coefficients: FloatArray, grid: FloatArray) -> FloatArray:
-        """Evaluate splines (P, j, B) at common ascending `grid` (T,): (B, T)."""
+    def starts(self, grid: FloatArray) -> NDArray[np.int64]:
+        """Return where in an ascending `grid` (T,) each piece begins, and T: (P + 1,)."""
         cuts = np.searchsorted(grid, self.borders[1:-1], side="left")
-        starts, ends = np.concatenate([[0], cuts]), np.concatenate([cuts, [grid.size]])
-        result = np.empty((coefficients.shape[2], grid.size))
-        for piece, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            out = result[:, start:end]
-            local = grid[start:end] - self.borders[piece]
-            columns = coefficients[piece][:, :, None]
-            out[:] = columns[-1]
-            for column in columns[-2::-1]:
-                out *= local
-                out += column
-        return result
-
-    def at(self, coefficients: FloatArray, t: FloatArray) -> FloatArray:
-        """Evaluate splines (P, j, B) at places of their own, t (B, T): (B, T)."""
-        if coefficients.shape[0] == 1:
-            columns = coefficients[0][:, :, None]
-            local = t
-        else:
-            piece = np.searchsorted(self.borders[1:-1], t, side="right")
-            local = t - self.borders.take(piece)
-            lanes = coefficients.shape[2]
-            piece *= lanes
-            piece += np.arange(lanes)[:, None]
-            columns = np.stack([coefficients[:, j].ravel().take(piece) for j in range(coefficients.shape[1])])
-        result: FloatArray = columns[-1] * local
-        for column in columns[-2:0:-1]:
-            result += column
-            result *= local
-        result += columns[0]
-        return result
+        return np.concatenate([[0], cuts, [grid.size]]).astype(np.int64)
 
 
 def derivative(coefficients: FloatArray) -> FloatArray:
@@ -146,17 +114,24 @@ def inside(support: FloatArray, rejection: Rejection = "tolerant") -> NDArray[np
         `scipy.interpolate.UnivariateSpline` for x is below 0 at its first point, where it should be 0; at
         degree 3 this rejects about a fifth of the valid paths, those that lean right.
     """
+    from qrlsuite.plugins.environments.beam6g import compiled
+
     curve = spline(support.shape[1])
     grid = np.linspace(0.0, 1.0, CHECKED)
-    valid = np.ones(len(support), dtype=np.bool_)
-    for points in (grid[::_STRIDE], grid):
-        size = _WORK // points.size
-        for axis in (0, 1):
-            left = np.flatnonzero(valid)
-            for start in range(0, left.size, size):
-                block = left[start : start + size]
-                path = curve.on_grid(curve.coefficients(support[block, :, axis]), points)
-                valid[block] = (path.min(axis=1) >= -TOLERANCE) & (path.max(axis=1) <= FIELD + TOLERANCE)
+    coarse = grid[::_STRIDE].copy()
+    valid = np.empty(len(support), dtype=np.bool_)
+    compiled.inside(
+        curve.coefficients(support[:, :, 0]),
+        curve.coefficients(support[:, :, 1]),
+        curve.borders,
+        coarse,
+        curve.starts(coarse),
+        grid,
+        curve.starts(grid),
+        -TOLERANCE,
+        FIELD + TOLERANCE,
+        valid,
+    )
     if rejection == "released":
         from scipy.interpolate import UnivariateSpline
 
@@ -209,64 +184,27 @@ def positions(support: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
 
 def _walk(support: FloatArray, steps: int, panels: int) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return x and y (B, steps + 1) by an arc length of that many panels, and which paths are slow, (B,)."""
+    from qrlsuite.plugins.environments.beam6g import compiled
+
     curve = spline(support.shape[1])
     x = np.empty((len(support), steps + 1))
     y = np.empty_like(x)
     slow = np.empty(len(support), dtype=np.bool_)
-    for start in range(0, len(support), block := _WORK // (4 * panels)):
-        lanes = slice(start, start + block)
-        along_x = curve.coefficients(support[lanes, :, 0])
-        along_y = curve.coefficients(support[lanes, :, 1])
-        t, slow[lanes] = _even_times(curve, along_x, along_y, steps, panels)
-        x[lanes] = curve.at(along_x, t)
-        y[lanes] = curve.at(along_y, t)
-    return x, y, slow
-
-
-def _even_times(
-    curve: Spline, along_x: FloatArray, along_y: FloatArray, steps: int, panels: int
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return t (B, steps + 1) of equal arc lengths between steps, and which paths are slow, (B,)."""
+    along_x, along_y = (curve.coefficients(support[:, :, axis]) for axis in (0, 1))
     grid = np.linspace(0.0, 1.0, 4 * panels + 1)
-    speed = curve.on_grid(derivative(along_x), grid)
-    other = curve.on_grid(derivative(along_y), grid)
-    speed *= speed
-    other *= other
-    speed += other
-    np.sqrt(speed, out=speed)
-
-    # Lengths in units of a panel's width: the length of panel i and the sum of those before it.
-    length = 7.0 * (speed[:, 0:-1:4] + speed[:, 4::4])
-    length += 32.0 * (speed[:, 1::4] + speed[:, 3::4])
-    length += 12.0 * speed[:, 2::4]
-    length /= 90.0
-    before = np.zeros((len(speed), panels + 1))
-    np.cumsum(length, axis=1, out=before[:, 1:])
-    total = before[:, -1:]
-
-    # Step k lies in the panel whose number is that of the interior borders at or before its arc length.
-    lanes = np.arange(len(speed))[:, None]
-    first_step = np.ceil(before[:, 1:-1] * (steps / total)).astype(np.int64)
-    first_step += lanes * (steps + 2)
-    counts = np.bincount(first_step.ravel(), minlength=len(speed) * (steps + 2))
-    panel = np.cumsum(counts.reshape(len(speed), steps + 2)[:, : steps + 1], axis=1)
-
-    target = total * (np.arange(steps + 1) / steps)
-    target -= before.ravel().take(panel + lanes * (panels + 1))
-    node = 4 * panel + lanes * grid.size
-    flat = speed.ravel()
-    v0, v1, v2, v3, v4 = (flat.take(node + i) for i in range(5))
-    # The quartic through the five speeds, as powers of z in [0, 1] across the panel.
-    c1 = (-25.0 * v0 + 48.0 * v1 - 36.0 * v2 + 16.0 * v3 - 3.0 * v4) / 3.0
-    c2 = (70.0 * v0 - 208.0 * v1 + 228.0 * v2 - 112.0 * v3 + 22.0 * v4) / 3.0
-    c3 = (-80.0 * v0 + 288.0 * v1 - 384.0 * v2 + 224.0 * v3 - 48.0 * v4) / 3.0
-    c4 = (32.0 * v0 - 128.0 * v1 + 192.0 * v2 - 128.0 * v3 + 32.0 * v4) / 3.0
-    z = target / length.ravel().take(panel + lanes * panels)
-    for _ in range(_NEWTON):
-        arc = ((((c4 * 0.2 * z + c3 * 0.25) * z + c2 / 3.0) * z + c1 * 0.5) * z + v0) * z
-        slope = (((c4 * z + c3) * z + c2) * z + c1) * z + v0
-        z -= (arc - target) / np.maximum(slope, 1e-12)
-        np.clip(z, 0.0, 1.0, out=z)
-    z += panel
-    z /= panels
-    return z, speed.min(axis=1) < SLOW / panels * total[:, 0]
+    compiled.walk(
+        along_x,
+        along_y,
+        derivative(along_x),
+        derivative(along_y),
+        curve.borders,
+        curve.starts(grid),
+        grid,
+        np.arange(steps + 1) / steps,
+        _NEWTON,
+        SLOW / panels,
+        x,
+        y,
+        slow,
+    )
+    return x, y, slow

@@ -11,16 +11,20 @@ prove that arrays do not overlap, and reloads coefficients in every pass.
 
 from __future__ import annotations
 
+import math
 import operator
 from typing import Any
 
 import llvmlite.binding
+import numpy as np
 from llvmlite import ir
 from numba import extending
 from numba.core import cgutils, types
 from numba.core.datamodel import models
 from numba.core.registry import cpu_target
 from numba.extending import lower_builtin, register_model, type_callable
+from numba.np.numpy_support import from_dtype
+from numpy.typing import NDArray
 
 intrinsic: Any = extending.intrinsic
 """Untyped on purpose: inside kernels its products are called without the typing context."""
@@ -48,6 +52,19 @@ def _target() -> tuple[int, bool]:
 _BYTES, FUSED = _target()
 LANES = {types.float32: _BYTES // 4, types.float64: _BYTES // 8}
 """Lanes of a vector by element type."""
+
+
+def lanes(dtype: Any) -> int:
+    """Return the number V of samples that are computed side by side."""
+    return LANES[from_dtype(np.dtype(dtype))]
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Allocate an array that begins at a multiple of 64 bytes, so that no vector straddles two cache lines."""
+    room = np.empty(math.prod(shape) * np.dtype(dtype).itemsize + 64, np.uint8)
+    first = -room.ctypes.data % 64
+    array: NDArray[Any] = room[first : first + len(room) - 64].view(dtype).reshape(shape)
+    return array
 
 
 class Vector(types.Type):

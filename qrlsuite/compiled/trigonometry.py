@@ -14,8 +14,8 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
-from qrlsuite.plugins.circuits.native.cache import inlined
-from qrlsuite.plugins.circuits.native.vectors import FUSED, Vector, constant, floor, fma, nearest
+from qrlsuite.compiled.cache import inlined
+from qrlsuite.compiled.vectors import FUSED, Vector, constant, floor, fma, nearest
 
 INVERSE_PI = 0.3183098861837907
 PI32 = (3.1415927410125732, -8.742277657347586e-08, 0.0)

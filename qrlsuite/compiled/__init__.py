@@ -1,0 +1,1 @@
+"""Loops that numba compiles: vectors of lanes, and the cache of compiled code."""
