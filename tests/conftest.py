@@ -126,6 +126,11 @@ horizons = [180]
 """
 
 
+def cases(table: str) -> list[list[str]]:
+    r"""Divide each line of a table at ` => `; `\n` stands for the end of a line."""
+    return [line.replace("\\n", "\n").split(" => ") for line in table.strip().splitlines()]
+
+
 POLE = """
 format_version = 1
 name = "pole"

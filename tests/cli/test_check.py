@@ -14,6 +14,7 @@ import pytest
 from qrlsuite import registry, testing
 from qrlsuite.cli import main
 from qrlsuite.experiment.task import load
+from tests.conftest import cases
 from tests.core.test_hooks import COMMANDS, install, suite
 
 ENGINES = """
@@ -186,7 +187,7 @@ silent => is every hook under @hookimpl
 """
 
 
-@pytest.mark.parametrize(("word", "message"), [line.split(" => ") for line in WRONG.strip().splitlines()])
+@pytest.mark.parametrize(("word", "message"), cases(WRONG))
 def test_wrong_names_are_one_clear_line(word: str, message: str, check: Command) -> None:
     code, out, err = check(word)
     assert (code, out) == (2, "")

@@ -21,8 +21,8 @@ from qrlsuite.cli import main
 from qrlsuite.cli.app import RENAMED, build
 from qrlsuite.results import checkpoint
 from qrlsuite.results.store import EntryStore
-from tests.commands import qrlsuite, start
-from tests.conftest import HANGS, TINY, Hold, install, installed, most_epochs, results
+from tests.commands import answer, qrlsuite, say, start
+from tests.conftest import HANGS, TINY, Hold, cases, install, installed, most_epochs, results
 
 
 @pytest.fixture
@@ -40,35 +40,31 @@ def test_run_then_leaderboard_compare_and_plot(task: str, tmp_path: Path) -> Non
         assert "4 seeds complete" in done.stderr
         assert f"results: {runs}/" in done.stderr
         assert (f"results go to the new folder {runs};" in done.stderr) == (width == "16")
-    again = qrlsuite("run", "ddqn", "mlp", "width=16", "--task", task, "--runs", runs, "--json")
-    assert json.loads(again.stdout)["seeds"] == 4
+    words = ("run", "ddqn", "mlp", "width=16", "--task", task, "--runs", runs)
+    assert json.loads(qrlsuite(*words, "--json").stdout)["seeds"] == 4
 
-    table = qrlsuite("leaderboard", "--runs", runs)
-    assert "undecided: fewer than 20 seeds" in table.stdout
-    board = json.loads(qrlsuite("leaderboard", "--runs", runs, "--format", "json").stdout)
-    (section,) = board["sections"]
+    assert "undecided: fewer than 20 seeds" in qrlsuite("leaderboard", "--runs", runs).stdout
+    (section,) = json.loads(say("leaderboard", "--runs", runs, "--format", "json").stdout)["sections"]
     assert {row["label"] for row in section["rows"]} == {"ddqn mlp width=16", "ddqn mlp width=8"}
     assert all(row["tier"] is None and row["seeds"] == 4 for row in section["rows"])
-    markdown = qrlsuite("leaderboard", "--runs", runs, "--format", "markdown").stdout
-    assert "| - | mlp width=8 |" in markdown
+    assert "| - | mlp width=8 |" in say("leaderboard", "--runs", runs, "--format", "markdown").stdout
 
     compared = qrlsuite("compare", "mlp width=16", "mlp width=8", "--runs", runs)
     assert "undecided: fewer than 20 seeds" in compared.stdout
-    drawn = qrlsuite("plot", "curves", "--runs", runs, "--out", str(tmp_path / "c.svg"))
-    assert drawn.returncode == 0, drawn.stderr
+    say("plot", "curves", "--runs", runs, "--out", str(tmp_path / "c.svg"))
     assert (tmp_path / "c.svg").read_text().startswith("<?xml")
 
-
-def test_more_seeds_widen_an_entry(task: str, tmp_path: Path) -> None:
-    words = ("run", "--task", task, "--model", "mlp", "--set", "width=16", "--runs", str(tmp_path / "runs"))
-    qrlsuite(*words, "--seeds", "0:2")
-    entry = next((tmp_path / "runs" / "tiny").iterdir())
+    (entry,) = (path for path in (tmp_path / "runs" / "tiny").iterdir() if "width=16" in label(path))
     before = results(entry, 0)
-    wider = qrlsuite(*words, "--seeds", "3")
-    assert "1 seed to epoch 3" in wider.stderr
-    assert "2 seeds already there" in wider.stderr
+    wider = qrlsuite(*words, "--seeds", "5").stderr
+    assert "1 seed to epoch 3" in wider
+    assert "4 seeds already there" in wider
     assert results(entry, 0) == before
-    assert EntryStore(entry).seeds() == [0, 1, 2]
+    assert EntryStore(entry).seeds() == [0, 1, 2, 3, 4]
+
+
+def label(entry: Path) -> str:
+    return str(EntryStore(entry).record()["label"])
 
 
 def test_ctrl_c_saves_and_the_same_command_resumes(task: str, tmp_path: Path, hold: Hold) -> None:
@@ -151,13 +147,6 @@ def test_what_comes_next_works_as_it_is_printed(task: str, tmp_path: Path) -> No
     assert list(folder.glob("*.png"))
 
 
-def test_two_of_help_and_one_of_many(task: str) -> None:
-    for words in (["-h"], ["run", "-h"], ["study", "run", "-h"]):
-        done = qrlsuite(*words)
-        assert (done.returncode, "Usage: qrlsuite" in done.stdout) == (0, True), done.stderr
-    assert "linear combination" in qrlsuite("show", "vqc-qiskit").stdout
-
-
 BROKEN = """
 from qrlsuite import hookimpl
 from qrlsuite.specs import ModelSpec
@@ -176,24 +165,14 @@ def test_what_cannot_be_built_is_one_message_and_leaves_no_folder(task: str, tmp
     site = tmp_path / "site"
     site.mkdir()
     install(site, "broken_model", BROKEN)
-    runs = ["--runs", str(tmp_path / "runs")]
-    for words, message in (
-        (
-            ["--model", "breaks"],
-            "model 'breaks' of broken_model cannot be built: ZeroDivisionError: no width (",
-        ),
-        (["--model", "mlp", "--device", "cuda:99"], "device = 'cuda:99'"),
-        (["--model", "vqc-pennylane", "--set", "device=default.qubitt"], "did you mean 'default.qubit'?"),
-    ):
-        done = qrlsuite("run", "--task", task, *words, *runs, "--seeds", "2", env=installed(site))
-        assert done.returncode == 2, done.stderr
-        lines = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
-        assert len(lines) == 1, done.stderr
-        (line,) = lines
-        assert message in line
-        assert "Traceback" not in done.stderr
-        assert "times" not in line
-        assert not (tmp_path / "runs").exists()
+    words = ["run", "breaks", "--task", task, "--seeds", "2", "--runs", str(tmp_path / "runs")]
+    done = qrlsuite(*words, env=installed(site))
+    assert done.returncode == 2, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("qrlsuite: ")]
+    assert "model 'breaks' of broken_model cannot be built: ZeroDivisionError: no width (" in line
+    assert "Traceback" not in done.stderr
+    assert "times" not in line
+    assert not (tmp_path / "runs").exists()
 
 
 STUDY = 'format_version = 1\nname = "x"\nsummary = "x"\n[[pictures]]\n'
@@ -234,6 +213,8 @@ run mlp --task beam6g --seeds 999999999999 => 100000 seeds are the most
 run mlp --task beam6g --sedes 3 => --seeds
 run mlp --task beam6g --epochs 0 => --epochs
 run mlp --task beam6g --device cudda => give cpu, cuda, or one GPU
+run mlp --task beam6g --device cuda:99 => device = 'cuda:99'
+run vqc-pennylane device=default.qubitt --task beam6g => did you mean 'default.qubit'?
 run mlp --task beam6g --set degree=1 => degree = 1
 run mlp --task beam6g --set environment.antennas=[[[1,1],[1,0]]] => antennas
 run mlp --task beam6g --set antennas=[[[1,1],[1,0]],[[9,1],[1,0]]] => antennas
@@ -246,6 +227,9 @@ run vqc-native ansatz=ipq --task beam6g => unknown ansatz 'ipq'; did you mean 'i
 run mlp --task beam6g --minutes 3 => --minutes is gone: --budget 30min
 run mlp --task beam6g --preset x => --preset is gone: write it into the entry
 list modles => did you mean 'models'
+list hooks => 'hooks' is now documentation: docs/api/hooks.md
+list significance-tests => 'significance-tests' is now `rules`
+show hook register_models => 'hook' is now documentation: docs/api/hooks.md
 show mpl => did you mean 'mlp'
 show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
 show picture barz => nothing called 'barz'; did you mean 'bars'
@@ -345,7 +329,7 @@ list ansatzes --plugin b => plugin b is no package: it has no __init__.py
 """What is typed, and what the one line of the answer has; answered with exit code 2."""
 
 
-@pytest.mark.parametrize(("typed", "message"), [line.split(" => ") for line in WRONG.strip().splitlines()])
+@pytest.mark.parametrize(("typed", "message"), cases(WRONG))
 def test_wrong_input_gives_one_clear_line_and_exit_code_2(
     typed: str,
     message: str,
@@ -381,7 +365,7 @@ def test_a_command_of_earlier_versions_names_the_new_one(old: str) -> None:
 
 
 def test_a_family_of_names_is_one_line_of_all_and_a_line_each_of_its_kind() -> None:
-    lines, tasks = (qrlsuite("list", *words).stdout.splitlines() for words in ([], ["tasks"]))
+    lines, tasks = (say("list", *words).stdout.splitlines() for words in ([], ["tasks"]))
     variants = [line for line in tasks if line.startswith("  beam6g-")]
     [folded] = [line for line in lines if line.startswith("  beam6g-")]
     assert folded.split(maxsplit=1) == [
@@ -393,39 +377,36 @@ def test_a_family_of_names_is_one_line_of_all_and_a_line_each_of_its_kind() -> N
 
 
 def test_list_and_show_answer_for_everything(tmp_path: Path) -> None:
-    rows = json.loads(qrlsuite("list", "--json").stdout)
+    rows = answer("list")
     assert {"environments", "models", "algorithms", "tasks"} <= {row["kind"] for row in rows}
     assert all(row["distribution"] for row in rows)
-    shown = qrlsuite("show", "mlp").stdout
+    shown = say("show", "mlp").stdout
     assert "width = 64" in shown
     assert "units of each hidden layer" in shown
-    protocol = json.loads(qrlsuite("show", "task", "beam6g", "--json").stdout)["protocol"]
-    assert protocol["interactions"] == 2000
+    assert "linear combination" in say("show", "vqc-qiskit").stdout
+    assert answer("show", "task", "beam6g")["protocol"]["interactions"] == 2000
     ansatz = ("show", "ansatz", "cx", "qubits=3", "gate=u3")
-    found = json.loads(qrlsuite(*ansatz, "--out", str(tmp_path / "cx.svg"), "--json").stdout)
+    found = answer(*ansatz, "--out", str(tmp_path / "cx.svg"))
     assert found["resources"]["gates"] == {"H": 3, "U3": 6, "CNOT": 3}
     assert "q_2: ┤ H ├┤ U3 ├" in found["drawing"]
-    assert "two_qubit_depth: 3" in qrlsuite(*ansatz).stdout
+    assert "two_qubit_depth: 3" in say(*ansatz).stdout
     assert (tmp_path / "cx.svg").read_text().startswith("<?xml")
-    for words in (("list", "hooks"), ("show", "hook", "register_models"), ("list", "significance-tests")):
-        refused = qrlsuite(*words)
-        assert refused.returncode == 2
-        answer = "`rules`" if words[1] == "significance-tests" else "documentation: docs/api/hooks.md"
-        assert refused.stderr == f"qrlsuite: '{words[1]}' is now {answer}\n"
 
 
 def test_show_says_how_a_published_entry_was_made() -> None:
     name = ("show", "cartpole/reinforce mlp", "--published")
-    shown = json.loads(qrlsuite(*name, "--json").stdout)
+    shown = answer(*name)
     assert (shown["seeds"], shown["parameters"]["classical"]) == (100, 114)
     assert shown["provenance"][0]["versions"]["qrlsuite"] == "0.1.0"
-    assert json.loads(qrlsuite(*name, "--identity", "--json").stdout)["seeds"] == {"0:100": ["not recorded"]}
+    assert answer(*name, "--identity")["seeds"] == {"0:100": ["not recorded"]}
 
 
 def test_version_and_help() -> None:
     assert qrlsuite("--version").stdout.startswith("qrlsuite ")
-    for command in ("run", "leaderboard", "compare", "plot", "list", "show"):
-        assert "Example" in qrlsuite(command, "--help").stdout
+    assert "Usage: qrlsuite" in qrlsuite("-h").stdout
+    for command in ("run", "study run", "leaderboard", "compare", "plot", "list", "show"):
+        said = say(*command.split(), "--help").stdout
+        assert ("Example" in said, said) == (True, say(*command.split(), "-h").stdout)
 
 
 def test_workers_do_not_import_from_the_folder_one_stands_in(task: str, tmp_path: Path) -> None:

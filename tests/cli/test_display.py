@@ -7,31 +7,37 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.engine.display import CostEstimate, RunDisplay
 from qrlsuite.engine.missing import summarize
 from qrlsuite.engine.terminal import as_command
 from qrlsuite.engine.work import Missing
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.options import parse_setting
 from qrlsuite.results.progress import Progress, ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
+from tests.commands import say
 
 PAIR = [SeedGroup((0, 1, 2), 0), SeedGroup((3, 4), 0)]
 
 
 @pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What the display takes for the time."""
+    now = [1000.0]
+    monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: now[0])
+    return now
+
+
+@pytest.fixture
 def entry(tiny_task: str) -> Entry:
-    return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+    return resolve(tiny_task, "mlp width=16")
 
 
 @pytest.mark.parametrize(("columns", "left_out"), [(80, 5), (100, 2), (165, 0)])
 def test_a_narrow_terminal_shows_fewer_columns_and_says_which(columns: int, left_out: int) -> None:
     words = ["leaderboard", "--task", "beam6g", "--published", "--explain"]
-    done = CliRunner().invoke(build(), words, env={"FORCE_COLOR": "1", "COLUMNS": str(columns)})
+    done = say(*words, FORCE_COLOR="1", COLUMNS=str(columns))
     lines = [re.sub("\x1b\\[[0-9;]*m", "", line).rstrip() for line in done.output.splitlines()]
     assert max(map(len, lines)) <= columns
     assert any("42.5k (40.6k to 44.5k)" in line for line in lines), "no number is broken over lines"
@@ -62,11 +68,7 @@ def test_the_last_median_shown_is_the_summary_s(train, entry, tmp_path, capsys, 
 
 @pytest.mark.parametrize(("again", "limit"), [("command", "--budget"), ("call", "`budget`")])
 def test_the_end_of_the_time_is_explained_in_the_words_of_the_caller(
-    again: str,
-    limit: str,
-    entry: Entry,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    again: str, limit: str, entry: Entry, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan = Missing(tmp_path, entry, EntryStore(tmp_path / "tiny" / entry.name), range(5), 3, groups=PAIR)
     with as_command() if again == "command" else contextlib.nullcontext():
@@ -119,10 +121,8 @@ def test_phases_before_the_first_measure_have_names(
     assert f"  {said}" in capsys.readouterr().err
 
 
-def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys, monkeypatch) -> None:
+def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys, clock) -> None:
     """PPO plays all rounds in a second and learns for the rest of the epoch, which tells nothing of a round."""
-    clock = [1000.0]
-    monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
     display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 500, groups=PAIR[:1]), 1)
     for _ in range(25):
         display.update({PAIR[0].id: {"phase": "training", "epoch": 0, "done": 200, "total": 200}})
@@ -140,10 +140,8 @@ def test_the_last_round_of_training_is_always_on_disk(tmp_path: Path) -> None:
         assert file.read()["done"] == (4 if done == 4 else 1)
 
 
-def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsys, monkeypatch) -> None:
+def test_a_model_that_finishes_no_round_is_no_silent_wait(entry, tmp_path, capsys, clock) -> None:
     """Its first update takes 100 seconds: after 20 what that means is said, with what is faster."""
-    clock = [1000.0]
-    monkeypatch.setattr("qrlsuite.engine.display.time.monotonic", lambda: clock[0])
     display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 10, groups=PAIR[:1]), 1)
     state = {"phase": "training", "epoch": 0, "done": 16, "total": 200}
     for _ in range(25):
@@ -180,7 +178,7 @@ def test_the_end_says_that_no_threshold_was_reached(
     task = Path(tiny_task)
     lowered = task.read_text().replace("epsilons = [0.6, 0.8]", f"epsilons = {epsilons}")
     task.write_text(lowered.replace("epsilon = 0.6", f"epsilon = {epsilons[1:].partition(',')[0]}"))
-    entry = resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+    entry = resolve(tiny_task, "mlp width=16")
     plan = Missing(path.parents[1], entry, EntryStore(path), range(3), 3, groups=PAIR[:1])
     summary = summarize(plan)
     assert summary["threshold_reached"] is not said

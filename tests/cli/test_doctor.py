@@ -18,19 +18,9 @@ def shadow(site: Path, *requires: str, python: str = ">=3.11") -> None:
     real = metadata.distribution("qrlsuite")
     info = site / f"qrlsuite-{real.version}.dist-info"
     info.mkdir()
-    lines = [f"Requires-Dist: {line}" for line in requires]
-    (info / "METADATA").write_text(
-        "\n".join(
-            [
-                "Metadata-Version: 2.1",
-                "Name: qrlsuite",
-                f"Version: {real.version}",
-                f"Requires-Python: {python}",
-                "Provides-Extra: slurm",
-                *lines,
-            ]
-        )
-    )
+    head = f"Metadata-Version: 2.1\nName: qrlsuite\nVersion: {real.version}\nRequires-Python: {python}\n"
+    lines = ["Provides-Extra: slurm", *(f"Requires-Dist: {line}" for line in requires)]
+    (info / "METADATA").write_text(head + "\n".join(lines))
     (info / "entry_points.txt").write_text(real.read_text("entry_points.txt") or "")
 
 

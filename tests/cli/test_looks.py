@@ -17,14 +17,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from qrlsuite import api, registry, specs
 from qrlsuite.cli import main
-from qrlsuite.cli.app import build
 from qrlsuite.engine.work import EngineOutcome, Show, Work
 from qrlsuite.engine.worker import train_group
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import PresetFile, TuningRecord, dumps
@@ -33,8 +31,8 @@ from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
 from qrlsuite.studies.outcome import needs_text
-from tests.commands import qrlsuite, start
-from tests.conftest import HANGS, TINY, Hold, results
+from tests.commands import answer, qrlsuite, say, start
+from tests.conftest import HANGS, TINY, Hold, cases, results
 
 ROOT = Path(__file__).parents[2]
 
@@ -115,18 +113,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     Path("tiny.toml").write_text(text)
 
 
-def say(*words: str) -> Result:
-    return CliRunner().invoke(build(), words, catch_exceptions=False)
-
-
-def answer(*words: str) -> dict[str, Any]:
-    result = say(*words, "--json")
-    assert result.exit_code == 0, result.output
-    content: dict[str, Any] = json.loads(result.stdout)
-    return content
-
-
-def run(study: str = "widths.toml", *words: str) -> dict[str, Any]:
+def run(study: str = "widths.toml", *words: str) -> Any:
     return answer("study", "run", study, "--engine", "scripted", *words)
 
 
@@ -428,8 +415,8 @@ def test_no_rule_for_a_fixed_number_of_seeds_judges_the_entries() -> None:
     ranked = say("leaderboard", *where, "--format", "json")
     assert json.loads(ranked.stdout)["sections"] == []
     assert ranked.output.count("trained by a study with looks") == 3
-    compared = CliRunner().invoke(build(), ["compare", "mlp width=16", "mlp width=4", *where])
-    assert "'ddqn mlp width=16' was trained by a study with looks" in str(compared.exception)
+    with pytest.raises(QrlSuiteError, match="'ddqn mlp width=16' was trained by a study with looks"):
+        say("compare", "mlp width=16", "mlp width=4", *where)
 
 
 def _entry(setting: str) -> Entry:
@@ -458,23 +445,23 @@ def ask() -> str:
     return study
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("alpha = 0.05", "alpha = 1.5", "widths.toml: alpha = 1.5 is outside (0, 1)"),
-        ("first_seed = 10000", "first_seed = 10000\nfrist_seed = 1", "unknown key 'frist_seed'"),
-        ("width = 8", "width = 5", "widths.toml: entries.1.hash is '"),
-        ("width = 8", 'width = "wide"', "widths.toml, entries.1: "),
-        ('rule = "times"', 'rule = "intervals"', "rule"),
-        ("    20,\n    40,", "    40,\n    20,", "looks = [40, 20, 60, 80, 100]: each must be at more runs"),
-        ('"wide", "narrow"', '"wide", "narow"', "pairs: 'narow' is not one of the entries"),
-        ('"mlp width=8", "wide"', '"narrow", "wide"', "a pair is repeated"),
-        ('"mlp width=8", "wide"', '"wide"', "looks.questions.1.pairs.0"),
-        ('[["wide", "narrow"]]', "[]", "looks.questions.0.pairs"),
-        ('name = "narrow"', 'name = "wide"', "two groups are named 'wide'"),
-        ('name = "narrow"', 'name = "\\u001b[31m"', "entries.2.name"),
-    ],
-)
+WRONG = r"""
+alpha = 0.05 => alpha = 1.5 => widths.toml: alpha = 1.5 is outside (0, 1)
+first_seed = 10000 => first_seed = 10000\nfrist_seed = 1 => unknown key 'frist_seed'
+width = 8 => width = 5 => widths.toml: entries.1.hash is '
+width = 8 => width = "wide" => widths.toml, entries.1:
+rule = "times" => rule = "intervals" => rule
+    20,\n    40, =>     40,\n    20, => looks = [40, 20, 60, 80, 100]: each must be at more runs
+"wide", "narrow" => "wide", "narow" => pairs: 'narow' is not one of the entries
+"mlp width=8", "wide" => "narrow", "wide" => a pair is repeated
+"mlp width=8", "wide" => "wide" => looks.questions.1.pairs.0
+[["wide", "narrow"]] => [] => looks.questions.0.pairs
+name = "narrow" => name = "wide" => two groups are named 'wide'
+name = "narrow" => name = "\u001b[31m" => entries.2.name
+"""
+
+
+@pytest.mark.parametrize(("old", "new", "message"), cases(WRONG))
 def test_a_wrong_study_file_is_refused_in_one_line(
     old: str, new: str, message: str, refused: Refused
 ) -> None:
@@ -484,13 +471,7 @@ def test_a_wrong_study_file_is_refused_in_one_line(
 
 def test_what_would_change_a_study_with_looks_is_refused(refused: Refused) -> None:
     write()
-    for option in (
-        ("--seeds", "20"),
-        ("width=3",),
-        ("mlp",),
-        ("--epochs", "2"),
-        ("--dry-run",),
-    ):
+    for option in (("--seeds", "20"), ("width=3",), ("mlp",), ("--epochs", "2"), ("--dry-run",)):
         message = refused("study", "run", "widths.toml", *option)
         assert f"has looks, which fix what is trained: leave {option[0]} out" in message
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,15 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from PIL import Image
-from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.api import episode as episodes
-from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
 from qrlsuite.plugins.environments.beam6g.env import BeamManagement6G
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import evaluation
-from tests.conftest import trainer
+from tests.commands import say
+from tests.conftest import Train, trainer
 
 COUNTER = """
 format_version = 1
@@ -72,13 +70,8 @@ class Counter(gymnasium.Env[Any, Any]):
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.count, self.last = self.count + 1, int(action)
-        return (
-            np.array([self.drawn / 200], np.float32),
-            float(action) + self.drawn,
-            self.count == 7,
-            False,
-            {},
-        )
+        seen = np.array([self.drawn / 200], np.float32)
+        return seen, float(action) + self.drawn, self.count == 7, False, {}
 
     def render(self) -> Any:
         image = np.zeros((8, 9, 3), np.uint8)
@@ -96,7 +89,7 @@ def counting(tmp_path: Path, kind: str = "image") -> Path:
     return trainer(str(tmp_path / "counter.toml"), tmp_path)("runs", [0, 1], 1, "mlp", ("width=4",))
 
 
-def test_the_episode_is_the_one_that_evaluate_plays(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_the_episode_is_the_one_that_evaluate_plays(train: Train, tmp_path: Path) -> None:
     store = EntryStore(train("runs", [0, 1, 2], 2))
     shown = api.play(str(store.path), episode=3, runs=tmp_path / "runs")
     played = evaluation.trained(store, 1, 5)
@@ -118,12 +111,9 @@ def test_the_episode_is_the_one_that_evaluate_plays(train: Callable[..., Path], 
 
 def test_any_environment_that_draws_frames(tmp_path: Path) -> None:
     folder = counting(tmp_path)
-    result = CliRunner().invoke(
-        build(), ["play", str(folder), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "c.gif")]
-    )
-    assert result.exit_code == 0, result.output
-    assert "7 steps" in result.stdout
-    assert "(8 frames, 0.0 MB)" in result.stdout
+    said = say("play", str(folder), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "c.gif")).stdout
+    assert "7 steps" in said
+    assert "(8 frames, 0.0 MB)" in said
     shown = api.play(str(folder), runs=tmp_path / "runs")
     assert [frame[0, 0, 0] // 30 for frame in shown.frames] == list(range(8))
     assert [frame[0, 0, 1] // 20 for frame in shown.frames[1:]] == (5 + shown.actions).tolist()
@@ -163,7 +153,7 @@ def test_environments_that_draw_nothing_say_so(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_single_form_that_plays_something_else_is_not_shown(
-    train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = BeamManagement6G.step
 
@@ -176,18 +166,17 @@ def test_a_single_form_that_plays_something_else_is_not_shown(
         api.play(str(train("runs", [0], 1)), runs=tmp_path / "runs")
 
 
-def test_wrong_input(train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_input(train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = train("runs", [0], 1)
     monkeypatch.setenv("PATH", str(tmp_path))
     for words, message in (
-        (["mlp", "--out", "x.txt"], "the file's ending must be .gif or .mp4"),
-        (["mlp", "--out", "x.mp4"], "ffmpeg, which is not installed: write a .gif"),
+        (["mlp", "--out", "x.txt"], r"the file's ending must be \.gif or \.mp4"),
+        (["mlp", "--out", "x.mp4"], r"ffmpeg, which is not installed: write a \.gif"),
         (["mpl"], "no entry 'mpl'"),
         (["tiny/mlp", "--task", "cartpole"], "agents play where both are equal"),
     ):
-        result = CliRunner().invoke(build(), ["play", *words, "--runs", str(tmp_path / "runs")])
-        assert isinstance(result.exception, QrlSuiteError), result.output
-        assert message in str(result.exception)
+        with pytest.raises(QrlSuiteError, match=message):
+            say("play", *words, "--runs", str(tmp_path / "runs"))
     with pytest.raises(OptionError, match="episode = -1"):
         api.play(str(folder), episode=-1, runs=tmp_path / "runs")
 

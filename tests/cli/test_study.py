@@ -9,14 +9,11 @@ import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tomli_w
-from typer.testing import CliRunner, Result
 
 from qrlsuite import registry, specs
-from qrlsuite.cli.app import build
 from qrlsuite.engine.api import EngineOutcome, Show, Work
 from qrlsuite.engine.where import Where
 from qrlsuite.engine.worker import train_group
@@ -31,7 +28,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import EngineSpec, StudySpec
 from qrlsuite.studies.runner import PendingEntry, Session, cheapest_first, check_budget, find_pending, fitting
 from qrlsuite.studies.study import parse
-from tests.commands import qrlsuite, start
+from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, results
 from tests.core.test_study import EXPECTED
 from tests.leaderboard import boards
@@ -120,18 +117,6 @@ def widths(tmp_path: Path) -> str:
     return str(path)
 
 
-def say(*words: str) -> Result:
-    group = [] if words[0] in ("show", "list") else ["study"]
-    return CliRunner().invoke(build(), [*group, *words], catch_exceptions=False)
-
-
-def answer(*words: str) -> dict[str, Any]:
-    result = say(*words, "--json")
-    assert result.exit_code == 0, result.output
-    content: dict[str, Any] = json.loads(result.stdout)
-    return content
-
-
 ALIKE = ("fig6", "fig7", "cartpole", "ppo", "ablation", "degree", "ansatz", "stacking", "fidelity", "buffer")
 """Studies whose pictures are of kinds that others have, too."""
 SIZES = {"qubits": "[2, 3]", "layers": "[1, 2]", "width": "[4, 8]", "depth": "[1, 2]", "shots": "[2, 4]"}
@@ -173,7 +158,7 @@ def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
     seeds = 6 if name == "few-runs" else 2  # its picture compares 5 with more
     words = [reduced(name, tmp_path), "--seeds", str(seeds), "--epochs", "2"]
     words += ["--engine", "here", "--runs", str(tmp_path / "runs")]
-    content = answer("run", *words)
+    content = answer("study", "run", *words)
     assert content["core_hours_left"] == 0
     assert all(entry["finished"] == seeds and entry["basis"] == "measured" for entry in content["entries"])
     assert (
@@ -184,7 +169,7 @@ def test_a_study_runs_and_gives_its_pictures(name: str, tmp_path: Path) -> None:
         assert picture["problem"] is None, picture
         assert Path(picture["file"]).read_bytes().startswith(b"\x89PNG")
         assert all(point["seeds"] == seeds for point in picture["seeds"])
-    assert answer("run", *words, "--dry-run")["steps"] == [], "nothing is trained twice"
+    assert answer("study", "run", *words, "--dry-run")["steps"] == [], "nothing is trained twice"
 
 
 DEPLOYED = """
@@ -212,13 +197,13 @@ def test_agents_of_a_study_act_on_a_backend_once(tmp_path: Path) -> None:
     path, runs = tmp_path / "there.toml", tmp_path / "runs"
     path.write_text(DEPLOYED.replace("TASK", str(tmp_path / "tiny.toml")))
     words = [str(path), "--seeds", "2", "--epochs", "1", "--engine", "here", "--runs", str(runs)]
-    (drawn,) = answer("run", *words, "qubits=2", "layers=1")["pictures"]
+    (drawn,) = answer("study", "run", *words, "qubits=2", "layers=1")["pictures"]
     assert drawn["problem"] is None, drawn
     kept = sorted(runs.rglob("evaluations/*.jsonl"))
     assert len(kept) == 2, "one for each value; the network has no circuit"
     before, figure = [path.read_bytes() for path in kept], Path(drawn["file"]).read_bytes()
     settings = ["qubits=2", "layers=1"]
-    (again,) = answer("draw", str(path), "--runs", str(runs), *settings)["pictures"]
+    (again,) = answer("study", "draw", str(path), "--runs", str(runs), *settings)["pictures"]
     assert [path.read_bytes() for path in kept] == before
     assert Path(again["file"]).read_bytes() == figure
 
@@ -226,7 +211,7 @@ def test_agents_of_a_study_act_on_a_backend_once(tmp_path: Path) -> None:
 def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
     plain = ["run", "mlp width=16", "--task", str(tmp_path / "tiny.toml"), "--runs", runs, "--engine", "here"]
-    done = CliRunner().invoke(build(), plain, catch_exceptions=False)
+    done = say(*plain)
     assert done.exit_code == 0
     assert "it should take" not in done.stderr
     (folder,) = (tmp_path / "runs" / "tiny").iterdir()
@@ -244,34 +229,33 @@ def test_entries_are_shared_with_plain_runs_and_between_studies(widths: str, tmp
     assert re.search(r"left: .* to .* with \d+ workers? \(.* to .* core-hours\)", shown)
     assert re.search(
         r"would train 4 of 4 missing \(.* to .* of core time",
-        say("run", widths, "--dry-run", "--runs", runs).stdout,
+        say("study", "run", widths, "--dry-run", "--runs", runs).stdout,
     )
     Here.trained.clear()
-    say("run", widths, "--engine", "here", "--runs", runs)
+    say("study", "run", widths, "--engine", "here", "--runs", runs)
     assert sorted(label for label, _ in Here.trained) == [
         "ddqn mlp width=4",
         "ddqn vqc-native qubits=2 layers=1",
     ]
     assert results(folder, 3) == before
     words = ["export", widths, "--runs", runs, "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(build(), words, catch_exceptions=False)
-    assert done.stdout.count("wrote ") == 3
+    assert say(*words).stdout.count("wrote ") == 3
 
 
 def test_show_and_dry_run_write_nothing(widths: str, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     for words in (
         ("show", widths),
-        ("run", widths, "--dry-run"),
-        ("run", widths, "--dry-run", "--budget", "1h"),
+        ("study", "run", widths, "--dry-run"),
+        ("study", "run", widths, "--dry-run", "--budget", "1h"),
     ):
         result = say(*words, "--runs", str(runs))
         assert result.exit_code == 0
         assert "vqc-native" in result.stdout
     assert not runs.exists()
-    said = say("run", widths, "--dry-run", "--engine", "here", "--runs", str(runs)).stdout
+    said = say("study", "run", widths, "--dry-run", "--engine", "here", "--runs", str(runs)).stdout
     assert "ddqn mlp width=4: 0 of 4 seeds there, would train 4 of 4 missing (" in said
-    steps = answer("run", widths, "--dry-run", "--engine", "here", "--runs", str(runs))["steps"]
+    steps = answer("study", "run", widths, "--dry-run", "--engine", "here", "--runs", str(runs))["steps"]
     assert [step["would_train"] for step in steps] == [4, 4, 4]
     assert not runs.exists()
 
@@ -280,9 +264,9 @@ def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: 
     runs = str(tmp_path / "runs")
     words = ("--engine", "here", "--runs", runs)
     for seeds, width in ((3, 16), (2, 4)):
-        said = say("run", widths, "--seeds", str(seeds), f"mlp width={width}", *words)
+        said = say("study", "run", widths, "--seeds", str(seeds), f"mlp width={width}", *words)
         assert f"{seeds} seeds: ddqn mlp width={width}" in said.stdout
-    drawn = say("draw", widths, "--runs", runs, "--format", "svg")
+    drawn = say("study", "draw", widths, "--runs", runs, "--format", "svg")
     assert "3 seeds: ddqn mlp width=16" in drawn.stdout
     assert "2 seeds: ddqn mlp width=4" in drawn.stdout
     assert "nothing yet: ddqn vqc-native qubits=2 layers=1" in drawn.stdout
@@ -290,34 +274,34 @@ def test_drawing_says_how_many_seeds_each_point_rests_on(widths: str, tmp_path: 
 
 
 def test_only_keeps_words_of_labels_but_no_part_of_a_hash(widths: str) -> None:
-    steps = answer("run", widths, "--dry-run")["steps"]
+    steps = answer("study", "run", widths, "--dry-run")["steps"]
     first = steps[0]["entry"]
     part = next(
         first[-8:][i : i + 3] for i in range(6) if first[-8:][i : i + 3] not in str(steps[0]["label"])
     )
-    assert [step["entry"] for step in answer("run", widths, "--dry-run", first)["steps"]] == [first]
-    assert len(answer("run", widths, "--dry-run", "mlp")["steps"]) == 2
+    assert [step["entry"] for step in answer("study", "run", widths, "--dry-run", first)["steps"]] == [first]
+    assert len(answer("study", "run", widths, "--dry-run", "mlp")["steps"]) == 2
     with pytest.raises(OptionError, match="has no such entry"):
-        say("run", widths, "--dry-run", part)
+        say("study", "run", widths, "--dry-run", part)
 
 
 def test_a_picture_that_cannot_be_drawn_yet_says_why(widths: str, tmp_path: Path) -> None:
     text = Path(widths).read_text().replace('kind = "scaling"', 'kind = "few-runs"')
     Path(widths).write_text(text.replace('settings = { by = "width" }', ""))
     words = (widths, "--seeds", "2", "mlp", "--epochs", "1")
-    said = say("run", *words, "--engine", "here", "--runs", str(tmp_path / "runs"))
+    said = say("study", "run", *words, "--engine", "here", "--runs", str(tmp_path / "runs"))
     assert said.exit_code == 0
     assert "no picture 'scaling': 'ddqn mlp width=16' has 2 seeds; this picture needs 6" in said.stdout
 
 
 def test_an_entry_that_ends_early_does_not_cut_the_others_short(widths: str, tmp_path: Path) -> None:
     words = ("--seeds", "2", "--engine", "here", "--runs", str(tmp_path / "runs"))
-    say("run", widths, "mlp width=16", "--epochs", "2", *words)
-    said = say("run", widths, "mlp", "vqc", "--epochs", "1", "--dry-run", *words)
+    say("study", "run", widths, "mlp width=16", "--epochs", "2", *words)
+    said = say("study", "run", widths, "mlp", "vqc", "--epochs", "1", "--dry-run", *words)
     assert "width=4" in said.stdout
-    said = say("run", widths, "mlp width=4", "--epochs", "1", *words)
+    said = say("study", "run", widths, "mlp width=4", "--epochs", "1", *words)
     assert "2 seeds: ddqn mlp width=4" in said.stdout
-    drawn = say("draw", widths, "--runs", str(tmp_path / "runs"))
+    drawn = say("study", "draw", widths, "--runs", str(tmp_path / "runs"))
     assert "2 seeds: ddqn mlp width=16" in drawn.stdout
     assert "left out, at epoch 1: ddqn mlp width=4" in drawn.stdout
 
@@ -370,10 +354,10 @@ def test_a_budget_that_cannot_hold_one_group(widths: str, tmp_path: Path) -> Non
 
 def test_a_budget_is_kept_and_the_same_command_continues(widths: str, tmp_path: Path) -> None:
     words = (widths, "--engine", "here", "--runs", str(tmp_path / "runs"))
-    refused = CliRunner().invoke(build(), ["study", "run", *words, "--budget", "0.001s"])
-    assert isinstance(refused.exception, OptionError)
+    with pytest.raises(OptionError):
+        say("study", "run", *words, "--budget", "0.001s")
     assert not (tmp_path / "runs").exists()
-    assert answer("run", *words, "--budget", "1h")["core_hours_left"] == 0
+    assert answer("study", "run", *words, "--budget", "1h")["core_hours_left"] == 0
     assert len(Here.trained) >= 3
 
 
@@ -381,12 +365,7 @@ def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -
     ticks = iter(range(0, 10_000, 60))
     known = speeds(0.1, 0.2)
     session = Session(
-        tmp_path / "runs",
-        Where(Here(), 1),
-        known,
-        budget=100,
-        quiet=True,
-        clock=lambda: float(next(ticks)),
+        tmp_path / "runs", Where(Here(), 1), known, budget=100, quiet=True, clock=lambda: float(next(ticks))
     )
     left = session.run(items(widths, tmp_path, known))
     assert Here.trained == [("ddqn mlp width=16", (0, 1, 2, 3))], (
@@ -400,9 +379,9 @@ def test_a_session_stops_when_the_time_is_used_up(widths: str, tmp_path: Path) -
 
 def test_an_engine_that_hands_over_is_given_everything_once(widths: str, tmp_path: Path) -> None:
     words = (widths, "--engine", "queue", "--runs", str(tmp_path / "runs"))
-    said = say("run", *words)
+    said = say("study", "run", *words)
     assert said.stdout.count("4 seeds submitted") == 3
-    again = answer("run", *words)
+    again = answer("study", "run", *words)
     assert again["submitted"] == []
     assert [entry["busy"] for entry in again["entries"]] == [4, 4, 4]
 
@@ -442,7 +421,7 @@ def two_studies(widths: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.usefixtures("two_studies")
 def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> None:
     words = ("--engine", "here", "--seeds", "2", "--epochs", "1", "--runs", str(tmp_path / "runs"))
-    said = say("run", "all", *words)
+    said = say("study", "run", "all", *words)
     assert said.stderr.index("study without-circuit:") < said.stderr.index("study widths:")
     assert said.stdout.index("study-without-circuit-curves.png") < said.stdout.index(
         "study-widths-curves.png"
@@ -450,25 +429,25 @@ def test_all_studies_at_once_the_one_that_lacks_least_first(tmp_path: Path) -> N
     assert [label for label, _ in Here.trained].count("ddqn mlp width=16") == 1, (
         "an entry of both is trained once"
     )
-    assert answer("run", "all", "--dry-run", *words)["steps"] == []
-    found = json.loads(say("run", "all", "--json", *words[:-1], str(tmp_path / "more")).stdout)
+    assert answer("study", "run", "all", "--dry-run", *words)["steps"] == []
+    found = json.loads(say("study", "run", "all", "--json", *words[:-1], str(tmp_path / "more")).stdout)
     assert [(each["name"], each["trained"]) for each in found] == [("without-circuit", 2), ("widths", 4)]
 
 
 @pytest.mark.usefixtures("two_studies")
 def test_all_skips_studies_without_the_wanted_entries(tmp_path: Path) -> None:
     words = ("vqc", "--runs", str(tmp_path / "runs"))
-    assert {step["label"] for step in answer("run", "all", "--dry-run", *words)["steps"]} == {
+    assert {step["label"] for step in answer("study", "run", "all", "--dry-run", *words)["steps"]} == {
         "ddqn vqc-native qubits=2 layers=1"
     }
-    said = say("run", "all", "--dry-run", *words).stderr
+    said = say("study", "run", "all", "--dry-run", *words).stderr
     assert said == "left out: vqc: study 'without-circuit' has no such entry\n"
     with pytest.raises(OptionError, match="has no such entry"):
-        say("run", "all", "--dry-run", "nothing")
+        say("study", "run", "all", "--dry-run", "nothing")
     broken = tmp_path / "widths.toml"
     broken.write_text(broken.read_text().replace('kind = "scaling"', 'kind = "scalin"'))
     with pytest.raises(QrlSuiteError, match="scalin"):  # it is no study without such an entry
-        say("run", "all", "--dry-run", *words)
+        say("study", "run", "all", "--dry-run", *words)
 
 
 @pytest.mark.usefixtures("two_studies")
@@ -490,7 +469,7 @@ def test_the_budget_of_all_studies_is_one(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("two_studies")
 def test_show_counts_seeds_and_decided_pairs(tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
-    say("run", "widths", "mlp", "--seeds", "20", "--epochs", "3", "--engine", "here", "--runs", runs)
+    say("study", "run", "widths", "mlp", "--seeds", "20", "--epochs", "3", "--engine", "here", "--runs", runs)
     widths = answer("show", "widths", "--runs", runs)
     assert [entry["finished"] for entry in widths["entries"]] == [4, 4, 0], (
         "of the four seeds of the protocol"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -10,17 +9,16 @@ from typing import Literal
 import pytest
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
-from typer.testing import CliRunner
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.specs import AnsatzSpec
 from qrlsuite.studies import study
 from qrlsuite.tuning import search, space
+from tests.commands import answer, say
 from tests.core.test_study import SMALL
 
 
@@ -70,10 +68,7 @@ def test_an_option_that_the_model_hands_on_stays_the_models() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ("ansatz=ising", "lr=2"),
-            r"--set algorithm\.lr=\.\.\. or --set ansatz\.lr=",
-        ),
+        (("ansatz=ising", "lr=2"), r"--set algorithm\.lr=\.\.\. or --set ansatz\.lr="),
         (("ansatz=ising", "couplng=zz"), "--set couplng: no option of that name; did you mean 'coupling'"),
         (
             ("ansatz=ising", "ansatz.couplng=zz"),
@@ -122,15 +117,13 @@ def test_studies_and_searches_take_them_too() -> None:
 
 
 def test_show_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
-    output = CliRunner().invoke(build(), ["show", "ansatz", "ising"]).output
+    output = say("show", "ansatz", "ising").output
     (line,) = [line for line in output.splitlines() if line.startswith("options (change with ")]
     command = line.removeprefix("options (change with ").removesuffix(")")
     words = command.replace("NAME=VALUE", "coupling=zz").split()
-    model, settings = (
-        words[words.index("--model") + 1],
-        [words[i + 1] for i, w in enumerate(words) if w == "--set"],
-    )
-    assert entry(*settings, model=model).model_options.ansatz_options == {"coupling": "zz"}
-    shown = CliRunner().invoke(build(), ["show", "ansatz", "ising", "--json"]).output
-    assert json.loads(shown)["set_with"] == command
-    assert "options (change with --set NAME=VALUE)" in CliRunner().invoke(build(), ["show", "mlp"]).output
+    settings = [words[i + 1] for i, w in enumerate(words) if w == "--set"]
+    assert entry(*settings, model=words[words.index("--model") + 1]).model_options.ansatz_options == {
+        "coupling": "zz"
+    }
+    assert answer("show", "ansatz", "ising")["set_with"] == command
+    assert "options (change with --set NAME=VALUE)" in say("show", "mlp").output

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +15,7 @@ from qrlsuite.engine.display import Bar
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError
 from qrlsuite.results.seeds import read_seeds
+from tests.commands import answer
 from tests.commands import qrlsuite as command
 from tests.conftest import results
 
@@ -99,21 +99,13 @@ def test_evaluating(tiny_task: str, tmp_path: Path) -> None:
         shown.print(found)
     assert "3 fresh episodes of each policy" in captured.get()
     assert f"<td style='text-align:left'>{entry.label}</td>" in found._repr_html_()
-    words = ["evaluate", entry.name, "--best", "2", "--episodes", "3", "--runs", str(tmp_path), "--json"]
-    assert {**found.as_dict(), "picture": None} == json.loads(command(*words).stdout)
+    words = ["evaluate", entry.name, "--best", "2", "--episodes", "3", "--runs", str(tmp_path)]
+    assert {**found.as_dict(), "picture": None} == answer(*words)
 
 
 def test_tuning(tiny_task: str, tmp_path: Path) -> None:
-    (found,) = api.tune(
-        tiny_task,
-        " ".join(["mlp", *(f"{name}={value}" for name, value in OPTIONS.items())]),
-        vary={"lr": (1e-2, 1e-3)},
-        seeds=1,
-        epochs=1,
-        workers=1,
-        runs=tmp_path,
-        progress=False,
-    )
+    given: dict[str, Any] = {"seeds": 1, "epochs": 1, "workers": 1, "runs": tmp_path, "progress": False}
+    (found,) = api.tune(tiny_task, "mlp width=4 model.depth=1", vary={"lr": (1e-2, 1e-3)}, **given)
     assert len(found.trials) == 2
     assert found.request.seeds == (1_000_000,)
     assert found.written is not None
@@ -125,7 +117,14 @@ def test_tuning(tiny_task: str, tmp_path: Path) -> None:
 def test_running_a_study(tiny_task: str, tmp_path: Path) -> None:
     path = tmp_path / "two.toml"
     path.write_text(STUDY.format(task=tiny_task))
-    done = api.run_study(str(path), seeds=2, epochs=1, workers=1, runs=tmp_path / "runs", progress=False)
+    given: dict[str, Any] = {
+        "seeds": 2,
+        "epochs": 1,
+        "workers": 1,
+        "runs": tmp_path / "runs",
+        "progress": False,
+    }
+    done = api.run_study(str(path), **given)
     assert done.trained == 4
     (picture,) = done.pictures
     assert picture.figure is not None
@@ -133,9 +132,7 @@ def test_running_a_study(tiny_task: str, tmp_path: Path) -> None:
     assert picture.path.stat().st_size > 1000
     assert done.as_dict()["core_hours_left"] == 0
     assert "everything is there" in done._repr_html_()
-    only = api.run_study(
-        str(path), only="width=8", seeds=2, epochs=1, workers=1, runs=tmp_path / "runs", progress=False
-    )
+    only = api.run_study(str(path), only="width=8", **given)
     assert only.trained == 0
     assert [item.missing.entry.label for item in only.overview.items] == ["ddqn mlp width=8 depth=1"]
 

@@ -20,6 +20,7 @@ from qrlsuite import api
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from tests.conftest import Train
 
 WHERE: dict[str, Any] = {"runs": "no-results-yet", "published": True}
 
@@ -52,7 +53,7 @@ def test_an_entry_is_read_with_its_curves_and_records(small: EntryResults) -> No
 
 
 def test_runs_have_the_records_that_published_entries_have(
-    train: Callable[..., Path], tmp_path: Path, small: EntryResults
+    train: Train, tmp_path: Path, small: EntryResults
 ) -> None:
     folder = train(tmp_path / "runs", [0, 1])
     found = api.load(str(folder), runs=tmp_path / "runs")

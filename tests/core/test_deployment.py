@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pennylane as qml
 import pytest
-from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.api.evaluation import evaluate
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.leaderboard import studies
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.training import deployment, evaluation
 from qrlsuite.training.deployment import Deployment, on_backend
+from tests.commands import answer, say
+from tests.conftest import Train
 
 CIRCUIT = ("qubits=2", "layers=1")
 
@@ -48,7 +46,7 @@ def unreliable(monkeypatch: pytest.MonkeyPatch) -> type[Unreliable]:
 
 
 @pytest.fixture
-def trained(train: Callable[..., Path]) -> EntryStore:
+def trained(train: Train) -> EntryStore:
     return EntryStore(train("runs", [0, 1], 1, "vqc-native", CIRCUIT))
 
 
@@ -69,7 +67,7 @@ def test_shots_and_noise_change_what_they_earn(trained: EntryStore) -> None:
     assert "shots=1" in played.name
 
 
-def test_training_options_of_the_backend_stay_behind(train: Callable[..., Path]) -> None:
+def test_training_options_of_the_backend_stay_behind(train: Train) -> None:
     entry = EntryStore(
         train("runs", [0], 1, "vqc-native", (*CIRCUIT, "shots=5", "activation_in=tanh"))
     ).entry()
@@ -200,9 +198,7 @@ def test_what_cannot_be_done_is_refused_before_it_begins(
         Deployment(trained, backend, values, best=1)
 
 
-def test_entries_without_circuits_or_agents_are_refused(
-    train: Callable[..., Path], trained: EntryStore
-) -> None:
+def test_entries_without_circuits_or_agents_are_refused(train: Train, trained: EntryStore) -> None:
     network = EntryStore(train("runs", [0], 1))
     with pytest.raises(OptionError, match="--backend qiskit: model 'mlp' has no circuit"):
         Deployment(network, "qiskit", {}, best=1)
@@ -214,11 +210,9 @@ def test_entries_without_circuits_or_agents_are_refused(
 
 def test_the_command(trained: EntryStore) -> None:
     runs = str(trained.path.parent.parent)
-    words = ["evaluate", str(trained.path), "--runs", runs, "--best", "1", "--episodes", "5", "--json"]
+    words = ["evaluate", str(trained.path), "--runs", runs, "--best", "1", "--episodes", "5"]
     there = ["--backend", "qiskit shots=10 estimator=aer"]
-    result = CliRunner().invoke(build(), [*words, *there])
-    policies = [each["policy"] for each in json.loads(result.stdout)["policies"]]
+    policies = [each["policy"] for each in answer(*words, *there)["policies"]]
     assert policies[1] == f"{policies[0]} on qiskit shots=10 estimator=aer"
-    result = CliRunner().invoke(build(), [*words, "--backend", "native shots"])
-    assert isinstance(result.exception, OptionError)
-    assert "--backend 'native shots': write a name and its options" in str(result.exception)
+    with pytest.raises(OptionError, match="--backend 'native shots': write a name and its options"):
+        say(*words, "--backend", "native shots")

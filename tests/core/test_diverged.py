@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,13 +13,13 @@ from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from tests.commands import qrlsuite
-from tests.conftest import results
+from tests.conftest import Train, results
 
 TOO_FAST = ("width=16", "algorithm.lr=1e30")
 
 
 def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    train: Train, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     entry = train("straight", [0, 1], 3, settings=TOO_FAST)
     sound = train("straight", [0, 1], 3)
@@ -35,11 +34,7 @@ def test_seeds_that_diverge_are_recorded_from_the_epoch_on_and_keep_their_scores
     assert results(entry, 1) == results(stopped, 1), "as never stopped"
     assert [
         (EntryStore(path).seed(0).record() or {}).get("diverged") for path in (entry, stopped, sound)
-    ] == [
-        1,
-        1,
-        None,
-    ]
+    ] == [1, 1, None]
     loaded = api.load("mlp width=16 lr=1e+30", runs=tmp_path / "straight")
     assert loaded.diverged == (0, 1)
     assert "2, 2 diverged" in loaded.facts["seeds"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import inspect
 import itertools
@@ -58,6 +59,7 @@ IN_SENTENCES = {
 """Commands within running text."""
 
 
+@functools.cache
 def application() -> tuple[Any, Any]:
     """Return the command line as a tree of commands, and the module they come from: click, or typer's copy of it.
 
@@ -195,6 +197,7 @@ def test_every_command_is_documented() -> None:
     assert not missing
 
 
+@functools.cache
 def every_option() -> set[str]:
     """Return the options of all commands, built-in ones imported."""
     from qrlsuite.cli.app import BUILT_IN, load
@@ -226,15 +229,15 @@ def test_options_in_running_text_exist(page: Path) -> None:
             assert word in known, f"{page.name}: `{code}`"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_variables_and_make_targets_exist(page: Path) -> None:
+def test_variables_and_make_targets_exist() -> None:
     code = "".join(path.read_text() for path in (ROOT / "qrlsuite").rglob("*.py"))
-    for name in re.findall(r"\bQRLSUITE_[A-Z_]+\b", page.read_text()):
-        assert name in code, f"{page.name}: {name}"
-    makefile = (ROOT / "Makefile").read_text()
-    for target in re.findall(r"^make ([a-z-]+)$|`make ([a-z-]+)`", page.read_text(), re.MULTILINE):
-        assert re.search(rf"^{''.join(target)}:", makefile, re.MULTILINE), (
-            f"{page.name}: make {''.join(target)}"
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for page in PAGES:
+        text = page.read_text()
+        named = {"".join(two) for two in re.findall(r"^make ([a-z-]+)$|`make ([a-z-]+)`", text, re.MULTILINE)}
+        assert named <= set(targets), page.name
+        assert [name for name in re.findall(r"\bQRLSUITE_[A-Z_]+\b", text) if name not in code] == [], (
+            page.name
         )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training.entanglement import EPISODES, along_episodes, half_cut_entropy, meyer_wallach
-from tests.conftest import POLE
+from tests.conftest import POLE, Train
 
 SMALL = ("qubits=2", "layers=2")
 
@@ -74,7 +73,7 @@ def test_states_are_those_of_the_circuit_also_where_qubits_are_apart() -> None:
     np.testing.assert_allclose(found[0, 0].abs().square(), np.eye(8)[[0, 5]].sum(0) / 2, atol=1e-12)
 
 
-def test_trained_agents_beside_their_initial_parameters(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_trained_agents_beside_their_initial_parameters(train: Train, tmp_path: Path) -> None:
     folder = train("runs", [0, 1], 2, model="vqc-native", settings=SMALL)
     found = along_episodes(EntryStore(folder), episodes=3)
     assert (found.qubits, set(found.seeds)) == (2, {0, 1})
@@ -98,7 +97,7 @@ def test_trained_agents_beside_their_initial_parameters(train: Callable[..., Pat
     assert 0 <= content[0]["meyer-wallach"]["trained"]["mean"] <= 1
 
 
-def test_steps_after_an_episode_s_end_do_not_count(tiny_task: str, train: Callable[..., Path]) -> None:
+def test_steps_after_an_episode_s_end_do_not_count(tiny_task: str, train: Train) -> None:
     Path(tiny_task).write_text(POLE)
     folder = train("runs", [0], 1, model="vqc-native", settings=SMALL)
     found = along_episodes(EntryStore(folder), episodes=1000)
@@ -110,7 +109,7 @@ def test_steps_after_an_episode_s_end_do_not_count(tiny_task: str, train: Callab
     assert (np.diff(ended.astype(int), axis=1) >= 0).all()
 
 
-def test_what_has_no_states_is_refused(train: Callable[..., Path]) -> None:
+def test_what_has_no_states_is_refused(train: Train) -> None:
     network = train("runs", [0], 1)
     with pytest.raises(OptionError, match=r"--entanglement: model 'mlp' of .* has no circuit"):
         along_episodes(EntryStore(network))

@@ -20,7 +20,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.seeding import Streams
 from qrlsuite.training import evaluation
 from qrlsuite.training.trainer import count_parameters
-from tests.conftest import golden
+from tests.conftest import Train, golden
 
 WALK = """
 format_version = 1
@@ -99,7 +99,7 @@ def test_nearest_is_by_distance_to_where_the_user_will_be(tiny_task: str) -> Non
         observations, *_ = envs.step(chosen)
 
 
-def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Callable[..., Path]) -> None:
+def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Train) -> None:
     store = EntryStore(train("runs", [0, 1, 2], 1))
     together = evaluation.trained(store, best=3, episodes=120)
     again = evaluation.trained(store, best=3, episodes=120)
@@ -113,7 +113,7 @@ def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Callab
     assert evaluation.trained(store, 3, 100).returns.tobytes() == together.returns[:, :100].tobytes()
 
 
-def test_loaded_agents_are_the_trained_ones(train: Callable[..., Path]) -> None:
+def test_loaded_agents_are_the_trained_ones(train: Train) -> None:
     """On the validation's own episodes, a loaded agent repeats the last validation scores bit by bit."""
     from qrlsuite.training.trainer import build_envs
 
@@ -131,7 +131,7 @@ def test_loaded_agents_are_the_trained_ones(train: Callable[..., Path]) -> None:
         assert np.array_equal(stored, scores.reshape(2, 5)[s].astype(np.float32))
 
 
-def test_the_best_runs_are_those_with_the_best_last_validation(train: Callable[..., Path]) -> None:
+def test_the_best_runs_are_those_with_the_best_last_validation(train: Train) -> None:
     store = EntryStore(train("runs", [0, 1, 2], 2))
     last = {seed: store.seed(seed).read().curve[-1] for seed in range(3)}
     seeds, scores, runs = evaluation.best_runs(store, 2)
@@ -242,7 +242,7 @@ def test_a_third_partys_policy_is_looked_at(tiny_task: str) -> None:
         evaluation.references(replace(entry, task=task), episodes=3)
 
 
-def test_entries_without_parameters_say_so(train: Callable[..., Path]) -> None:
+def test_entries_without_parameters_say_so(train: Train) -> None:
     store = EntryStore(train("runs", [0, 1], 1))
     path = store.seed(0).path / "final.safetensors"
     whole = path.read_bytes()
@@ -264,7 +264,7 @@ def test_entries_without_parameters_say_so(train: Callable[..., Path]) -> None:
     ],
 )
 def test_parameters_of_another_model_are_refused(
-    change: Callable[..., object], message: str, train: Callable[..., Path]
+    change: Callable[..., object], message: str, train: Train
 ) -> None:
     from safetensors.numpy import load_file, save_file
 

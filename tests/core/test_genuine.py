@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,12 @@ from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore, json_line
 from qrlsuite.results.survey import groups
+from tests.commands import say
+from tests.conftest import Train
 
 
 @pytest.fixture
-def store(train: Callable[..., Path]) -> EntryStore:
+def store(train: Train) -> EntryStore:
     return EntryStore(train("runs", range(3), 4))
 
 
@@ -145,7 +146,7 @@ def test_a_damaged_file_leaves_out_one_seed(store: EntryStore, damaged: str) -> 
     assert seeds == (0, 2)
     assert line.startswith("seed 1: ")
     assert damaged in line
-    done = CliRunner().invoke(build(), ["leaderboard", "--runs", str(store.path.parents[1])])
+    done = say("leaderboard", "--runs", str(store.path.parents[1]))
     assert done.exit_code == 0
     assert f"left out: {line}" in done.stderr
     for seed in (0, 2):
@@ -158,6 +159,7 @@ def test_hashes_are_computed_again(store: EntryStore) -> None:
     path = store.path / "entry.json"
     whole = path.read_text()
     identity = json.loads(whole)["identity"]
+    assert digest(identity) == store.record()["hash"]
     for values, message in (
         (
             {"identity": {**identity, "model_options": {"width": 512}}},
@@ -197,11 +199,6 @@ def test_markdown_shows_labels_as_they_are() -> None:
     (sheet,) = board.build([entry("mlp [a](http://x) *b* `c` _d_ e_f & <i>"), entry("mlp")]).sheets()
     shown = sheet.markdown()
     assert r"mlp \[a\](http://x) \*b\* \`c\` \_d\_ e_f &amp; &lt;i>" in shown
-
-
-def test_an_entrys_hash_is_that_of_its_identity(store: EntryStore) -> None:
-    record = store.record()
-    assert digest(record["identity"]) == record["hash"]
 
 
 def test_a_damaged_seed_is_not_said_to_go_on(store: EntryStore) -> None:

@@ -226,10 +226,7 @@ def test_what_a_queue_trains_is_waited_for(tiny_task: str, tmp_path: Path) -> No
 
 def test_all_combinations_of_a_list_and_no_more(tiny_task: str, tmp_path: Path) -> None:
     wanted = request(
-        tiny_task,
-        trials=9,
-        varied=varied("activation=relu,tanh"),
-        settings=(*OWN, parse_setting("lr=1e-3")),
+        tiny_task, trials=9, varied=varied("activation=relu,tanh"), settings=(*OWN, parse_setting("lr=1e-3"))
     )
     found = finish(Halving(wanted, tmp_path), Recorder(tmp_path / "tuning", near(2e-3)))
     assert {trial.point["model.activation"] for trial in found.trials} == {"relu", "tanh"}
@@ -289,8 +286,7 @@ def test_every_model_tunes_its_learning_rates_and_its_gain(
 
 @pytest.mark.parametrize(("train", "varied"), [("scaling", True), ("linear", False)])
 def test_a_circuit_that_stays_as_drawn_has_no_quantum_learning_rate(train: str, varied: bool) -> None:
-    settings = [parse_setting(word) for word in (f"train={train}", "qubits=2", "layers=1")]
-    found = space.declared(resolve("beam6g", "vqc-native", "ddqn", settings))
+    found = space.declared(resolve("beam6g", f"ddqn vqc-native train={train} qubits=2 layers=1"))
     assert ("algorithm.quantum_lr" in found) == varied
 
 

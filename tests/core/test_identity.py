@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +20,14 @@ from qrlsuite.engine.display import RunDisplay
 from qrlsuite.engine.where import Where
 from qrlsuite.errors import QrlSuiteError, StoreError, UnknownNameError
 from qrlsuite.experiment import identity, source
-from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import collect
-from qrlsuite.options import parse_setting
 from qrlsuite.results import codes
 from qrlsuite.results.claims import acquire
 from qrlsuite.results.store import EntryStore, read_json, write_json
 from qrlsuite.training.remote_task import pack, unpack, work_on
 from tests.commands import qrlsuite, start_worker
-from tests.conftest import TINY, install, installed
+from tests.conftest import TINY, Train, install, installed
 
 PLUGIN = """
 from qrlsuite import hookimpl, specs
@@ -325,9 +323,8 @@ def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(auth
     for _ in range(2):  # again, there is nothing new
         done = author.command("import", str(before))
         assert done.returncode == 0, done.stdout + done.stderr
-        assert (
-            sorted(path.relative_to(author.runs) for path in author.runs.glob("*/*/seed-*/run.json")) == held
-        )
+        found = [path.relative_to(author.runs) for path in author.runs.glob("*/*/seed-*/run.json")]
+        assert sorted(found) == held
     assert list(author.board().values()) == [2, 2]
 
 
@@ -417,10 +414,6 @@ def edit_json(path: Path, **values: Any) -> None:
     write_json(path, {name: value for name, value in kept.items() if value is not None})
 
 
-def tiny(task: str, *settings: str, model: str = "mlp") -> Entry:
-    return resolve(task, model, settings=[parse_setting(word) for word in settings])
-
-
 def with_numerics(monkeypatch: pytest.MonkeyPatch, kind: str, name: str, number: int) -> None:
     known = registry.load().entries[specs.kind(kind)]
     each = known[name]
@@ -428,7 +421,7 @@ def with_numerics(monkeypatch: pytest.MonkeyPatch, kind: str, name: str, number:
 
 
 def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = train("runs", range(2), epochs=1)
     record = read_json(folder / "seed-0000" / "run.json")
@@ -448,7 +441,7 @@ def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
         train("runs", range(4), epochs=2)
 
 
-def test_a_folder_of_two_codes_is_two_entries(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_folder_of_two_codes_is_two_entries(train: Train, tmp_path: Path) -> None:
     folder = train("runs", range(4), epochs=1)
     store = EntryStore(folder)
     parts = read_json(folder / "seed-0000" / "run.json")["code"]["parts"]
@@ -472,7 +465,7 @@ def test_a_folder_of_two_codes_is_two_entries(train: Callable[..., Path], tmp_pa
         collect.read(store)
 
 
-def test_a_published_entry_of_other_code_is_another_entry(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_published_entry_of_other_code_is_another_entry(train: Train, tmp_path: Path) -> None:
     folder = train("runs", range(2), epochs=1)
     entry = collect.read(EntryStore(folder))
     assert entry is not None
@@ -485,10 +478,10 @@ def test_a_published_entry_of_other_code_is_another_entry(train: Callable[..., P
 
 
 def test_seeds_are_set_aside_only_where_nobody_has_them(
-    train: Callable[..., Path], tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Train, tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = train("runs", range(2), epochs=1)
-    store, entry = EntryStore(folder), tiny(tiny_task, "width=16")
+    store, entry = EntryStore(folder), resolve(tiny_task, "mlp width=16")
     with_numerics(monkeypatch, "models", "mlp", 2)
     now, runs = identity.of(entry), tmp_path / "runs"
     claim = acquire(store, [0])
@@ -518,7 +511,7 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
 
 
 def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> None:
-    entry = tiny(tiny_task, "width=16")
+    entry = resolve(tiny_task, "mlp width=16")
     parts = identity.of(entry).record()["parts"]
     task = {
         "token": "t",
@@ -540,7 +533,7 @@ def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> 
 def test_what_somebody_trains_is_not_begun_with_other_code(
     tiny_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry, runs = tiny(tiny_task, "width=16"), tmp_path / "runs"
+    entry, runs = resolve(tiny_task, "mlp width=16"), tmp_path / "runs"
     store = EntryStore.create(runs, entry)
     codes.prepare(store, identity.of(entry))
     claim = acquire(store, [0])  # of a seed that is being built, and has no record yet
@@ -556,7 +549,7 @@ def test_what_somebody_trains_is_not_begun_with_other_code(
 
 
 def test_all_entries_are_looked_at_before_one_is_trained(
-    train: Callable[..., Path],
+    train: Train,
     tiny_task: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -564,7 +557,7 @@ def test_all_entries_are_looked_at_before_one_is_trained(
 ) -> None:
     train("runs", range(2), epochs=1)
     with_numerics(monkeypatch, "models", "mlp", 2)
-    entries = [tiny(tiny_task, "width=8"), tiny(tiny_task, "width=16")]
+    entries = [resolve(tiny_task, "mlp width=8"), resolve(tiny_task, "mlp width=16")]
     with pytest.raises(StoreError, match="model 'mlp' has numerics 2, and had 1"):
         missing.require_same_code(tmp_path / "runs", entries, Where.create())
     missing.require_same_code(tmp_path / "runs", entries, replace(Where.create(), fresh=True))
@@ -575,7 +568,7 @@ def test_all_entries_are_looked_at_before_one_is_trained(
     "code",
     [{}, "text", {"digest": "0", "parts": []}, {"digest": "0" * 16, "parts": [{"role": 1, "name": "x"}]}],
 )
-def test_a_damaged_identity_is_named(train: Callable[..., Path], tmp_path: Path, code: Any) -> None:
+def test_a_damaged_identity_is_named(train: Train, tmp_path: Path, code: Any) -> None:
     folder = train("runs", range(2), epochs=1)
     edit_json(folder / "seed-0001" / "run.json", code=code)
     with pytest.raises(QrlSuiteError, match=r"seed-0001/run\.json: code is not a code identity"):

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import pytest
 from pydantic.dataclasses import dataclass
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.options import parse_setting
 from qrlsuite.specs import AlgorithmSpec, ModelSpec
 from qrlsuite.training import memory
 from qrlsuite.training.memory import PROCESS, group_bytes
+from tests.commands import say
 
 GB = 10**9
 HERE = __name__
@@ -26,7 +24,7 @@ DRAWS = 200 * 64 * 8
 
 
 def entry(model: str, *words: str, algorithm: str = "ddqn") -> Entry:
-    return resolve("beam6g", model, algorithm, [parse_setting(word) for word in words])
+    return resolve("beam6g", " ".join((algorithm, model, *words)))
 
 
 def test_networks_and_replay_buffers() -> None:
@@ -136,7 +134,6 @@ def test_it_is_refused_before_an_entry_s_folder_is_made(
         ["run", "mlp", "width=4096", *where],
         ["tune", "mlp width=4096", *where, "--vary", "lr=[1e-2, 1e-3]"],
     ):
-        said = CliRunner().invoke(build(), words)
-        assert isinstance(said.exception, OptionError)
-        assert "of memory or more, and 1.0 GB are free here" in str(said.exception)
+        with pytest.raises(OptionError, match=r"of memory or more, and 1\.0 GB are free here"):
+            say(*words)
         assert not [*runs.rglob("entry.json")]

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import UnknownNameError
 from qrlsuite.results import lookup
 from qrlsuite.results.store import entries
-from tests.conftest import TINY
+from tests.commands import say
+from tests.conftest import TINY, Train
 
 
 class Entry(NamedTuple):
@@ -112,7 +110,7 @@ def test_a_damaged_entry_is_called_by_its_folder(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def two_tasks(tiny_task: str, train: Callable[..., Path], tmp_path: Path) -> Path:
+def two_tasks(tiny_task: str, train: Train, tmp_path: Path) -> Path:
     """Results of two tasks with entries of the same labels."""
     for name in ("tiny", "other"):
         changed = TINY.replace('"tiny"', f'"{name}"').replace("degree = 3", f"degree = {len(name)}")
@@ -135,14 +133,13 @@ def test_a_task_narrows_the_search(
     words: tuple[str, ...], two_tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    several = CliRunner().invoke(build(), [*words, "--runs", "runs"])
-    assert isinstance(several.exception, UnknownNameError)
-    assert "may be any of 'other/ddqn mlp width=8', 'tiny/ddqn mlp width=8'" in str(several.exception)
+    with pytest.raises(
+        UnknownNameError, match="may be any of 'other/ddqn mlp width=8', 'tiny/ddqn mlp width=8'"
+    ):
+        say(*words)
     for task in ("tiny", "other"):
-        done = CliRunner().invoke(build(), [*words, "--runs", "runs", "--task", task])
-        assert done.exit_code == 0, done.output + str(done.exception)
-    unknown = CliRunner().invoke(build(), [*words, "--runs", "runs", "--task", "tny"])
-    assert "did you mean 'tiny'" in str(unknown.exception)
-    absent = [word.replace("mlp width=8", "ddqn vqc") for word in words]
-    nowhere = CliRunner().invoke(build(), [*absent, "--runs", "runs", "--task", "tiny"])
-    assert "no entry 'ddqn vqc' in runs, task tiny" in str(nowhere.exception)
+        assert say(*words, "--task", task).exit_code == 0
+    with pytest.raises(UnknownNameError, match="did you mean 'tiny'"):
+        say(*words, "--task", "tny")
+    with pytest.raises(UnknownNameError, match="no entry 'ddqn vqc' in runs, task tiny"):
+        say(*(word.replace("mlp width=8", "ddqn vqc") for word in words), "--task", "tiny")

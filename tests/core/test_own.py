@@ -22,6 +22,7 @@ from qrlsuite.studies.looks import FILE, FOLDER
 from qrlsuite.studies.outcome import in_folder
 from qrlsuite.training.remote_task import pack, unpack, work_on
 from qrlsuite.training.trainer import Trainer, first_network
+from tests.conftest import cases
 
 RING = '''
 from qrlsuite.circuit import Circuit
@@ -270,61 +271,40 @@ def test_a_packages_folder_with_hooks_is_used_as_it_lies_there() -> None:
     assert not list(Path("src").rglob("__pycache__"))
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("x = 1\nraise ValueError('no\\nway')\n", "/bad.py:2: ValueError: no way"),
-        ("import no_such_module\n", "/bad.py:1: ModuleNotFoundError: No module named 'no_such_module'"),
-        ("def f(:\n", "/bad.py:1: SyntaxError: "),
-        ("import sys\nsys.exit('bye')\n", "/bad.py:2: SystemExit: bye"),
-        ("x = 1\n", "/bad.py registers nothing: write a function (qubits, layers)"),
-        (
-            "def ring(qubits, layers, depth): ...\n",
-            "/bad.py:1: 'ring': parameter 'depth' needs a default, for example",
-        ),
-        (
-            "def ring(qubits, layers, d=None): ...\n",
-            "/bad.py:1: 'ring': parameter 'd' needs a type, for example d: int",
-        ),
-        (
-            "def ring(qubits, layers, d: 'Nothing' = 1): ...\n",
-            "'ring': its annotations cannot be read: NameError",
-        ),
-        ("def iqp(qubits, layers): ...\n", "/bad.py:1: ansatz 'iqp' is registered already, by qrlsuite ("),
-        (
-            "import qrlsuite\nqrlsuite.register('x.py')\n",
-            "/bad.py:2: ''x.py'' cannot be registered: it is neither",
-        ),
-        (
-            "import qrlsuite\nqrlsuite.register(3)\n",
-            "/bad.py:2: '3' cannot be registered: it is neither a spec nor",
-        ),
-        (
-            "import qrlsuite\n@qrlsuite.register\nclass Net: pass\n",
-            "/bad.py:2: 'Net' cannot be registered: it is neither",
-        ),
-        (
-            "from qrlsuite import hookimpl\n@hookimpl\ndef register_modles(register): ...\n",
-            "there is no hook 'register_modles'; did you mean 'register_models'?",
-        ),
-    ],
-)
+BAD = r"""
+x = 1\nraise ValueError('no' + chr(10) + 'way')\n => /bad.py:2: ValueError: no way
+import no_such_module\n => /bad.py:1: ModuleNotFoundError: No module named 'no_such_module'
+def f(:\n => /bad.py:1: SyntaxError:
+import sys\nsys.exit('bye')\n => /bad.py:2: SystemExit: bye
+x = 1\n => /bad.py registers nothing: write a function (qubits, layers)
+def ring(qubits, layers, depth): ...\n => /bad.py:1: 'ring': parameter 'depth' needs a default, for example
+def ring(qubits, layers, d=None): ...\n => /bad.py:1: 'ring': parameter 'd' needs a type, for example d: int
+def ring(qubits, layers, d: 'Nothing' = 1): ...\n => 'ring': its annotations cannot be read: NameError
+def iqp(qubits, layers): ...\n => /bad.py:1: ansatz 'iqp' is registered already, by qrlsuite (
+import qrlsuite\nqrlsuite.register('x.py')\n => /bad.py:2: ''x.py'' cannot be registered: it is neither
+import qrlsuite\nqrlsuite.register(3)\n => /bad.py:2: '3' cannot be registered: it is neither a spec nor
+import qrlsuite\n@qrlsuite.register\nclass Net: pass\n => /bad.py:2: 'Net' cannot be registered: it is neither
+from qrlsuite import hookimpl\n@hookimpl\ndef register_modles(register): ...\n => did you mean 'register_models'?
+"""
+
+
+@pytest.mark.parametrize(("text", "expected"), cases(BAD))
 def test_what_cannot_be_loaded_is_refused_in_a_line(text: str, expected: str) -> None:
     assert expected in refusal(write("bad.py", text))
 
 
-@pytest.mark.parametrize(
-    ("path", "expected"),
-    [
-        ("none.py", "there is no plugin none.py"),
-        ("ring", "there is no plugin ring; did you mean ring.py?"),
-        ("notes.ipynb", "is a notebook"),
-        ("data.csv", "give a Python file, or the folder of a package"),
-        ("my-ring.py", "cannot import a module 'my-ring': rename it, for example my_ring"),
-        ("json.py", "Python has another module 'json' ("),
-        ("numpy.py", "Python has another module 'numpy' ("),
-    ],
-)
+NO_PLUGINS = """
+none.py => there is no plugin none.py
+ring => there is no plugin ring; did you mean ring.py?
+notes.ipynb => is a notebook
+data.csv => give a Python file, or the folder of a package
+my-ring.py => cannot import a module 'my-ring': rename it, for example my_ring
+json.py => Python has another module 'json' (
+numpy.py => Python has another module 'numpy' (
+"""
+
+
+@pytest.mark.parametrize(("path", "expected"), cases(NO_PLUGINS))
 def test_a_path_that_is_no_plugin_is_refused(path: str, expected: str) -> None:
     for name in ("ring.py", "notes.ipynb", "data.csv", "my-ring.py", "json.py", "numpy.py"):
         write(name, RING)

@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
 from qrlsuite.training.trainer import Trainer
 from tests.commands import Command, start_worker
-from tests.conftest import HANGS, most_epochs, results
+from tests.conftest import HANGS, Train, most_epochs, results
 
 EPOCHS = 6
 
@@ -42,7 +41,7 @@ def _interrupt_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
 
 @pytest.mark.parametrize("model", ["mlp", "vqc-native"])
 def test_interrupted_and_resumed_equals_undisturbed(
-    model: str, train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    model: str, train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = ("width=16",) if model == "mlp" else ("qubits=2", "layers=2")
     straight = train("straight", [0, 1], EPOCHS, model=model, settings=settings)
@@ -60,7 +59,7 @@ def test_interrupted_and_resumed_equals_undisturbed(
 
 
 def test_groups_are_split_and_merged_on_resume(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, frequent: None
+    train: Train, monkeypatch: pytest.MonkeyPatch, frequent: None
 ) -> None:
     straight = train("straight", [0, 1, 2, 3], EPOCHS)
     train("mixed", [0, 1, 2], 2)
@@ -72,16 +71,8 @@ def test_groups_are_split_and_merged_on_resume(
         assert results(straight, seed) == results(mixed, seed)
 
 
-def test_more_epochs_extend_a_finished_run(train: Callable[..., Path]) -> None:
-    straight = train("straight", [0, 1], EPOCHS)
-    train("extended", [0, 1], 2)
-    extended = train("extended", [0, 1], EPOCHS)
-    for seed in (0, 1):
-        assert results(straight, seed) == results(extended, seed)
-
-
 def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     straight = train("straight", [0], EPOCHS)
     with monkeypatch.context() as patch:
@@ -98,7 +89,7 @@ def test_lines_newer_than_the_checkpoint_and_a_torn_line_are_cut(
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
-def test_sigkill_at_random_moments(kills: int, train: Callable[..., Path]) -> None:
+def test_sigkill_at_random_moments(kills: int, train: Train) -> None:
     """A worker process is killed again and again; the final bytes are those of an undisturbed run."""
     entry = train("killed", [0, 1, 2], 1)  # one epoch, so that the folder and its entry exist
     words = (str(entry), "--seeds", "0:3", "--epochs")
@@ -124,7 +115,7 @@ def _wait_for_claim(entry: Path, process: Command) -> None:
         time.sleep(0.02)
 
 
-def test_sigterm_saves_and_exits_130(train: Callable[..., Path]) -> None:
+def test_sigterm_saves_and_exits_130(train: Train) -> None:
     entry = train("runs", [0, 1], 1)
     process = start_worker(str(entry), "--seeds", "0:2", "--epochs", "100000")
     while len(EntryStore(entry).seed(0).epochs()) < 3:

@@ -35,7 +35,8 @@ from qrlsuite.tuning.display import TuneDisplay
 from qrlsuite.tuning.halving import Halving
 from qrlsuite.tuning.runner import run as run_searches
 from tests.conftest import results
-from tests.core.test_tuning import finish, varied, without_hours
+from tests.core.test_halving import OWN
+from tests.core.test_tuning import finish, request, varied, without_hours
 
 NETWORK = ("width=4", "depth=1")
 CASES = {
@@ -49,10 +50,11 @@ RATES = ((0.01, 0.002, 1.0), (0.03, 0.02, 0.3), (0.001, 0.1, 3.7))
 
 def entries(task: str, model: str = "mlp", algorithm: str = "ddqn") -> list[Entry]:
     settings, gain = CASES[model]
-    words = [
-        (*settings, f"lr={lr}", f"quantum_lr={quantum}", gain.format(scale)) for lr, quantum, scale in RATES
+    head = " ".join((algorithm, model, *settings))
+    return [
+        resolve(task, f"{head} lr={lr} quantum_lr={quantum} {gain.format(scale)}")
+        for lr, quantum, scale in RATES
     ]
-    return [resolve(task, model, algorithm, [parse_setting(word) for word in own]) for own in words]
 
 
 def stores(folder: Path, chosen: Sequence[Entry]) -> list[EntryStore]:
@@ -143,7 +145,7 @@ def test_each_entry_has_its_own_progress_and_claim(tiny_task: str, tmp_path: Pat
 
 
 def test_entries_that_differ_in_more_are_refused(tiny_task: str) -> None:
-    apart = [resolve(tiny_task, "mlp", settings=[parse_setting(f"gamma={gamma}")]) for gamma in (0.9, 0.5)]
+    apart = [resolve(tiny_task, f"mlp gamma={gamma}") for gamma in (0.9, 0.5)]
     assert len({entry.population_key for entry in apart}) == 2
     with pytest.raises(ValueError, match="differ in options marked per_agent only"):
         Trainer(apart, [0, 0])
@@ -223,7 +225,7 @@ def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Pa
     """An option without the mark, an entry that another process trains, and any other engine."""
     by = where.Where(local.LocalEngine(), 1)
     alike = entries(tiny_task)
-    other = resolve(tiny_task, "mlp", settings=[*map(parse_setting, NETWORK), parse_setting("gamma=.5")])
+    other = resolve(tiny_task, "mlp width=4 depth=1 gamma=.5")
     stores(tmp_path, alike)
     claim = acquire(EntryStore.find(tmp_path, alike[1]), [1])
     lists = by.divide(plans(tmp_path, [*alike, other], [0, 1], by))
@@ -235,35 +237,19 @@ def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Pa
 
 
 def halving(task: str, folder: Path) -> Halving:
-    settings = tuple(parse_setting(word) for word in (*NETWORK, "input_scale=1"))
-    wanted = search.Request(
-        task, "mlp", settings=settings, sampler="halving", trials=4, seeds=search.tuning_seeds("2"), epochs=1
-    )
-    return Halving(wanted, folder)
+    return Halving(request(task, varied=(), settings=OWN, sampler="halving", trials=4), folder)
 
 
 def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -> None:
     """What a search is expected to cost depends on it."""
-    settings = tuple(parse_setting(word) for word in NETWORK)
     for words, sampler, beside in (
         (("lr=1e-3,1e-2",), "grid", 2),
         (("lr=1e-3,1e-2", "gamma=.9,.99"), "grid", 1),
         (("lr+quantum_lr=1e-3,1e-2",), "halving", 3),
         (("gamma=.9,.99",), "halving", 1),
     ):
-        fixed = (
-            *settings,
-            parse_setting("input_scale=1"),
-            *([parse_setting("lr=1e-3")] * (words == ("gamma=.9,.99",))),
-        )
-        wanted = search.Request(
-            tiny_task,
-            "mlp",
-            settings=fixed,
-            varied=varied(*words),
-            sampler=sampler,
-            seeds=search.tuning_seeds("2"),
-        )
+        fixed = (*OWN, *([parse_setting("lr=1e-3")] * (words == ("gamma=.9,.99",))))
+        wanted = request(tiny_task, settings=fixed, varied=varied(*words), sampler=sampler)
         found = Halving(wanted, tmp_path) if sampler == "halving" else search.Search(wanted, tmp_path)
         assert found.beside == beside, words
 

@@ -25,7 +25,7 @@ from qrlsuite.plugins.circuits import ansatz
 from qrlsuite.plugins.environments.beam6g import options as beam6g
 from qrlsuite.plugins.models import mlp, vqc
 from qrlsuite.results.store import EntryStore
-from tests.conftest import results
+from tests.conftest import Train, results
 
 FROZEN = ConfigDict(extra="forbid")
 
@@ -162,7 +162,7 @@ def test_a_preset_that_sets_one_shows_in_the_label_of_those_who_use_it(
     assert facts(resolve(tiny_task, "mlp", settings=words("warm_up=0")))[:3] == facts(before)[:3]
 
 
-def test_a_run_from_before_is_resumed(train: Callable[..., Path], upgrade: Callable[[], None]) -> None:
+def test_a_run_from_before_is_resumed(train: Train, upgrade: Callable[[], None]) -> None:
     straight = train("straight", [0, 1], 4, settings=("width=8",))
     begun = train("begun", [0, 1], 2, settings=("width=8",))
     upgrade()

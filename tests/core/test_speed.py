@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,18 +14,18 @@ from qrlsuite import registry
 from qrlsuite.errors import FileError
 from qrlsuite.experiment.entry import Entry, from_record, resolve
 from qrlsuite.leaderboard.shelf import published
-from qrlsuite.options import parse_setting
 from qrlsuite.results import provenance, speed
 from qrlsuite.results.speed import Estimate, Speed, Speeds
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import StudySpec
+from tests.conftest import Train
 
 KIND = ("beam6g", "ddqn", "vqc-native")
 REFERENCES = [Speed(KIND, {"qubits": n}, seconds) for n, seconds in ((4, 1.0), (8, 3.0), (12, 50.0))]
 
 
 def vqc(qubits: int, *words: str) -> Entry:
-    return resolve("beam6g", "vqc-native", settings=[parse_setting(w) for w in (f"qubits={qubits}", *words)])
+    return resolve("beam6g", " ".join((f"vqc-native qubits={qubits}", *words)))
 
 
 def test_without_evidence_nothing_is_claimed() -> None:
@@ -133,7 +132,7 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
         assert low <= seconds <= high, (record["label"], seconds, low, high)
 
 
-def test_the_median_of_an_entrys_epochs_is_measured(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_the_median_of_an_entrys_epochs_is_measured(train: Train, tmp_path: Path) -> None:
     store = EntryStore(train("runs", [0, 1], 3))
     for seed in (0, 1):
         lines = [{"epoch": e, "train": e, "validate": 0.5} for e in (1, 2, 3)]

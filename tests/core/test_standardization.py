@@ -24,7 +24,7 @@ from qrlsuite.training import evaluation, group
 from qrlsuite.training.group import GroupRun
 from qrlsuite.training.standardization import PREFIX, RunningStatistics
 from qrlsuite.training.trainer import Trainer, build_envs
-from tests.conftest import POLE
+from tests.conftest import POLE, Train
 
 STANDARDIZED = POLE.replace("steps = 30", 'steps = 30\nnormalization = "running"')
 AGENTS = [
@@ -49,7 +49,7 @@ def entry(tmp_path: Path) -> Callable[..., Entry]:
 
 
 @pytest.fixture
-def train(entry: Callable[..., Entry], tmp_path: Path) -> Callable[..., Path]:
+def train(entry: Callable[..., Entry], tmp_path: Path) -> Train:
     """Train seeds as one group in this process; returns the entry's folder."""
 
     def go(folder: str, seeds: Sequence[int], agent: tuple[Any, ...], epochs: int = 3) -> Path:
@@ -188,7 +188,7 @@ def test_a_constant_value_becomes_zero() -> None:
 
 @agents
 def test_seeds_trained_together_equal_seeds_trained_apart(
-    algorithm: str, model: str, settings: tuple[str, ...], train: Callable[..., Path]
+    algorithm: str, model: str, settings: tuple[str, ...], train: Train
 ) -> None:
     agent = (algorithm, model, settings)
     together = train("together", [0, 1, 2, 3], agent)
@@ -205,11 +205,7 @@ def test_seeds_trained_together_equal_seeds_trained_apart(
 
 @agents
 def test_interrupted_split_and_resumed_equals_undisturbed(
-    algorithm: str,
-    model: str,
-    settings: tuple[str, ...],
-    train: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
+    algorithm: str, model: str, settings: tuple[str, ...], train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = (algorithm, model, settings)
     straight = train("straight", [0, 1], agent, 4)
@@ -233,7 +229,7 @@ def test_interrupted_split_and_resumed_equals_undisturbed(
 
 
 def test_killed_before_publishing_publishes_the_statistics_of_the_last_epoch(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     straight = train("straight", [0], AGENTS[1])
 
@@ -249,7 +245,7 @@ def test_killed_before_publishing_publishes_the_statistics_of_the_last_epoch(
 
 @agents
 def test_evaluated_agents_are_the_trained_ones(
-    algorithm: str, model: str, settings: tuple[str, ...], train: Callable[..., Path]
+    algorithm: str, model: str, settings: tuple[str, ...], train: Train
 ) -> None:
     """On the validation's own episodes they repeat the last scores."""
     store = EntryStore(train("runs", [0, 1], (algorithm, model, settings)))
@@ -259,7 +255,7 @@ def test_evaluated_agents_are_the_trained_ones(
     assert player.statistics.used["count"].tolist() == [120, 120], "of the first two of three epochs"
 
 
-def test_with_other_statistics_an_agent_is_another(train: Callable[..., Path]) -> None:
+def test_with_other_statistics_an_agent_is_another(train: Train) -> None:
     store = EntryStore(train("runs", [0, 1], AGENTS[1]))
     player = evaluation.trained_agents(store.entry(), store, [0, 1])
     assert player.statistics is not None
@@ -286,7 +282,7 @@ def play(entry: Entry, player: Trainer) -> NDArray[np.float32]:
     return scores.reshape(2, 5).astype(np.float32)  # as they are stored
 
 
-def test_an_agent_without_its_statistics_is_not_played(train: Callable[..., Path]) -> None:
+def test_an_agent_without_its_statistics_is_not_played(train: Train) -> None:
     store = EntryStore(train("runs", [0], AGENTS[1], 1))
     path = store.seed(0).path / "final.safetensors"
     save_file({k: v for k, v in load_file(path).items() if not k.startswith(PREFIX)}, path)

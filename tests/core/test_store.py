@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 
 import qrlsuite
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.results import checkpoint, provenance, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.seeds import format_seeds, parse_seeds, plan_groups
-from tests.conftest import results
+from tests.commands import answer
+from tests.conftest import Train, results
 
 
 def test_a_torn_last_line_is_dropped_and_a_broken_one_named(tmp_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_float32_scores_survive_every_round_trip(tmp_path: Path) -> None:
     assert (np.array(back[0]["scores"], np.float32) == values).all()
 
 
-def test_the_table_is_what_the_lines_were(train: Callable[..., Path]) -> None:
+def test_the_table_is_what_the_lines_were(train: Train) -> None:
     folder = store.EntryStore(train("runs", [0])).seed(0)
     rows = folder.epochs()
     assert not folder.lines.exists()
@@ -59,7 +59,7 @@ def test_the_table_is_what_the_lines_were(train: Callable[..., Path]) -> None:
     assert folder.epochs() == rows[:2]
 
 
-def test_scores_are_read_and_those_that_cannot_be_are_refused(train: Callable[..., Path]) -> None:
+def test_scores_are_read_and_those_that_cannot_be_are_refused(train: Train) -> None:
     folder = store.EntryStore(train("runs", [0], 1)).seed(0)
     assert folder.read().scores.shape == (1, 5)
     (row,) = folder.epochs()
@@ -70,7 +70,7 @@ def test_scores_are_read_and_those_that_cannot_be_are_refused(train: Callable[..
             folder.read()
 
 
-def test_another_format_version_is_refused(train: Callable[..., Path]) -> None:
+def test_another_format_version_is_refused(train: Train) -> None:
     entry = train("runs", [0])
     content = json.loads((entry / "entry.json").read_text())
     (entry / "entry.json").write_text(json.dumps({**content, "format_version": 2}))
@@ -78,7 +78,7 @@ def test_another_format_version_is_refused(train: Callable[..., Path]) -> None:
         train("runs", [0])
 
 
-def test_a_missing_epoch_is_an_error(train: Callable[..., Path]) -> None:
+def test_a_missing_epoch_is_an_error(train: Train) -> None:
     folder = store.EntryStore(train("runs", [0])).seed(0)
     rows = folder.epochs()
     folder.table.unlink()
@@ -87,23 +87,21 @@ def test_a_missing_epoch_is_an_error(train: Callable[..., Path]) -> None:
         folder.read()
 
 
-@pytest.mark.parametrize("content", [b"", b"PAR1", b"not parquet at all", b"\0" * 100])
-def test_a_truncated_table_is_named(train: Callable[..., Path], content: bytes) -> None:
-    folder = store.EntryStore(train("runs", [0])).seed(0)
-    folder.table.write_bytes(content)
-    with pytest.raises(StoreError, match=r"epochs\.parquet is not a readable parquet file"):
-        folder.read()
+def test_a_truncated_table_and_a_damaged_checkpoint_are_named(train: Train) -> None:
+    entry = store.EntryStore(train("runs", [0], 1))
+    folder = entry.seed(0)
+    for content in (b"", b"PAR1", b"not parquet at all", b"\0" * 100):
+        folder.table.write_bytes(content)
+        with pytest.raises(StoreError, match=r"epochs\.parquet is not a readable parquet file"):
+            folder.read()
+    (path,) = entry.groups.glob("*/checkpoint.safetensors")
+    for content in (b"", b"\xff" * 20, b"\x10\0\0\0\0\0\0\0{}              "):
+        path.write_bytes(content)
+        with pytest.raises(StoreError, match="is damaged"):
+            checkpoint.headers(entry)
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff" * 20, b"\x10\0\0\0\0\0\0\0{}              "])
-def test_a_damaged_checkpoint_is_named(train: Callable[..., Path], content: bytes) -> None:
-    entry = store.EntryStore(train("runs", [0]))
-    next(entry.groups.glob("*/checkpoint.safetensors")).write_bytes(content)
-    with pytest.raises(StoreError, match="is damaged"):
-        checkpoint.headers(entry)
-
-
-def test_a_finished_run_without_checkpoint_is_not_started_again(train: Callable[..., Path]) -> None:
+def test_a_finished_run_without_checkpoint_is_not_started_again(train: Train) -> None:
     entry = store.EntryStore(train("runs", [0]))
     before = entry.seed(0).table.read_bytes()
     for path in entry.groups.glob("*/checkpoint.safetensors"):
@@ -113,7 +111,7 @@ def test_a_finished_run_without_checkpoint_is_not_started_again(train: Callable[
     assert entry.seed(0).table.read_bytes() == before
 
 
-def test_two_workers_never_share_a_seed(train: Callable[..., Path]) -> None:
+def test_two_workers_never_share_a_seed(train: Train) -> None:
     entry = store.EntryStore(train("runs", [0, 1]))
     claim = acquire(entry, [1, 2])
     with pytest.raises(SeedsClaimedError, match=r"1 of these seeds \(from 2\) are being trained by process"):
@@ -124,7 +122,7 @@ def test_two_workers_never_share_a_seed(train: Callable[..., Path]) -> None:
     acquire(entry, [2, 3]).release()
 
 
-def test_the_claim_of_a_dead_process_is_taken_over(train: Callable[..., Path]) -> None:
+def test_the_claim_of_a_dead_process_is_taken_over(train: Train) -> None:
     entry = store.EntryStore(train("runs", [0]))
     claim = acquire(entry, [0])
     content = json.loads(claim.path.read_text())
@@ -134,11 +132,9 @@ def test_the_claim_of_a_dead_process_is_taken_over(train: Callable[..., Path]) -
     assert not claim.refresh(), "a holder whose claim was taken over finds out"
 
 
-@pytest.mark.parametrize(
-    ("text", "seeds"), [("3", [0, 1, 2]), ("2:4", [2, 3]), ("0,3,10:12", [0, 3, 10, 11]), ("5,1", [1, 5])]
-)
-def test_seeds_are_parsed(text: str, seeds: list[int]) -> None:
-    assert parse_seeds(text) == seeds
+def test_seeds_are_parsed() -> None:
+    texts = {"3": [0, 1, 2], "2:4": [2, 3], "0,3,10:12": [0, 3, 10, 11], "5,1": [1, 5]}
+    assert {text: parse_seeds(text) for text in texts} == texts
 
 
 @pytest.mark.parametrize(
@@ -164,31 +160,27 @@ def test_seeds_that_are_none(text: str) -> None:
         parse_seeds(text)
 
 
-@pytest.mark.parametrize("seeds", [[0], [7], [0, 1, 2], [0, 2, 3, 9], [5, 6, 8, 9, 10]])
-def test_format_seeds_is_the_inverse_of_parse_seeds(seeds: list[int]) -> None:
-    assert parse_seeds(format_seeds(seeds)) == seeds
+@given(st.sets(st.integers(0, 40) | st.integers(0, 10**6), min_size=1))
+def test_format_seeds_is_the_inverse_of_parse_seeds(seeds: set[int]) -> None:
+    assert parse_seeds(format_seeds(sorted(seeds))) == sorted(seeds)
 
 
-def test_groups_are_even_and_keep_epochs_apart(train: Callable[..., Path]) -> None:
+def test_groups_are_even_and_keep_epochs_apart(train: Train) -> None:
     entry = store.EntryStore(train("runs", [0, 1], 2))
     groups = plan_groups(entry, range(10), 5, workers=2)
     assert [(g.seeds, g.epoch) for g in groups] == [((2, 3, 4, 5), 0), ((6, 7, 8, 9), 0), ((0, 1), 2)]
     assert plan_groups(entry, [0, 1], 2, workers=2) == []
 
 
-def test_a_read_only_folder_gives_one_clear_error(tmp_path: Path) -> None:
-    blocker = tmp_path / "file"
-    blocker.write_text("")
+def test_a_folder_that_cannot_be_written_or_is_not_there_gives_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*: Not a directory; the old file is unchanged"):
-        store.write_atomically(blocker / "x.json", b"{}")
-
-
-def test_no_results_folder(tmp_path: Path) -> None:
+        store.write_atomically(tmp_path / "file" / "x.json", b"{}")
     with pytest.raises(QrlSuiteError, match="there is no results folder"):
         store.entries(tmp_path / "none")
 
 
-def test_a_torn_line_of_timings_costs_nothing(train: Callable[..., Path]) -> None:
+def test_a_torn_line_of_timings_costs_nothing(train: Train) -> None:
     path = train("runs", [0, 1], 1)
     seed = store.EntryStore(path).seed(0)
     with seed.timings.open("ab") as file:
@@ -198,7 +190,7 @@ def test_a_torn_line_of_timings_costs_nothing(train: Callable[..., Path]) -> Non
     assert seed.seconds() > 0
 
 
-def test_a_deleted_folder_of_a_seed_starts_again(train: Callable[..., Path]) -> None:
+def test_a_deleted_folder_of_a_seed_starts_again(train: Train) -> None:
     """As messages advise, although the group's checkpoint holds its agent."""
     path = train("runs", [0, 1], 2)
     kept = store.EntryStore(path)
@@ -209,16 +201,11 @@ def test_a_deleted_folder_of_a_seed_starts_again(train: Callable[..., Path]) -> 
     assert results(path, 1) == before
 
 
-def test_a_finished_seed_without_its_epochs_is_no_curve(train: Callable[..., Path]) -> None:
+def test_neither_a_record_nor_a_checkpoint_stands_for_epochs_that_are_gone(train: Train) -> None:
     seed = store.EntryStore(train("runs", [0], 2)).seed(0)
     seed.table.unlink()
     with pytest.raises(StoreError, match="finished 2 epochs and holds 0: restore the file or delete"):
         seed.read()
-
-
-def test_a_checkpoint_does_not_stand_for_epochs_that_are_gone(train: Callable[..., Path]) -> None:
-    seed = store.EntryStore(train("runs", [0], 2)).seed(0)
-    seed.table.unlink()
     with pytest.raises(StoreError, match="holds 0 epochs, its checkpoint 2: restore the file, or delete"):
         train("runs", [0], 3)
 
@@ -228,7 +215,7 @@ def test_means_of_float32_scores_reach_what_the_scores_reach() -> None:
     assert np.asarray(curve).tolist() == [0.95]
 
 
-def test_core_seconds_are_processor_time_where_it_was_recorded(train: Callable[..., Path]) -> None:
+def test_core_seconds_are_processor_time_where_it_was_recorded(train: Train) -> None:
     seed = store.EntryStore(train("runs", [0], 2)).seed(0)
     lines = store.read_lines(seed.timings)
     assert [line["epoch"] for line in lines] == [1, 2]
@@ -252,7 +239,7 @@ def test_the_recorded_version_is_that_of_the_code_that_runs(monkeypatch: pytest.
     }
 
 
-def test_the_record_of_a_seed_says_what_was_trained(train: Callable[..., Path]) -> None:
+def test_the_record_of_a_seed_says_what_was_trained(train: Train) -> None:
     """Trackers are given it, and it lies beside the curve for whoever finds the folder."""
     folder = train("runs", [3], 1)
     entry = store.EntryStore(folder).entry()
@@ -277,10 +264,9 @@ def test_the_record_of_a_seed_says_what_was_trained(train: Callable[..., Path]) 
     assert record["parameters"] == {"classical": weights, "quantum": 0, "networks": 1}
 
 
-def test_an_entry_shows_once_what_made_all_its_seeds(train: Callable[..., Path]) -> None:
+def test_an_entry_shows_once_what_made_all_its_seeds(train: Train) -> None:
     entry = train("runs", [0, 1, 2], epochs=1)
-    options = ["show", entry.name, "--runs", str(entry.parents[1]), "--json"]
-    shown = json.loads(CliRunner().invoke(build(), options, catch_exceptions=False).stdout)
+    shown = answer("show", entry.name, "--runs", str(entry.parents[1]))
     record = store.EntryStore(entry).record()
     assert (shown["label"], shown["seeds"]) == (record["label"], 3)
     [origin] = shown["provenance"]

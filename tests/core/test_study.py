@@ -10,9 +10,10 @@ import pytest
 from qrlsuite import registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
-from qrlsuite.options import Setting, parse_setting
+from qrlsuite.options import parse_setting
 from qrlsuite.studies import study
 from qrlsuite.studies.sizes import nearest_size, parameters
+from tests.conftest import cases
 
 ROOT = Path(__file__).parents[2]
 SMALL = """
@@ -115,7 +116,7 @@ def test_studies_have_the_entries_of_the_paper() -> None:
 
 
 def test_entries_are_those_of_plain_runs() -> None:
-    plain = resolve("beam6g", "mlp", settings=[parse_setting("width=16")])
+    plain = resolve("beam6g", "mlp width=16")
     assert plain.name in {m.entry.name for m in study.load("fig6").members()}
     shared = {m.entry.name for m in study.load("fig6").members()} - {
         m.entry.name for m in study.load("fig7").members()
@@ -157,9 +158,7 @@ def test_matched_sizes_are_the_nearest_of_all() -> None:
     members = study.load("matched").members()
     circuits = [m.entry for m in members if m.group == "vqc"]
     networks = [m.entry for m in members if m.group == "mlp"]
-    counts = {
-        w: parameters(resolve("beam6g", "mlp", settings=[Setting("model", "width", w)])) for w in range(1, 25)
-    }
+    counts = {w: parameters(resolve("beam6g", f"mlp width={w}")) for w in range(1, 25)}
     assert counts[16] == 16**2 + 8 * 16 + 3
     for circuit, network in zip(circuits, networks, strict=True):
         wanted = 31 * circuit.model_options.qubits + 3  # 6 L n + 7 n + 3 with 4 layers
@@ -168,8 +167,7 @@ def test_matched_sizes_are_the_nearest_of_all() -> None:
 
 
 def test_sizes_that_cannot_be_matched() -> None:
-    target = resolve("beam6g", "mlp", settings=[parse_setting("width=64")])
-    small = resolve("beam6g", "mlp", settings=[parse_setting("width=16")])
+    target, small = (resolve("beam6g", f"mlp width={width}") for width in (64, 16))
     with pytest.raises(OptionError, match="no size up to 4096 has the 4611 parameters of ddqn mlp width=64"):
         nearest_size(lambda size: small, target)
 
@@ -230,36 +228,20 @@ def test_every_error_of_a_file_is_named_with_its_place() -> None:
         assert part in message, message
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            'group = "vqc"',
-            'group = "vcq"',
-            "entries.1.match.group = 'vcq' is no earlier group; did you mean 'vqc'",
-        ),
-        ('group = "vqc"', 'group = "mlp"', "entries.1.match.group = 'mlp' is no earlier group"),
-        ('name = "vqc"', 'name = "mlp"', "two groups are named 'mlp'"),
-        (
-            'kind = "curves"',
-            'kind = "curves"\nentries = ["mpl"]',
-            "pictures.0.entries: no group 'mpl'; did you mean 'mlp'",
-        ),
-        (
-            'kind = "curves"',
-            'kind = "curves"\n[[pictures]]\nkind = "bars"',
-            "two pictures are named 'picture'",
-        ),
-        ("grid = { qubits = [2, 3] }", "grid = { qubits = [] }", "entries.0.grid.qubits"),
-        (
-            'kind = "curves"',
-            'kind = "deployed"\nevaluation.deployed = { backend = "native", values = [1] }',
-            "missing key 'pictures.0.evaluation.deployed.vary'",
-        ),
-        ("format_version = 1", "format_version = 2", "format_version = 2"),
-        ("[[entries]]", "[[entries", "not valid TOML"),
-    ],
-)
+CONTRADICTIONS = r"""
+group = "vqc" => group = "vcq" => entries.1.match.group = 'vcq' is no earlier group; did you mean 'vqc'
+group = "vqc" => group = "mlp" => entries.1.match.group = 'mlp' is no earlier group
+name = "vqc" => name = "mlp" => two groups are named 'mlp'
+"curves" => "curves"\nentries = ["mpl"] => pictures.0.entries: no group 'mpl'; did you mean 'mlp'
+"curves" => "curves"\n[[pictures]]\nkind = "bars" => two pictures are named 'picture'
+"curves" => "deployed"\nevaluation.deployed = { backend = "native", values = [1] } => evaluation.deployed.vary'
+qubits = [2, 3] => qubits = [] => entries.0.grid.qubits
+format_version = 1 => format_version = 2 => format_version = 2
+[[entries]] => [[entries => not valid TOML
+"""
+
+
+@pytest.mark.parametrize(("old", "new", "message"), cases(CONTRADICTIONS))
 def test_studies_that_contradict_themselves(old: str, new: str, message: str) -> None:
     with pytest.raises(FileError) as caught:
         study.parse(SMALL.replace(old, new), "broken.toml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,17 +15,7 @@ from qrlsuite import registry, specs
 from qrlsuite.errors import FileError, OptionError, QrlSuiteError
 from qrlsuite.experiment import entry, task
 from qrlsuite.hookspecs import hookimpl
-from tests.conftest import TINY
-
-MAXIMUM = "[score]\nsource = 'return'\nmax_return = "
-LEVELS = """epsilons = [0.6, 0.8]
-deltas = [0.5, 0.75]
-reference = { epsilon = 0.6, delta = 0.5 }
-"""
-ABSOLUTE = """thresholds = [1.0, 2.5, 1.0]
-deltas = [0.5, 0.75]
-reference = { threshold = 1.0, delta = 0.5 }
-"""
+from tests.conftest import TINY, cases
 
 
 def test_the_hash_covers_the_definition_and_nothing_else() -> None:
@@ -35,56 +26,53 @@ def test_the_hash_covers_the_definition_and_nothing_else() -> None:
     assert task.parse(TINY.replace("episodes = 5", "episodes = 6"), "t").hash != base.hash
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("epochs = 3", "epoch = 3", r"t.toml: unknown key 'epoch' in \[protocol\]; did you mean 'epochs'"),
-        ("[protocol]", "[protocoll]", "unknown key 'protocoll'; did you mean 'protocol'"),
-        ("interactions = 60", "", "missing key 'protocol.interactions'"),
-        ("interactions = 60", "interactions = 61", "interactions = 61 is not a multiple of environments = 4"),
-        ("seeds = 4", "seeds = 'four'", "protocol.seeds = 'four'"),
-        (
-            'name = "beam6g"',
-            'name = "beam6h"',
-            "t.toml: environment.name: unknown environment 'beam6h'; did you mean 'beam6g'",
-        ),
-        ('name = "tiny"', 'name = "tiny task"', "name = 'tiny task'"),
-        ("degree = 3", "degre = 3", "no option 'degre'; did you mean 'degree'"),
-        ("deltas = [0.5, 0.75]", "deltas = [0.5, 1.5]", "ranking.deltas.1 = 1.5"),
-        ("epsilons = [0.6, 0.8]", "", "give either epsilons"),
-        ("epsilon = 0.6, delta", "threshold = 0.6, delta", "the reference cell needs epsilon and delta"),
-        ("format_version = 1", "format_version = 2", "format_version = 2"),
-        ("steps = 20", "steps = 20 = 3", "not valid TOML"),
-        (
-            "degree = 3",
-            f"degree = {'[' * 5000}{']' * 5000}",
-            "not valid TOML: too large a value: maximum recursion",
-        ),
-        ("seeds = 4", f"seeds = {'9' * 5000}", "not valid TOML: too large a value"),
-        ("[ranking]", f"{MAXIMUM}-5\n[ranking]", "score.max_return = -5: Input should be greater than 0"),
-        ("[ranking]", f"{MAXIMUM}nan\n[ranking]", "score.max_return = nan: Input should be a finite number"),
-        ("[ranking]", f"{MAXIMUM}inf\n[ranking]", "score.max_return = inf: Input should be a finite number"),
-        (
-            "epsilons = [0.6, 0.8]",
-            "epsilons = [0.6, 0.8, 0.60]",
-            "epsilons: 0.6 is there twice, and its cells would",
-        ),
-        ("deltas = [0.5, 0.75]", "deltas = [0.5, 0.5]", "deltas: 0.5 is there twice"),
-        ("horizons = [180]", "horizons = [180, 180]", "horizons: 180 is there twice"),
-        (LEVELS, ABSOLUTE.replace("2.5", "nan"), r"thresholds\[1\] = nan is not finite"),
-        (LEVELS, ABSOLUTE.replace("2.5", "inf"), r"thresholds\[1\] = inf is not finite"),
-        (LEVELS, ABSOLUTE, "thresholds: 1.0 is there twice"),
-        (LEVELS, ABSOLUTE.replace("2.5, 1.0", "2.5").replace("d = 1.0", "d = nan"), "nan is not finite"),
-        (
-            'default_algorithm = "ddqn"',
-            'default_preset = "relesed"',
-            "default_preset 'relesed'; none is registered",
-        ),
-    ],
-)
+MISTAKES = r"""
+epochs = 3 => epoch = 3 => t.toml: unknown key 'epoch' in [protocol]; did you mean 'epochs'
+[protocol] => [protocoll] => unknown key 'protocoll'; did you mean 'protocol'
+interactions = 60 =>  => missing key 'protocol.interactions'
+interactions = 60 => interactions = 61 => interactions = 61 is not a multiple of environments = 4
+seeds = 4 => seeds = 'four' => protocol.seeds = 'four'
+seeds = 4 => seeds = 9{5000} => not valid TOML: too large a value
+name = "beam6g" => name = "beam6h" => t.toml: environment.name: unknown environment 'beam6h'; did you mean 'beam6g'
+name = "tiny" => name = "tiny task" => name = 'tiny task'
+degree = 3 => degre = 3 => no option 'degre'; did you mean 'degree'
+degree = 3 => degree = [{5000}]{5000} => not valid TOML: too large a value: maximum recursion
+deltas = [0.5, 0.75] => deltas = [0.5, 1.5] => ranking.deltas.1 = 1.5
+deltas = [0.5, 0.75] => deltas = [0.5, 0.5] => deltas: 0.5 is there twice
+epsilons = [0.6, 0.8] =>  => give either epsilons
+epsilons = [0.6, 0.8] => epsilons = [0.6, 0.8, 0.60] => epsilons: 0.6 is there twice, and its cells would
+epsilon = 0.6, delta => threshold = 0.6, delta => the reference cell needs epsilon and delta
+horizons = [180] => horizons = [180, 180] => horizons: 180 is there twice
+format_version = 1 => format_version = 2 => format_version = 2
+steps = 20 => steps = 20 = 3 => not valid TOML
+[ranking] => [score]\nsource = 'return'\nmax_return = -5\n[ranking] => score.max_return = -5: Input should be greater
+[ranking] => [score]\nsource = 'return'\nmax_return = nan\n[ranking] => max_return = nan: Input should be a finite
+[ranking] => [score]\nsource = 'return'\nmax_return = inf\n[ranking] => max_return = inf: Input should be a finite
+default_algorithm = "ddqn" => default_preset = "relesed" => default_preset 'relesed'; none is registered
+"""
+THRESHOLDS = """
+thresholds = [1.0, nan, 1.0] => thresholds[1] = nan is not finite
+thresholds = [1.0, inf, 1.0] => thresholds[1] = inf is not finite
+thresholds = [1.0, 2.5, 1.0] => thresholds: 1.0 is there twice
+thresholds = [1.0, 2.5]; threshold = nan => nan is not finite
+"""
+
+
+@pytest.mark.parametrize(("thresholds", "message"), cases(THRESHOLDS))
+def test_mistakes_in_thresholds_are_named(thresholds: str, message: str) -> None:
+    every, _, reference = thresholds.partition("; ")
+    text = TINY.replace("epsilons = [0.6, 0.8]", every).replace(
+        "epsilon = 0.6", reference or "threshold = 1.0"
+    )
+    with pytest.raises(QrlSuiteError, match=re.escape(message)):
+        task.parse(text, "t.toml")
+
+
+@pytest.mark.parametrize(("old", "new", "message"), cases(MISTAKES))
 def test_mistakes_are_named(old: str, new: str, message: str) -> None:
     assert old in TINY
-    with pytest.raises(QrlSuiteError, match=message):
+    new = re.sub(r"(.)\{5000\}", lambda many: many[1] * 5000, new)
+    with pytest.raises(QrlSuiteError, match=re.escape(message)):
         task.parse(TINY.replace(old, new), "t.toml")
 
 
@@ -209,10 +197,7 @@ def test_a_task_extends_another() -> None:
 )
 def test_what_cannot_be_extended_is_named(extends: str, message: str) -> None:
     with pytest.raises(FileError, match=message):
-        task.parse(
-            f"{TINY.replace('format_version = 1', f'format_version = 1{chr(10)}extends = {extends}')}",
-            "t.toml",
-        )
+        task.parse(f"extends = {extends}\n{TINY}", "t.toml")
 
 
 class Circle:

@@ -151,8 +151,8 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
         + "[presets.mine.ddqn.all]\nlr = 0.1\ngamma = 0.5\n"
         + '[tuning.mine.ddqn.quantum]\ntrials = 3\nseeds = "0:20"\n'
     )
-    words = [parse_setting(word) for word in ("qubits=2", "layers=1", "gamma=.9")]
-    entry = resolve(str(path), "vqc-native", settings=words, preset="mine")
+    circuit = "vqc-native qubits=2 layers=1 gamma=.9"
+    entry = resolve(str(path), circuit, preset="mine")
     assert entry.tuning is not None
     assert entry.tuning["trials"] == 3
     assert entry.tuning["preset"] == "mine"
@@ -161,7 +161,7 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
     assert (entry.tuning["steps"], entry.tuning["value"]) == (None, None), "not known, and not made up"
     assert entry.task.hash == resolve(str(path), "mlp").task.hash
     assert resolve(str(path), "mlp", preset="mine").tuning is None, "nothing is said of networks"
-    assert resolve(str(path), "vqc-native", settings=words).tuning is None, "it is not the default"
+    assert resolve(str(path), circuit).tuning is None, "it is not the default"
     assert "tuning" not in entry.record()["task_file"], "older versions read the record"
 
     store = EntryStore.create(tmp_path / "runs", dataclasses.replace(entry, tuning=None))
@@ -180,8 +180,7 @@ def test_a_tasks_own_preset_says_what_finding_it_took(tmp_path: Path) -> None:
 def test_published_entries_carry_the_tuning_of_the_preset_they_use(path: Path) -> None:
     record = EntryStore(path.parent).record()
     model = record["identity"]["model"]
-    sizes = {"mlp": ("width=16", "depth=1"), "vqc-native": ("qubits=4", "layers=1")}[model]
-    entry = resolve("cartpole", model, settings=[parse_setting(word) for word in sizes])
+    entry = resolve("cartpole", {"mlp": "mlp width=16 depth=1"}.get(model, f"{model} qubits=4 layers=1"))
     assert (entry.name, entry.preset) == (path.parent.name, record["preset"])
     assert record["tuning"] == entry.tuning
     assert (record["tuning"]["trials"], record["tuning"]["seeds"]) == (7, "1000000:1000010")

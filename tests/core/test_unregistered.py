@@ -25,7 +25,7 @@ from qrlsuite.specs import ModelSpec
 from qrlsuite.testing import model as rules
 from qrlsuite.testing.common import Subject
 from qrlsuite.training import unregistered
-from tests.conftest import results
+from tests.conftest import Train, results
 
 
 @dataclass(frozen=True)
@@ -227,11 +227,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Base]], ModelSpec
 @pytest.mark.parametrize("cls", [Attribute, ArraysInAList, ModuleInADict, Remembers, Recurrent])
 @pytest.mark.parametrize("seeds", [(1,), (0, 1)], ids=["alone", "together"])
 def test_run_refuses_it_before_training(
-    cls: type[Base],
-    seeds: tuple[int, ...],
-    install: Callable[..., Any],
-    train: Callable[..., Path],
-    tmp_path: Path,
+    cls: type[Base], seeds: tuple[int, ...], install: Callable[..., Any], train: Train, tmp_path: Path
 ) -> None:
     install(cls)
     with pytest.raises(PluginError, match=REFUSED[cls]):
@@ -239,7 +235,7 @@ def test_run_refuses_it_before_training(
     assert not list(tmp_path.rglob("epochs.jsonl"))
 
 
-def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: Callable[..., Path]) -> None:
+def test_what_is_registered_trains_as_alone(install: Callable[..., Any], train: Train) -> None:
     class Registers(Base):
         w: Tensor
 
@@ -264,9 +260,7 @@ def test_check_names_attribute_and_cure(cls: type[Base], install: Callable[[type
     assert re.search(REFUSED[cls], broken.message), broken.message
 
 
-def test_a_model_that_cannot_be_vmapped_is_said_once(
-    install: Callable[..., Any], train: Callable[..., Path]
-) -> None:
+def test_a_model_that_cannot_be_vmapped_is_said_once(install: Callable[..., Any], train: Train) -> None:
     class Branching(Base):
         def forward(self, x: Tensor) -> Tensor:
             return super().forward(x if float(x.sum()) > 0 else -x)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from qrlsuite import api
 from qrlsuite.api.warm import begin_with
-from qrlsuite.cli.app import build
 from qrlsuite.engine import probe
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
@@ -27,7 +24,8 @@ from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training.remote_task import POLICY, pack, unpack, versions, work_on
 from qrlsuite.training.trainer import Trainer
-from tests.conftest import TINY, trainer
+from tests.commands import answer, say
+from tests.conftest import POLE, TINY, Train, trainer
 
 WORDS = ["--seeds", "2", "--epochs", "2", "--workers", "1"]
 
@@ -40,9 +38,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "other.toml").write_text(TINY.replace("degree = 3", "degree = 2").replace('"tiny"', '"other"'))
     trainer(str(root / "tiny.toml"), root)("runs", [0, 1], 2)
     words = ["run", "mlp width=16", "--task", str(root / "other.toml"), "--from", "tiny/mlp", *WORDS]
-    result = CliRunner().invoke(build(), [*words, "--runs", str(root / "runs"), "--json"])
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["seeds"] == 2
+    assert answer(*words, "--runs", str(root / "runs"))["seeds"] == 2
     return root
 
 
@@ -192,42 +188,20 @@ def test_what_is_refused_is_said_in_one_line_and_trains_nothing(
 ) -> None:
     shutil.rmtree(root / "runs" / "other")
     runs = ["--runs", str(root / "runs"), "--task", str(root / "other.toml")]
-    result = CliRunner().invoke(build(), ["run", *words, *runs])
-    assert isinstance(result.exception, QrlSuiteError), result.output
-    assert message in str(result.exception)
-    assert "\n" not in str(result.exception)
+    with pytest.raises(QrlSuiteError) as refused:
+        say("run", *words, *runs)
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
     assert not list(root.glob("runs/other/*/seed-*"))
 
 
 def test_running_statistics_are_no_beginning(trained: Path) -> None:
     task = trained / "running.toml"
-    task.write_text(RUNNING)
-    entry = resolve(str(task), "mlp width=4")
+    task.write_text(POLE.replace("steps = 30", 'steps = 30\nnormalization = "running"'))
+    entry = resolve(str(task), "reinforce mlp width=4")
     other = Trainer(entry, [1])
     with pytest.raises(OptionError, match="standardized by running statistics"):
         Trainer(entry, [0]).start(other.policy())
-
-
-RUNNING = """
-format_version = 1
-name = "running"
-summary = "CartPole with running statistics"
-default_algorithm = "reinforce"
-[environment]
-name = "cartpole"
-options = { normalization = "running" }
-[protocol]
-environments = 2
-interactions = 20
-[score]
-source = "return"
-max_return = 500
-[ranking]
-epsilons = [0.6]
-deltas = [0.5]
-reference = { epsilon = 0.6, delta = 0.5 }
-horizons = [20]
-"""
 
 
 def test_an_agent_that_is_gone_or_damaged_is_named(root: Path) -> None:
@@ -262,7 +236,7 @@ def test_it_is_not_published(root: Path) -> None:
         export(entry, root / "entries")
 
 
-def test_entries_without_agents_are_as_before(train: Callable[..., Path]) -> None:
+def test_entries_without_agents_are_as_before(train: Train) -> None:
     entry: Entry = EntryStore(train("runs", [0], 1)).entry()
     assert entry.start is None
     assert "from" not in json.dumps(entry.record())

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.commands import qrlsuite
+from tests.conftest import Train
 
 pytestmark = pytest.mark.usefixtures("forked_workers")
 ROOT = Path(__file__).parents[2]
@@ -37,7 +37,7 @@ def blocks() -> list[Any]:
 
 
 @pytest.fixture
-def results(train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def results(train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder of a user who has trained an entry of beam6g."""
     entry = train("runs", [0, 1])
     shutil.copytree(entry, tmp_path / "user" / "runs" / "beam6g" / "ENTRY")
@@ -45,7 +45,11 @@ def results(train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.Monk
     return tmp_path / "user"
 
 
-@pytest.mark.parametrize("text", blocks())
+BLOCKS = blocks()
+assert len(BLOCKS) >= 6
+
+
+@pytest.mark.parametrize("text", BLOCKS)
 def test_a_block_runs(text: str, results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
     exec(text, names)
@@ -67,11 +71,7 @@ def test_what_the_first_lines_print_is_below_them(
     assert capsys.readouterr().out == printed
 
 
-def test_there_are_blocks_to_run() -> None:
-    assert len(blocks()) >= 6
-
-
-def test_the_readmes_plugin_is_what_its_summary_says() -> None:
+def test_the_readmes_plugin_is_what_its_summary_says_and_conforms(tmp_path: Path) -> None:
     """RX of every input, RY of every weight, and a ring: each qubit has two CZs, the last one with the first."""
     text = (ROOT / "README.md").read_text()
     (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
@@ -82,11 +82,6 @@ def test_the_readmes_plugin_is_what_its_summary_says() -> None:
     gates = [(step.gate, step.wires) for step in circuit.operations]
     assert gates[:2] == [("RX", (0,)), ("RY", (0,))]
     assert [qubits for name, qubits in gates if name == "CZ"] == [(0, 1), (1, 2), (2, 3), (3, 0)]
-
-
-def test_the_readmes_plugin_is_a_file(tmp_path: Path) -> None:
-    text = (ROOT / "README.md").read_text()
-    (code,) = re.findall(rf"```python\n{OWN_FILE}(.*?)```", text, re.DOTALL)
     (tmp_path / "ring.py").write_text(code)
     checked = qrlsuite("check", "ansatz:ry-ring", "--plugin", "ring.py", cwd=tmp_path)
     assert checked.returncode == 0, checked.stdout + checked.stderr

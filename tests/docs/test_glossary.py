@@ -26,8 +26,7 @@ def test_there_are_ten_to_twenty_terms_each_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("term", "module"),
-    [(term, module) for term, _, modules in ROWS for module in modules.split("`, `")],
+    ("term", "module"), [(term, module) for term, _, modules in ROWS for module in modules.split("`, `")]
 )
 def test_a_term_is_found_where_the_glossary_says(term: str, module: str) -> None:
     found = importlib.util.find_spec(module)

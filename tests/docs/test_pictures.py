@@ -39,15 +39,13 @@ def test_a_picture_shows_the_entries_as_they_are_published_now(name: str) -> Non
     )
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_what_a_picture_shows_is_published(name: str) -> None:
-    for pattern in PUBLISHED[name].entries:
-        assert list((ROOT / "leaderboard").glob(f"{pattern}/[!.]*"))
-
-
-@pytest.mark.parametrize("name", pictures.PICTURES)
-def test_a_command_is_one_that_the_suite_understands(name: str) -> None:
-    assert parse(shlex.split(pictures.PICTURES[name].command)) == ""
+def test_pictures_show_what_is_published_by_commands_of_the_suite() -> None:
+    for picture in PUBLISHED.values():
+        assert all(list((ROOT / "leaderboard").glob(f"{pattern}/[!.]*")) for pattern in picture.entries), (
+            picture
+        )
+    for picture in pictures.PICTURES.values():
+        assert parse(shlex.split(picture.command)) == ""
 
 
 def test_a_mark_follows_the_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

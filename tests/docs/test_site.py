@@ -33,15 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("plugins", "tasks", "leaderboard"):
         (package / name).symlink_to(ROOT / name)
     env = {**os.environ, "QRLSUITE_DOCS_PACKAGE": str(package.parent), "NO_MKDOCS_2_WARNING": "1"}
-    words = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",
-        "--site-dir",
-        str(folder / "html"),
-    ]
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder / "html")]
     # not --quiet: it hides warnings from --strict too
     done = subprocess.run(
         words, cwd=ROOT, env=env, capture_output=True, text=True, check=False, timeout=HANGS

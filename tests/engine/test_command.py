@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ from qrlsuite.results import claims
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore
 from tests.commands import qrlsuite, start
-from tests.conftest import Hold, results
+from tests.conftest import Hold, Train, results
 
 QUEUE = "({command} >/dev/null 2>&1 &)"
 """Returns at once, as `qsub` does."""
@@ -89,7 +88,7 @@ def test_the_documented_templates_hand_the_command_on(program: str, tmp_path: Pa
 
 @pytest.mark.long
 def test_a_killed_worker_is_started_again_and_ctrl_c_reaches_one_that_no_process_leads_to(
-    train: Callable[..., Path], tiny_task: str, tmp_path: Path, hold: Hold
+    train: Train, tiny_task: str, tmp_path: Path, hold: Hold
 ) -> None:
     """In a folder whose name has a blank; what is left is trained by another engine."""
     queue = f'echo "{{i}} {{group}}" >> "{tmp_path}/started"; {QUEUE}'
@@ -117,7 +116,7 @@ def run(store: EntryStore, template: str, seeds: tuple[int, ...] = (5,)) -> api.
     return CommandEngine(CommandOptions(template)).run([work], lambda snapshot: None)
 
 
-def test_a_command_that_fails_is_named_by_what_it_says(train: Callable[..., Path]) -> None:
+def test_a_command_that_fails_is_named_by_what_it_says(train: Train) -> None:
     outcome = run(EntryStore(train("runs", [0], 1)), "echo 'no such queue: fast' >&2; exit 7 # {command}")
     (message,) = outcome.failed.values()
     assert (
@@ -125,7 +124,7 @@ def test_a_command_that_fails_is_named_by_what_it_says(train: Callable[..., Path
     )
 
 
-def test_seeds_of_another_worker_are_left_to_it(train: Callable[..., Path]) -> None:
+def test_seeds_of_another_worker_are_left_to_it(train: Train) -> None:
     store = EntryStore(train("runs", [0], 1))
     claim = claims.acquire(store, [5])
     (message,) = run(store, "{command}").taken.values()
@@ -134,7 +133,7 @@ def test_seeds_of_another_worker_are_left_to_it(train: Callable[..., Path]) -> N
 
 
 def test_a_command_that_never_begins_a_worker_ends_with_ctrl_c(
-    train: Callable[..., Path], caplog: pytest.LogCaptureFixture
+    train: Train, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One waits for a machine that does not answer, one has handed the worker to a queue."""
     store = EntryStore(train("runs", [0], 1))

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from qrlsuite.errors import QrlSuiteError
 from qrlsuite.plugins.engines.dask import DaskEngine, DaskLink, DaskOptions
 from qrlsuite.results.store import EntryStore
 from tests.commands import Command, qrlsuite, start
-from tests.conftest import TINY, most_epochs, results
+from tests.conftest import TINY, Train, most_epochs, results
 from tests.engine.stress import compare, undisturbed
 
 pytest.importorskip("distributed", reason="pip install 'qrlsuite[dask]'")
@@ -128,7 +128,7 @@ def test_killed_again_and_again(kills: int, task: Path, cluster: Cluster, tmp_pa
 
 
 def test_over_tls_from_python(
-    task: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    task: Path, train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By Dask's own settings."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
@@ -214,7 +214,7 @@ def start_without_suite(cluster: Cluster) -> subprocess.Popen[bytes]:
 
 
 def test_workers_of_another_version_or_without_the_suite_are_left_out_by_name(
-    task: Path, cluster: Cluster, train: Callable[..., Path], tmp_path: Path
+    task: Path, cluster: Cluster, train: Train, tmp_path: Path
 ) -> None:
     bare = start_without_suite(cluster)
     try:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from qrlsuite import registry, specs
-from qrlsuite.cli.app import build
 from qrlsuite.engine import api, local, where, worker
 from qrlsuite.engine.local import LocalEngine
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, StoreError, UnknownNameError
@@ -26,25 +22,17 @@ from qrlsuite.results import checkpoint, survey
 from qrlsuite.results.claims import _process_start, acquire
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, write_json
-from tests.commands import qrlsuite, start
-from tests.conftest import Hold, results
+from tests.commands import answer, qrlsuite, say, start, start_worker
+from tests.conftest import Hold, Train, results
 
 
 def test_engines_enter_by_the_door_of_plugins() -> None:
     assert {"local", "slurm"} <= set(registry.load().names(specs.EngineSpec))
     assert isinstance(where.build("local", {}), LocalEngine)
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "error", "message"),
-    [
-        ("lokal", {}, UnknownNameError, "unknown engine 'lokal'; did you mean 'local'"),
-        ("local", {"partition": "x"}, OptionError, "engine 'local' has no options, got partition"),
-    ],
-)
-def test_wrong_engines(name: str, given: dict[str, object], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        where.build(name, given)
+    with pytest.raises(UnknownNameError, match="unknown engine 'lokal'; did you mean 'local'"):
+        where.build("lokal", {})
+    with pytest.raises(OptionError, match="engine 'local' has no options, got partition"):
+        where.build("local", {"partition": "x"})
 
 
 def test_an_engine_of_an_earlier_version_is_told_what_run_takes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +75,7 @@ def test_times_that_are_none(text: str) -> None:
         build_options(SlurmOptions, {"time": text}, "engine 'slurm'")
 
 
-def test_slurm_that_is_not_there(train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slurm_that_is_not_there(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
     store = EntryStore(train("runs", [0], 1))
     monkeypatch.setenv("PATH", "")
@@ -105,9 +93,7 @@ def test_slurm_that_is_not_there(train: Callable[..., Path], monkeypatch: pytest
         engine.queued(store)
 
 
-def test_what_is_queued_is_left_to_the_queue(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_queued_is_left_to_the_queue(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
     store = EntryStore(train("runs", [0], 1))
     tasks = [{"job": "7_0", "seeds": [1, 2]}, {"job": "7_1", "seeds": [3]}, {"job": "6", "seeds": [4]}]
     write_json(store.path / "slurm" / "submitted.json", {"tasks": tasks})
@@ -116,7 +102,7 @@ def test_what_is_queued_is_left_to_the_queue(
     assert SlurmEngine(SlurmOptions()).queued(store) == {3, 4}
 
 
-def test_a_worker_started_twice_does_no_harm(train: Callable[..., Path]) -> None:
+def test_a_worker_started_twice_does_no_harm(train: Train) -> None:
     entry = train("runs", [0, 1])
     before = {seed: results(entry, seed) for seed in (0, 1)}
     stamps = {path: path.stat().st_mtime_ns for path in entry.glob("seed-*/*")}
@@ -127,21 +113,14 @@ def test_a_worker_started_twice_does_no_harm(train: Callable[..., Path]) -> None
     assert results(train("alone", [2]), 2) == results(entry, 2)
 
 
-def test_a_worker_whose_parent_is_gone_does_not_begin(train: Callable[..., Path]) -> None:
+def test_a_worker_whose_parent_is_gone_does_not_begin(train: Train) -> None:
     entry = train("runs", [0], 1)
-    arguments = [str(entry), "--seeds", "0:1", "--epochs", "2"]
-    program = (
-        "import os, sys; from qrlsuite.engine import worker\n"
-        f"sys.exit(worker.main({arguments!r} + ['--follow-parent', str(os.getppid() + 1)]))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], check=False)
-    assert done.returncode == 130
+    words = (str(entry), "--seeds", "0:1", "--epochs", "2", "--follow-parent", str(os.getpid()))
+    assert start_worker(*words).wait() == 130, "its parent is the process that it was forked from"
     assert EntryStore(entry).finished([0], 2) == set()
 
 
-def test_the_time_between_checkpoints_is_checked(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_time_between_checkpoints_is_checked(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = train("runs", [0], 1)
     monkeypatch.setenv("QRLSUITE_CHECKPOINT_SECONDS", "often")
     assert worker.main([str(entry), "--seeds", "0:1", "--epochs", "2"]) == 2
@@ -152,39 +131,35 @@ def test_local_workers_are_as_many_as_cores_or_as_asked() -> None:
     assert LocalEngine().workers(7) == 7
 
 
-def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(
-    train: Callable[..., Path],
-) -> None:
+def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(train: Train) -> None:
     entry = train("runs", [0, 1], 2)
     train("runs", [2], 1)
     store = EntryStore(entry)
     store.seed(2).write_record({"seed": 2, **store.names, "status": "running", "epochs": 1, "parameters": {}})
-    runs = str(entry.parent.parent)
+    runs = ("--runs", str(entry.parent.parent))
 
-    def say(*words: str) -> str:
-        return CliRunner().invoke(build(), [*words, "--runs", runs], catch_exceptions=False).output
+    def collect(*words: str) -> str:
+        return say("runs", "gc", *words, *runs).output
 
-    listed = json.loads(say("runs", "--json"))
-    assert listed[0]["seeds"] == {"finished": 2, "interrupted": 1}
-    assert listed[0]["epochs"] == [1, 2]
+    (listed,) = answer("runs", *runs)
+    assert listed["seeds"] == {"finished": 2, "interrupted": 1}
+    assert listed["epochs"] == [1, 2]
     before = results(entry, 0)
-    assert "would remove 1 checkpoint" in say("runs", "gc")
-    assert "can then not be extended" in say("runs", "gc")
+    assert "would remove 1 checkpoint" in collect()
+    assert "can then not be extended" in collect()
     assert len(checkpoint.headers(store)) == 2, "without --yes nothing is removed"
     held = acquire(store, [1])
-    assert "nothing to remove" in say("runs", "gc", "--yes"), (
-        "a group that is being extended keeps its checkpoint"
-    )
+    assert "nothing to remove" in collect("--yes"), "a group that is being extended keeps its checkpoint"
     held.release()
-    assert "freed" in say("runs", "gc", "--yes")
+    assert "freed" in collect("--yes")
     assert [header.seeds for header in checkpoint.headers(store)] == [(2,)], "unfinished groups keep theirs"
     assert results(entry, 0) == before
-    assert "nothing to remove" in say("runs", "gc")
+    assert "nothing to remove" in collect()
     with pytest.raises(StoreError, match="it cannot be extended"):
         train("runs", [0, 1], 3)
 
 
-def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_reads_our_own_files_only(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = train("runs", [0, 1], 1)
     store = EntryStore(entry)
     write_json(entry / "slurm" / "submitted.json", {"tasks": [{"job": "9_3", "seeds": [5, 6], "epochs": 3}]})
@@ -199,7 +174,7 @@ def test_status_reads_our_own_files_only(train: Callable[..., Path], monkeypatch
     claim.release()
 
 
-def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Callable[..., Path]) -> None:
+def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Train) -> None:
     store = EntryStore(train("runs", [0, 1], 1))
     for seed in (0, 1):
         store.seed(seed).write_record({"seed": seed, **store.names, "status": "running", "epochs": 1})
@@ -209,7 +184,7 @@ def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Calla
 
 
 def test_status_tells_what_waits_from_what_has_left_the_queue(
-    train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Task 9_1 was canceled before it began: only SLURM can know."""
     pytest.importorskip("submitit", reason="pip install 'qrlsuite[slurm]'")
@@ -221,29 +196,24 @@ def test_status_tells_what_waits_from_what_has_left_the_queue(
     squeue.write_text("#!/bin/sh\necho 9_0\n")
     squeue.chmod(0o755)
 
-    def say(*words: str) -> str:
-        command = ["runs", "--runs", str(entry.parent.parent), *words]
-        return CliRunner().invoke(build(), command, catch_exceptions=False).output
-
+    command = ("runs", "--runs", str(entry.parent.parent))
     monkeypatch.setenv("PATH", str(squeue.parent))
-    (row,) = json.loads(say("--json"))
+    (row,) = answer(*command)
     assert row["seeds"] == {"submitted": 2, "interrupted": 1, "finished": 1}
     assert row["queue_problem"] is None
     assert [(group["state"], group["seeds"]) for group in row["groups"]] == [
         ("submitted", [5, 6]),
         ("stopped", [7]),
     ]
-    assert "job 9_1 has left the queue  continued by the same `qrlsuite run`" in say()
+    assert "job 9_1 has left the queue  continued by the same `qrlsuite run`" in say(*command).output
     squeue.unlink()
-    (row,) = json.loads(say("--json"))
+    (row,) = answer(*command)
     assert row["seeds"] == {"submitted": 3, "finished": 1}, "our own files are believed"
     assert "squeue is not found" in row["queue_problem"]
-    assert "the queue was not asked, seeds may have left it: there is no SLURM on this machine" in say()
+    assert "seeds may have left it: there is no SLURM on this machine" in say(*command).output
 
 
-def test_squeue_is_asked_once_for_many_entries(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_squeue_is_asked_once_for_many_entries(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
     store = EntryStore(train("runs", [0], 1))
     write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "7_0", "seeds": [1]}]})
     asked = []
@@ -324,7 +294,7 @@ pathlib.Path.read_text, os.readlink, ctypes.CDLL = read_text, readlink, Library
 
 
 def test_a_killed_run_goes_on_where_the_system_lacks_what_linux_has(
-    hold: Hold, tiny_task: str, train: Callable[..., Path], tmp_path: Path
+    hold: Hold, tiny_task: str, train: Train, tmp_path: Path
 ) -> None:
     plugin = hold.site / "holding.py"
     plugin.write_text(WITHOUT_LINUX + plugin.read_text())

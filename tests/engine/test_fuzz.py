@@ -21,7 +21,7 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment.task import load
 from qrlsuite.results import store
-from tests.conftest import TINY
+from tests.conftest import TINY, trainer
 
 FEW = settings(
     max_examples=40,
@@ -71,15 +71,9 @@ def no_queue(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def entry(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An entry with a finished and an interrupted seed, a claim, a submitted task and a checkpoint."""
-    from qrlsuite.engine.worker import train_group
-    from qrlsuite.experiment.entry import resolve
-    from qrlsuite.options import parse_setting
-
     folder = tmp_path_factory.mktemp("fuzz")
     (folder / "tiny.toml").write_text(TINY)
-    made = resolve(str(folder / "tiny.toml"), "mlp", settings=[parse_setting("width=16")])
-    kept = store.EntryStore.create(folder / "runs", made)
-    train_group(kept.path, [0, 1], 2)
+    kept = store.EntryStore(trainer(str(folder / "tiny.toml"), folder)("runs", [0, 1], 2))
     kept.seed(1).cut(1)
     record = kept.seed(1).record() or {}
     store.write_json(
@@ -229,20 +223,6 @@ def test_task_files(tmp_path: Path, data: Any) -> None:
             content[:start] + data.draw(st.one_of(st.binary(max_size=8), st.just(b"nan"))) + content[stop:]
         )
     path.write_bytes(content)
-    _loads_or_is_refused(str(path), content)
-
-
-def _loads_or_is_refused(path: str, content: bytes) -> None:
-    try:
-        load(path)
-    except QrlSuiteError:
-        return
-    else:
-        tomllib.loads(content.decode())
-
-
-def test_a_task_file_is_not_accepted_whatever_it_holds(tmp_path: Path) -> None:
-    path = tmp_path / "x.toml"
-    path.write_text(TINY.replace("epochs = 3", "epochs = 'x'"))
-    with pytest.raises(QrlSuiteError, match="epochs"):
+    with contextlib.suppress(QrlSuiteError):
         load(str(path))
+        tomllib.loads(content.decode())

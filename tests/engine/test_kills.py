@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import TINY, most_epochs
-from tests.engine.stress import compare, disturbed, start_forked, undisturbed
+from tests.engine.stress import compare, disturbed, undisturbed
 
 ENDLESS = 1_000_000
 
@@ -19,7 +19,7 @@ def test_killed_again_and_again(kills: int, tmp_path: Path) -> None:
     task = tmp_path / "tiny.toml"
     task.write_text(TINY)
     runs, seeds = tmp_path / "killed", 3
-    killed = disturbed(task, runs, kills, random.Random(4), seeds, ENDLESS, 3, 0.3, start_forked)
+    killed = disturbed(task, runs, kills, random.Random(4), seeds, ENDLESS, 3, 0.3)
     assert killed["supervisor"] + killed["worker"] == kills
     (entry,) = (runs / "tiny").iterdir()
     epochs = most_epochs(entry) + 1

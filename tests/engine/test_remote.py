@@ -22,14 +22,13 @@ from qrlsuite.engine.where import Where
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf import collect
-from qrlsuite.options import parse_setting
 from qrlsuite.results import checkpoint, claims
 from qrlsuite.results.progress import ProgressFile
 from qrlsuite.results.seeds import SeedGroup
 from qrlsuite.results.store import EntryStore, read_lines
 from qrlsuite.training import remote_task
 from qrlsuite.training.remote_task import pack, unpack, work_on
-from tests.conftest import results
+from tests.conftest import Train, results
 
 EPOCHS = 4
 
@@ -42,7 +41,7 @@ def _short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def entry(tiny_task: str) -> Entry:
-    return resolve(tiny_task, "mlp", settings=[parse_setting("width=16")])
+    return resolve(tiny_task, "mlp width=16")
 
 
 @pytest.fixture
@@ -100,7 +99,7 @@ def edited(content: bytes, **changes: Any) -> bytes:
     return pack({**header, **changes}, arrays)
 
 
-def test_bytes_are_those_of_the_local_engine(store: EntryStore, train_locally: Callable[..., Path]) -> None:
+def test_bytes_are_those_of_the_local_engine(store: EntryStore, train_locally: Train) -> None:
     engine = Here()
     assert train(engine, store, [(0, 1), (2,)]) == EngineOutcome()
     assert engine.sent == 2 * EPOCHS, "one epoch each"
@@ -115,12 +114,12 @@ def test_bytes_are_those_of_the_local_engine(store: EntryStore, train_locally: C
 
 
 @pytest.fixture
-def train_locally(train: Callable[..., Path]) -> Callable[..., Path]:
+def train_locally(train: Train) -> Train:
     return train
 
 
 def test_local_and_remote_training_continue_each_other(
-    store: EntryStore, train_locally: Callable[..., Path], entry: Entry
+    store: EntryStore, train_locally: Train, entry: Entry
 ) -> None:
     train_locally("runs", [0, 1], 2)
     train(Here(), store, [(1,), (0,)], 3)
@@ -148,7 +147,7 @@ class Strange(Here):
 
 
 def test_an_answer_is_accepted_once_and_only_where_it_fits(
-    store: EntryStore, train_locally: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    store: EntryStore, train_locally: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(remote, "ATTEMPTS", 10)
     engine = Strange()
@@ -278,7 +277,7 @@ ALTERED_ARRAYS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ],
 )
 def test_an_altered_answer_costs_its_group_and_the_entry_stays_readable(
-    alter: Callable[[bytes], bytes], problem: str, store: EntryStore, train_locally: Callable[..., Path]
+    alter: Callable[[bytes], bytes], problem: str, store: EntryStore, train_locally: Train
 ) -> None:
     class Altering(Here):
         def answers(self, key: str, task: bytes) -> list[Answer]:
@@ -316,7 +315,7 @@ class Pair(Here):
 
 
 def test_a_second_worker_repeats_some_answers(
-    store: EntryStore, train_locally: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    store: EntryStore, train_locally: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(remote, "REPEATED", 3)
     engine = Pair()
@@ -356,7 +355,7 @@ def test_two_workers_that_disagree_end_their_group_alone(
 
 
 def test_answers_of_other_processors_say_nothing_about_each_other(
-    store: EntryStore, train_locally: Callable[..., Path]
+    store: EntryStore, train_locally: Train
 ) -> None:
     engine = Pair(alter_header(on_another_processor))
     assert train(engine, store, [(0,), (1,)], 2) == EngineOutcome()
@@ -432,7 +431,7 @@ def test_a_worker_of_other_versions_refuses_by_name() -> None:
 
 
 def test_what_an_environment_raises_is_said_and_what_was_finished_before_stays(
-    store: EntryStore, monkeypatch: pytest.MonkeyPatch, train_locally: Callable[..., Path]
+    store: EntryStore, monkeypatch: pytest.MonkeyPatch, train_locally: Train
 ) -> None:
     from qrlsuite.training.trainer import Trainer
 
@@ -517,9 +516,7 @@ def test_a_claim_that_was_taken_over_ends_the_run(store: EntryStore, monkeypatch
         train(Suspended(), store, [(0,)], 10_000)
 
 
-def test_a_full_disk_where_the_results_are(
-    disk: Path, entry: Entry, train_locally: Callable[..., Path]
-) -> None:
+def test_a_full_disk_where_the_results_are(disk: Path, entry: Entry, train_locally: Train) -> None:
     store = EntryStore.create(disk / "runs", entry)
     outcome = train(Here(), store, [(0, 1)])
     (message,) = outcome.failed.values()
@@ -530,7 +527,7 @@ def test_a_full_disk_where_the_results_are(
     assert [results(store.path, seed) for seed in (0, 1)] == [results(straight, seed) for seed in (0, 1)]
 
 
-def test_ctrl_c_keeps_what_was_accepted(store: EntryStore, train_locally: Callable[..., Path]) -> None:
+def test_ctrl_c_keeps_what_was_accepted(store: EntryStore, train_locally: Train) -> None:
     def show(snapshot: api.Snapshot) -> None:
         if any(state.get("epoch") == 2 for state in snapshot.values()):
             raise KeyboardInterrupt

@@ -9,20 +9,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import StoreError
 from qrlsuite.results import checkpoint, claims, store
 from qrlsuite.results.claims import SeedsClaimedError, acquire, living
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training.group import GroupRun
-from tests.commands import qrlsuite, start
-from tests.conftest import HANGS, TINY, Hold, results
+from tests.commands import qrlsuite, say, start
+from tests.conftest import HANGS, TINY, Hold, Train, results
 from tests.engine.stress import finished
 
 
@@ -37,13 +34,6 @@ def remount(disk: Path, option: str) -> None:
     subprocess.run(["mount", "-o", f"remount,{option}", str(disk)], check=True)
 
 
-def answer(*words: str) -> str:
-    """Run a command that trains nothing in this process; returns what it prints."""
-    result = CliRunner().invoke(build(), list(words), catch_exceptions=False)
-    assert result.exit_code == 0
-    return result.output
-
-
 def only_line(done: subprocess.CompletedProcess[str]) -> str:
     """The one line after the announcement of the run."""
     assert "Traceback" not in done.stderr, done.stderr
@@ -51,14 +41,14 @@ def only_line(done: subprocess.CompletedProcess[str]) -> str:
     return line
 
 
-def test_a_full_disk(disk: Path, words: list[str], train: Callable[..., Path]) -> None:
+def test_a_full_disk(disk: Path, words: list[str], train: Train) -> None:
     runs = ["--runs", str(disk / "runs"), "--workers", "1"]
     full = qrlsuite(*words, *runs, "--epochs", "60")
     assert full.returncode == 2
     assert "finished epochs are kept" in only_line(full)
     assert "No space left on device" in only_line(full)
     for command in ("runs", "leaderboard"):
-        answer(command, "--runs", str(disk / "runs"))
+        assert say(command, "--runs", str(disk / "runs")).exit_code == 0
     remount(disk, "size=20m")
     resumed = qrlsuite(*words, *runs, "--epochs", "60")
     assert resumed.returncode == 0, resumed.stderr
@@ -92,9 +82,9 @@ def test_a_read_only_folder(disk: Path, words: list[str]) -> None:
     assert other.returncode == 2
     assert "Read-only file system; the old file is unchanged" in only_line(other)
     for command in (["runs"], ["leaderboard"], ["runs", "gc"]):
-        answer(*command, *runs)
+        assert say(*command, *runs).exit_code == 0
     with pytest.raises(StoreError, match="Read-only file system"):
-        answer("runs", "gc", "--yes", *runs)
+        say("runs", "gc", "--yes", *runs)
 
 
 def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> None:
@@ -119,7 +109,7 @@ def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> N
 
 
 @pytest.fixture
-def entry(train: Callable[..., Path]) -> EntryStore:
+def entry(train: Train) -> EntryStore:
     return EntryStore(train("runs", [0], 1))
 
 
@@ -149,16 +139,7 @@ def test_another_machines_fresh_claim_is_respected(entry: EntryStore, age: float
 
 
 @pytest.mark.parametrize("age", [1000.0, 1e8, -1000.0, -1e8])
-def test_a_claim_that_nobody_refreshes_is_taken_over_whatever_its_time(
-    entry: EntryStore, age: float, quick: None
-) -> None:
-    path = elsewhere(entry, age)
-    acquire(entry, [0]).release()
-    assert not path.exists()
-
-
-@pytest.mark.parametrize("age", [1000.0, 1e8, -1000.0, -1e8])
-def test_a_claim_that_is_refreshed_is_kept_whatever_its_time(
+def test_a_claim_is_taken_over_unless_it_is_refreshed_whatever_its_time(
     entry: EntryStore, age: float, quick: None
 ) -> None:
     """The clock jumped: the holder refreshes, with the times of a clock that is wrong."""
@@ -169,6 +150,9 @@ def test_a_claim_that_is_refreshed_is_kept_whatever_its_time(
         acquire(entry, [0])
     beats.join()
     assert path.exists()
+    os.utime(path, (time.time() - age, time.time() - age))
+    acquire(entry, [0]).release()
+    assert not path.exists()
 
 
 def test_a_claim_of_this_machine_does_not_depend_on_any_clock(entry: EntryStore) -> None:
@@ -180,33 +164,22 @@ def test_a_claim_of_this_machine_does_not_depend_on_any_clock(entry: EntryStore)
     assert living(entry) == []
 
 
-def test_another_container_of_this_machine_is_judged_like_another_machine(
-    entry: EntryStore, quick: None
+@pytest.mark.parametrize(
+    "other", [{"namespace": "pid:[1]"}, {"machine": "another boot, another installation"}, {"machine": None}]
+)
+def test_a_copy_or_a_container_is_judged_like_another_machine(
+    other: dict[str, str | None], entry: EntryStore, quick: None
 ) -> None:
-    """Its process numbers mean nothing here: a number that is not running here says nothing about it."""
+    """A number that is not running here says nothing about its process; earlier versions wrote no machine."""
     claim = acquire(entry, [0])
-    content = json.loads(claim.path.read_text())
-    claim.path.write_text(json.dumps({**content, "namespace": "pid:[1]", "pid": 2**22}))
-    with pytest.raises(SeedsClaimedError):
-        acquire(entry, [0])
-
-
-@pytest.mark.parametrize("machine", ["another boot, another installation", None])
-def test_another_machine_of_the_same_name_is_judged_like_another_machine(
-    machine: str | None, entry: EntryStore, quick: None
-) -> None:
-    """Host name and process namespace are the same on machines that were copied; earlier versions knew no more."""
-    claim = acquire(entry, [0])
-    content = json.loads(claim.path.read_text()) | {"machine": machine, "pid": 2**22}
-    if machine is None:
-        del content["machine"]
-    claim.path.write_text(json.dumps(content))
+    content = json.loads(claim.path.read_text()) | other | {"pid": 2**22}
+    claim.path.write_text(json.dumps({k: v for k, v in content.items() if v is not None}))
     with pytest.raises(SeedsClaimedError):
         acquire(entry, [0])
 
 
 def test_two_process_namespaces_of_one_host_name_share_a_folder(
-    words: list[str], tmp_path: Path, train: Callable[..., Path], hold: Hold
+    words: list[str], tmp_path: Path, train: Train, hold: Hold
 ) -> None:
     """One holds the seeds and is killed, the other goes on; the bytes are those of one process."""
     inside = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"]
@@ -232,28 +205,23 @@ def test_two_process_namespaces_of_one_host_name_share_a_folder(
         assert results(entry, seed) == results(straight, seed)
 
 
-def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(entry: EntryStore) -> None:
-    answers = iter([True, False, False, False])
-    run = GroupRun(entry.entry(), entry, [0], 5, held=lambda: next(answers))
-    before = entry.seed(0).epochs()
-    with pytest.raises(StoreError, match="another worker has taken these seeds over"):
-        run.run()
-    assert len(entry.seed(0).epochs()) == len(before) + 1
-    assert [header.epoch for header in checkpoint.headers(entry)] == [1], "no checkpoint is overwritten"
-
-
-def test_a_worker_whose_seeds_were_taken_over_at_last_marks_none_as_finished(
-    train: Callable[..., Path],
+@pytest.mark.parametrize(
+    ("answers", "epochs", "saved"), [([True, False, False, False], 5, 1), ([True, True, False], 2, 2)]
+)
+def test_a_worker_whose_seeds_were_taken_over_writes_nothing_more(
+    answers: list[bool], epochs: int, saved: int, entry: EntryStore
 ) -> None:
-    entry = EntryStore(train("runs", [0], 1))
-    answers = iter([True, True, False])  # to the line of epoch 2, to its checkpoint, and to the end
-    run = GroupRun(entry.entry(), entry, [0], 2, held=lambda: next(answers))
+    """Asked before a line, a checkpoint and the end: what was written before stays, and no seed is finished."""
+    held = iter(answers)
+    run = GroupRun(entry.entry(), entry, [0], epochs, held=lambda: next(held))
     with pytest.raises(StoreError, match="another worker has taken these seeds over"):
         run.run()
+    assert len(entry.seed(0).epochs()) == 2
+    assert [header.epoch for header in checkpoint.headers(entry)] == [saved]
     assert (entry.seed(0).record() or {})["status"] == "running"
 
 
-def test_lines_of_two_workers_are_put_in_order_when_the_run_goes_on(train: Callable[..., Path]) -> None:
+def test_lines_of_two_workers_are_put_in_order_when_the_run_goes_on(train: Train) -> None:
     straight = train("straight", [0], 4)
     entry = EntryStore(train("runs", [0], 2))
     folder = entry.seed(0)
@@ -292,7 +260,7 @@ def test_a_folder_copied_while_it_was_at_work(words: list[str], tmp_path: Path) 
     assert waits.returncode == 0
     assert "2 seeds are being trained by" in waits.stderr
     assert "nothing is left to do here" in waits.stderr
-    assert "node17" in answer("runs", "--runs", str(tmp_path / "there"))
+    assert "node17" in say("runs", "--runs", str(tmp_path / "there")).output
     claim.unlink()
     assert qrlsuite(*more).returncode == 0
     assert store.finished([0, 1], 3) == {0, 1}

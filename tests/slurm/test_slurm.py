@@ -18,7 +18,7 @@ import pytest
 
 from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore
-from tests.conftest import TINY, results
+from tests.conftest import TINY, Train, results
 
 
 def _slurm() -> str | None:
@@ -94,15 +94,13 @@ def test_a_wrong_partition_is_slurms_own_message(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def longer_than_a_minute(train: Callable[..., Path]) -> int:
+def longer_than_a_minute(train: Train) -> int:
     """Epochs that take a task about 80 seconds here and now, so that it meets its limit of one minute."""
     store = EntryStore(train("measured", [0], 40))
     return int(80 / (store.seed(0).seconds() / 40))
 
 
-def test_canceled_killed_and_timed_out_tasks_all_finish_once(
-    tmp_path: Path, train: Callable[..., Path]
-) -> None:
+def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path, train: Train) -> None:
     """Eight groups: one canceled, one killed, one at its time limit; submitted again, everything is there once."""
     (tmp_path / "tiny.toml").write_text(TINY)
     epochs = longer_than_a_minute(train)

@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,10 +17,9 @@ from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.plugins.trackers import common
 from qrlsuite.results.store import EntryStore
 from tests.commands import start_worker
-from tests.conftest import Hold, most_epochs
+from tests.conftest import Hold, Train, most_epochs
 from tests.trackers.test_tensorboard import read as read_tensorboard
 
-Train = Callable[..., Path]
 Curves = dict[str, list[tuple[int, float]]]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ from qrlsuite.errors import QrlSuiteError, UnknownNameError
 from qrlsuite.plugins.trackers.tensorboard import TensorBoard
 from qrlsuite.testing.tracker import RECORD, RUN
 from qrlsuite.training import trackers
-
-Train = Callable[..., Path]
+from tests.conftest import Train
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, float]]]:
