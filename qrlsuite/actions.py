@@ -119,6 +119,15 @@ def size(space: spaces.Space[Any]) -> int:
     return int(np.prod(space.shape or (), dtype=np.int64))
 
 
+def choices(space: spaces.Space[Any]) -> list[int]:
+    """Return how many choices each number of an action has; none of a box."""
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    if isinstance(space, spaces.MultiDiscrete):
+        return [int(n) for n in space.nvec.reshape(-1)]
+    return [2] * size(space) if isinstance(space, spaces.MultiBinary) else []
+
+
 def from_units(units: NDArray[np.floating[Any]], space: spaces.Box) -> NDArray[Any]:
     """Map numbers in -1 .. 1 linearly to a box; what lies beyond is clipped, and NaN becomes the middle.
 

@@ -77,7 +77,11 @@ class Algorithm(Protocol):
         """Reset the environments. Called once for a new run; a resumed run calls `load_state_dict` instead."""
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
-        """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,)."""
+        """Interact for `rounds` steps of every environment, learn, and return metrics of shape (S,).
+
+        An algorithm that learns from data of its own, and steps nothing, has an attribute `offline` that is true.
+        Boards count its epochs in interactions like those of others.
+        """
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         """Return the actions of validation (S, B, ...) for observations (S, B, obs), in their space's shape and type.

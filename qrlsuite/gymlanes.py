@@ -43,7 +43,7 @@ class GymLanes(LaneEnv):
     shape and type of their space, see `qrlsuite.actions`. At an episode's end `infos["final_info"]` holds `score` (L,)
     where the environment's `info` does, and `metrics`, (L,) by name, where that is a dict of numbers. Where `info`
     holds an `action_mask` (choices,), 1 for what can be chosen, `infos["action_mask"]` is that of the returned
-    observations (L, choices).
+    observations (L, choices), and at an episode's end `infos["final_info"]` has that of the last one.
 
     Without autoreset, a lane whose episode has ended stays where it is: its steps return the last observation,
     reward 0, and neither termination nor truncation.
@@ -99,6 +99,10 @@ class GymLanes(LaneEnv):
         self.envs = [first, *(make(env_id, keywords) for _ in range(num_envs - 1))]
         batched_spaces(self, self._normalize.space, action_spaces.from_zero(self._action_space), num_envs)
         self.unflattened_space = self._raw_space if observe is None else None
+        if normalization != "none" and observe is None and isinstance(self._raw_space, spaces.Box):
+            ends = self._normalize.space.low, self._normalize.space.high
+            bottom, top = (end.reshape(self._raw_space.shape) for end in ends)
+            self.unflattened_space = spaces.Box(bottom, top, dtype=np.float32)
         limit = first.spec.max_episode_steps if first.spec is not None else None
         self.capacity = int(limit or UNLIMITED)
         self.streams = []
@@ -146,7 +150,7 @@ class GymLanes(LaneEnv):
         gymnasium.error.InvalidAction
             If an action is not one of the space.
         qrlsuite.errors.EnvironmentFailure
-            If an episode without a time limit gets too long to be checkpointed, or a mask leaves no action.
+            If an episode without a time limit gets too long to be checkpointed.
         """
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
@@ -281,12 +285,9 @@ class GymLanes(LaneEnv):
         """Return the masks of all lanes (L, choices) for infos; nothing where the environment has none."""
         if not self._masks:
             return {}
-        for lane, mask in self._masks.items():
-            if not mask.any() and not self._ended[lane]:
-                raise EnvironmentFailure(
-                    f"environment '{self.env_id}': info['action_mask'] leaves no action, and the episode goes on"
-                )
-        return {"action_mask": np.stack([self._masks[lane] for lane in range(self.num_envs)])}
+        masks = np.stack([self._masks[lane] for lane in range(self.num_envs)])
+        masks[self._ended] = 1  # what is chosen there means nothing
+        return {"action_mask": masks}
 
     def _finish(self, last: Mapping[int, dict[str, Any]], done: NDArray[np.bool_]) -> dict[str, Any]:
         """Report the episodes that have ended (`last`: their infos by lane), and begin the next ones."""
@@ -304,6 +305,8 @@ class GymLanes(LaneEnv):
             for lane, info in last.items():
                 for name, value in info.get("metrics", {}).items():
                     infos["final_info"]["metrics"][name][lane] = value
+        if self._masks:
+            infos["final_info"] |= self._mask_info()
         scored = {lane: info["score"] for lane, info in last.items() if "score" in info}
         if scored:
             score = np.full(self.num_envs, np.nan)

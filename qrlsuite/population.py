@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from qrlsuite.errors import PluginError
 from qrlsuite.options import per_agent
 
 NARROW = 16
@@ -83,11 +84,22 @@ def remembers(module: nn.Module) -> int:
 
 
 def remember(population: nn.Module, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-    """Return outputs (S, B, out) and the next state (S, B, M) for x (S, B, in); without a memory M is 0."""
+    """Return outputs (S, B, out) and the next state (S, B, M) for x (S, B, in); without a memory M is 0.
+
+    Raises
+    ------
+    PluginError
+        If the module returns no next state, or one of another shape.
+    """
     if not remembers(population):
         return population(x), state
-    outputs, after = population(x, state)
-    return outputs, after
+    result = population(x, state)
+    if not (isinstance(result, tuple) and len(result) == 2 and result[1].shape == state.shape):
+        raise PluginError(
+            f"a model with `remembers` = {remembers(population)} returns from forward(x, state) its outputs and the "
+            f"next state, (B, {remembers(population)}) like the one before: `return outputs, after`"
+        )
+    return result
 
 
 def unroll(population: nn.Module, seen: Tensor, begins: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

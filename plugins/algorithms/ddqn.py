@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
@@ -81,17 +82,21 @@ class DDQN:
         self.online = build_model(self.actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
-        # a transition is one row: observation, next observation, action, reward, 1 - terminated
-        self.columns = 2 * self.obs_dim + 3
-        self.buffer = torch.zeros((self.S, options.buffer, self.columns), device=device)
         self.stored = 0  # transitions ever stored, per seed
         self.epoch = 0
-        self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
+        self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
+
+    def _hold(self, observations: Tensor) -> None:
+        """Keep current observations, with masks behind them if there are any, and room for such transitions."""
+        self.observations, self.seen_dim = observations, observations.shape[2]
+        # a transition is one row: observation, next observation, action, reward, 1 - terminated
+        self.columns = 2 * self.seen_dim + 3
+        self.buffer = torch.zeros((self.S, self.options.buffer, self.columns), device=self.device)
 
     def start(self) -> None:
         """Reset the environments."""
-        first, _ = self.envs.reset()
-        self.observations = by_seed(first, self.S, self.device)
+        first, infos = self.envs.reset()
+        self._hold(masks.behind(by_seed(first, self.S, self.device), infos))
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
@@ -100,7 +105,10 @@ class DDQN:
         losses = torch.zeros(self.S, dtype=torch.float64, device=self.device)
         for k in range(rounds):
             greedy = self._greedy(self.observations)
-            actions = torch.where(explore[:, k], random_action[:, k], greedy)  # (S, E)
+            uniform = masks.drawn(
+                random_action[:, k], self.observations, self.obs_dim, self.streams, self.epoch, k
+            )
+            actions = torch.where(explore[:, k], uniform, greedy)  # (S, E)
             self._interact(actions)
             filled = min(self.stored, o.buffer)
             picked = (draws[:, k] * filled).to(torch.int64)  # (S, batch)
@@ -127,7 +135,7 @@ class DDQN:
         rows = torch.cat(
             [
                 self.observations,
-                by_seed(arrived(after, infos), self.S, self.device),
+                masks.behind(by_seed(arrived(after, infos), self.S, self.device), infos, arrived=True),
                 actions[..., None].to(torch.float32),
                 by_seed(rewards, self.S, self.device),
                 1.0 - by_seed(terminated, self.S, self.device),
@@ -137,11 +145,11 @@ class DDQN:
         places = (self.stored + torch.arange(self.E)) % self.options.buffer
         self.buffer[:, places] = rows
         self.stored += self.E
-        self.observations = by_seed(after, self.S, self.device)
+        self.observations = masks.behind(by_seed(after, self.S, self.device), infos)
 
     def _learn(self, picked: Tensor) -> Tensor:
         """Make one Adam step of every agent on its batch `picked` (S, batch); returns the losses (S,)."""
-        o, d = self.options, self.obs_dim
+        o, d = self.options, self.seen_dim
         offset = torch.arange(self.S, device=self.device)[:, None] * o.buffer
         batch = self.buffer.view(-1, self.columns)[(picked + offset).reshape(-1)].view(self.S, o.batch, -1)
         s, following = batch[..., :d].contiguous(), batch[..., d : 2 * d].contiguous()
@@ -151,9 +159,10 @@ class DDQN:
             batch[..., 2 * d + 2],
         )
         with torch.no_grad():
-            best = self.online(following).argmax(2, keepdim=True)
-            y = reward + o.gamma * alive * self.target(following).gather(2, best).squeeze(2)
-        error = self.online(s).gather(2, action).squeeze(2) - y  # (S, batch)
+            best = self._greedy(following)[..., None]
+            beyond = self.target(masks.observed(following, self.obs_dim))
+            y = reward + o.gamma * alive * beyond.gather(2, best).squeeze(2)
+        error = self.online(masks.observed(s, self.obs_dim)).gather(2, action).squeeze(2) - y  # (S, batch)
         losses = error.square().mean(1)
         self.adam.zero_grad()
         losses.sum().backward()
@@ -164,13 +173,16 @@ class DDQN:
         return detached
 
     @torch.no_grad()
-    def _greedy(self, observations: Tensor) -> Tensor:
-        values: Tensor = self.online(observations)
-        return values.argmax(2)
+    def _greedy(self, seen: Tensor) -> Tensor:
+        values = self.online(masks.observed(seen, self.obs_dim))
+        return masks.masked(values, seen, self.obs_dim).argmax(2)
 
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (S, B) for observations (S, B, obs)."""
-        result: NDArray[np.int64] = self._greedy(torch.from_numpy(observations).to(self.device)).cpu().numpy()
+    def act(
+        self, observations: NDArray[np.float32], infos: Mapping[str, Any] = masks.NOTHING
+    ) -> NDArray[np.int64]:
+        """Return the greedy actions (S, B) for observations (S, B, obs), none that `infos` forbid."""
+        seen = masks.behind(torch.from_numpy(observations).to(self.device), infos)
+        result: NDArray[np.int64] = self._greedy(seen).cpu().numpy()
         return result
 
     def policy_state(self) -> dict[str, Tensor]:
@@ -193,8 +205,8 @@ class DDQN:
         self.online.load_state_dict(part(state, "online"))
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
+        self._hold(state["observations"].clone().to(self.device))
         self.buffer.copy_(state["buffer"])
-        self.observations = state["observations"].clone().to(self.device)
         self.stored, self.epoch = (int(v) for v in state["counters"][0])
 
 

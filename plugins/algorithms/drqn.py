@@ -39,6 +39,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
@@ -95,15 +96,23 @@ class DRQN:
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
         self.L = options.burn_in + options.length
         self.capacity = max(options.buffer // self.E, self.L)  # rounds
-        # a row is one step: observation, where it arrived, action, reward, 1 - terminated, 1 where an episode begins
-        self.columns = 2 * self.obs_dim + 4
-        self.buffer = torch.zeros((self.S, self.E, self.capacity, self.columns), device=device)
         self.stored = 0  # rounds ever stored
         self.epoch = 0
-        self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
+        self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
         self.begins = torch.ones((self.S, self.E), device=device)
         self.remembered = self._nothing(self.E)
         self.validation = self._nothing(0)  # what is remembered in validation: no part of training
+
+    def _hold(self, observations: Tensor) -> None:
+        """Keep current observations, with masks behind them if there are any, and room for such steps."""
+        self.observations, self.seen_dim = observations, observations.shape[2]
+        # a row is one step: observation, where it arrived, action, reward, 1 - terminated, 1 where an episode begins
+        self.columns = 2 * self.seen_dim + 4
+        self.buffer = torch.zeros((self.S, self.E, self.capacity, self.columns), device=self.device)
+
+    def _best(self, values: Tensor, seen: Tensor) -> Tensor:
+        """Return the best actions (S, B) of values (S, B, actions), none that is forbidden."""
+        return masks.masked(values, seen, self.obs_dim).argmax(2)
 
     def _nothing(self, batch: int) -> Tensor:
         """Return what is remembered where episodes begin (S, batch, M)."""
@@ -111,8 +120,8 @@ class DRQN:
 
     def start(self) -> None:
         """Reset the environments."""
-        first, _ = self.envs.reset()
-        self.observations = by_seed(first, self.S, self.device)
+        first, infos = self.envs.reset()
+        self._hold(masks.behind(by_seed(first, self.S, self.device), infos))
         self.begins = torch.ones((self.S, self.E), device=self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
@@ -123,10 +132,14 @@ class DRQN:
         steps = 0
         for k in range(rounds):
             with torch.no_grad():
+                plain = masks.observed(self.observations, self.obs_dim)
                 values, self.remembered = remember(
-                    self.online, self.observations, self.remembered * (1.0 - self.begins)[..., None]
+                    self.online, plain, self.remembered * (1.0 - self.begins)[..., None]
                 )
-            self._interact(torch.where(explore[:, k], random_action[:, k], values.argmax(2)))
+            uniform = masks.drawn(
+                random_action[:, k], self.observations, self.obs_dim, self.streams, self.epoch, k
+            )
+            self._interact(torch.where(explore[:, k], uniform, self._best(values, self.observations)))
             for u in range(k * o.updates, (k + 1) * o.updates) if self.stored >= self.L else ():
                 losses += self._learn(self._sequences(draws[:, u]))
                 steps += 1
@@ -152,7 +165,7 @@ class DRQN:
         self.buffer[:, :, self.stored % self.capacity] = torch.cat(
             [
                 self.observations,
-                by_seed(arrived(after, infos), self.S, self.device),
+                masks.behind(by_seed(arrived(after, infos), self.S, self.device), infos, arrived=True),
                 actions[..., None].to(torch.float32),
                 by_seed(rewards, self.S, self.device),
                 1.0 - by_seed(terminated, self.S, self.device),
@@ -161,7 +174,7 @@ class DRQN:
             dim=2,
         )
         self.stored += 1
-        self.observations = by_seed(after, self.S, self.device)
+        self.observations = masks.behind(by_seed(after, self.S, self.device), infos)
         self.begins = by_seed(terminated | truncated, self.S, self.device)[..., 0]
 
     def _sequences(self, draws: Tensor) -> Tensor:
@@ -176,8 +189,8 @@ class DRQN:
 
     def _learn(self, rows: Tensor) -> Tensor:
         """Make one Adam step of every agent on its sequences (S, B, L, columns); returns the losses (S,)."""
-        o, d = self.options, self.obs_dim
-        seen, following = rows[..., :d], rows[..., d : 2 * d]
+        o, d = self.options, self.seen_dim
+        seen, following = rows[..., : self.obs_dim], rows[..., d : 2 * d]
         action, reward, alive, begins = (rows[..., 2 * d + i] for i in range(4))
         new = slice(o.burn_in, None)
         nothing = self._nothing(rows.shape[1])
@@ -190,10 +203,11 @@ class DRQN:
         values, states = unroll(self.online, seen[:, :, new], begins[:, :, new], start)
         flat = (self.S, rows.shape[1] * o.length, -1)
         with torch.no_grad():
-            beyond = following[:, :, new].reshape(flat)
+            masked = following[:, :, new].reshape(flat)
+            beyond = masks.observed(masked, self.obs_dim)
             best = remember(self.online, beyond, states.detach().reshape(*flat[:2], nothing.shape[2]))[0]
             least = remember(self.target, beyond, behind[:, :, new].reshape(*flat[:2], nothing.shape[2]))[0]
-            worth = least.gather(2, best.argmax(2, keepdim=True)).view(self.S, rows.shape[1], o.length)
+            worth = least.gather(2, self._best(best, masked)[..., None]).view(self.S, rows.shape[1], o.length)
             y = reward[:, :, new] + o.gamma * alive[:, :, new] * worth
         taken = values.gather(3, action[:, :, new].long()[..., None]).squeeze(3)
         losses = (taken - y).square().reshape(self.S, -1).mean(1)
@@ -215,13 +229,15 @@ class DRQN:
         ----------
         begins:
             Where an episode begins with the observation (S, B).
+        infos:
+            What the lanes said of it: nothing is chosen that they forbid.
         """
         going_on = torch.from_numpy(~begins).to(self.device)[..., None]
         if self.validation.shape[1] != begins.shape[1]:  # other lanes than before: their episodes begin
             self.validation = self._nothing(begins.shape[1])
         seen = torch.from_numpy(observations).to(self.device)
         values, self.validation = remember(self.online, seen, self.validation * going_on)
-        result: NDArray[np.int64] = values.argmax(2).cpu().numpy()
+        result: NDArray[np.int64] = self._best(values, masks.behind(seen, infos)).cpu().numpy()
         return result
 
     def policy_state(self) -> dict[str, Tensor]:
@@ -246,9 +262,10 @@ class DRQN:
         self.online.load_state_dict(part(state, "online"))
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
+        self._hold(state["observations"].clone().to(self.device))
         self.buffer.copy_(state["buffer"])
-        self.observations, self.begins, self.remembered = (
-            state[name].clone().to(self.device) for name in ("observations", "begins", "remembered")
+        self.begins, self.remembered = (
+            state[name].clone().to(self.device) for name in ("begins", "remembered")
         )
         self.stored, self.epoch = (int(v) for v in state["counters"][0])
 

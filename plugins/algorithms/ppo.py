@@ -61,7 +61,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite.actions import from_units, size
+from qrlsuite import masks
+from qrlsuite.actions import choices, from_units, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
@@ -122,12 +123,7 @@ class Choices:
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self.space = space
-        if isinstance(space, spaces.Discrete):
-            self.sizes = [int(space.n)]
-        elif isinstance(space, spaces.MultiDiscrete):
-            self.sizes = [int(n) for n in space.nvec.reshape(-1)]
-        else:
-            self.sizes = [2] * size(space)
+        self.sizes = choices(space)
         self.outputs, self.numbers = sum(self.sizes), len(self.sizes)
 
     def noise(self, generator: np.random.Generator, *shape: int) -> NDArray[np.float64]:
@@ -308,14 +304,18 @@ class PPO:
         self._validation: list[np.random.Generator] = []
         self.draws = options.validation == "sampled"
 
+    def _seen(self, observations: NDArray[Any], infos: Mapping[str, Any]) -> Tensor:
+        """Return observations of lanes (S, E, obs), with masks behind them if there are any and actions are choices."""
+        own = by_seed(observations, self.S, self.device)
+        return masks.behind(own, infos) if isinstance(self.policy, Choices) else own
+
     def _nothing(self, network: nn.Module, lanes: int) -> Tensor:
         """Return what a network remembers where episodes begin (S, lanes, M)."""
         return torch.zeros((self.S, lanes, remembers(network)), device=self.device)
 
     def start(self) -> None:
         """Reset the environments."""
-        first, _ = self.envs.reset()
-        self.observations = by_seed(first, self.S, self.device)
+        self.observations = self._seen(*self.envs.reset())
         self.begins = torch.ones((self.S, self.E), device=self.device)
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
@@ -326,7 +326,7 @@ class PPO:
         """
         rollout = self._collect(rounds)
         advantages, returns, critic_remembered = self._estimate(rollout)
-        states = rollout.states.reshape(-1, self.obs_dim)
+        states = rollout.states.flatten(0, 1)
         # one row per quantity and not one per sample: every minibatch column is then contiguous
         columns = torch.stack([rollout.log_probs, advantages, returns, rollout.begins]).view(4, -1)
         actions = rollout.actions.reshape(-1, self.policy.numbers)
@@ -342,7 +342,7 @@ class PPO:
                 *judged, begins = columns.index_select(1, picked).view(4, self.S, -1)
                 per_agent = (self.S, len(chosen) // self.S)
                 total += self._learn(
-                    states.index_select(0, picked).view(self.S, -1, self.obs_dim),
+                    states.index_select(0, picked).view(self.S, -1, states.shape[1]),
                     actions.index_select(0, picked).view(self.S, -1, self.policy.numbers),
                     *judged,
                     begins.view(*per_agent, length),
@@ -380,8 +380,8 @@ class PPO:
         for s, streams in enumerate(self.streams):
             drawn[s] = self.policy.noise(streams.numpy("exploration", self.epoch), rounds, self.E)
         noise = torch.from_numpy(drawn).to(self.device)
-        states = torch.empty((*shape, self.obs_dim), device=self.device)
-        arrivals = torch.empty_like(states)
+        states = torch.empty((*shape, self.observations.shape[2]), device=self.device)
+        arrivals = torch.empty((*shape, self.obs_dim), device=self.device)
         outputs = torch.empty((*shape, self.policy.outputs), device=self.device)
         begins = torch.empty(shape, device=self.device)
         chosen, remembered = [], []
@@ -391,11 +391,13 @@ class PPO:
             states[:, k], begins[:, k] = self.observations, self.begins
             remembered.append(self.actor_memory * (1.0 - self.begins)[..., None])
             with torch.no_grad():
-                outputs[:, k], self.actor_memory = remember(self.actor, self.observations, remembered[k])
+                plain = masks.observed(self.observations, self.obs_dim)
+                free, self.actor_memory = remember(self.actor, plain, remembered[k])
+                outputs[:, k] = masks.masked(free, self.observations, self.obs_dim)
                 chosen.append(self.policy.draw(outputs[:, k], noise[:, k]))
             lanes = self.policy.lanes(chosen[k].reshape(self.S * self.E, -1))
             after, reward, terminal, limit, infos = self.envs.step(lanes)
-            self.observations = by_seed(after, self.S, self.device)
+            self.observations = self._seen(after, infos)
             arrivals[:, k] = by_seed(arrived(after, infos), self.S, self.device)
             rewards[:, k] = np.reshape(reward, (self.S, self.E))
             terminated[:, k] = np.reshape(terminal, (self.S, self.E))
@@ -420,6 +422,7 @@ class PPO:
     def _estimate(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
         """Return A and R of the samples, both (S, N), and what the critic remembered before each (S, N, M)."""
         o, shape = self.options, rollout.rewards.shape
+        rollout = rollout._replace(states=masks.observed(rollout.states, self.obs_dim))
         if remembers(self.critic):
             values, following, remembered = self._values_in_order(rollout)
         else:
@@ -476,7 +479,7 @@ class PPO:
         Parameters
         ----------
         states:
-            (S, B, obs).
+            (S, B, obs), with masks behind them if there are any.
         actions:
             (S, B, numbers).
         old_log_probs, advantages, returns:
@@ -491,12 +494,14 @@ class PPO:
             Policy loss, value loss, entropy and divergence (4, S).
         """
         o = self.options
-        log_probs, entropies = self.policy.judge(_outputs(self.actor, states, *memory[:2]), actions)
+        plain = masks.observed(states, self.obs_dim)
+        free = masks.masked(_outputs(self.actor, plain, *memory[:2]), states, self.obs_dim)
+        log_probs, entropies = self.policy.judge(free, actions)
         log_ratio = log_probs - old_log_probs
         ratio = log_ratio.exp()
         a = _normalized(advantages)
         policy_loss = -torch.minimum(ratio * a, ratio.clamp(1.0 - o.clip, 1.0 + o.clip) * a).mean(1)
-        value_loss = (_outputs(self.critic, states, *memory[::2]).squeeze(2) - returns).square().mean(1)
+        value_loss = (_outputs(self.critic, plain, *memory[::2]).squeeze(2) - returns).square().mean(1)
         entropy = entropies.mean(1)
         losses = policy_loss + o.value_coefficient * value_loss - o.entropy_coefficient * entropy
         for adam in self.adams:
@@ -522,6 +527,8 @@ class PPO:
         ----------
         begins:
             Where an episode begins with the observation (S, B); None: everywhere.
+        infos:
+            What the lanes said of it: nothing is chosen that they forbid.
         """
         seen = torch.from_numpy(observations).to(self.device)
         if begins is None or self.validation_memory.shape[1] != seen.shape[1]:  # or other lanes than before
@@ -530,6 +537,8 @@ class PPO:
             going_on = torch.from_numpy(~begins).to(self.device)[..., None]
             self.validation_memory = self.validation_memory * going_on
         outputs, self.validation_memory = remember(self.actor, seen, self.validation_memory)
+        if isinstance(self.policy, Choices):
+            outputs = masks.masked(outputs, masks.behind(seen, infos or masks.NOTHING), self.obs_dim)
         if not self.draws:
             return self.policy.lanes(self.policy.best(outputs))
         if not self._validation:

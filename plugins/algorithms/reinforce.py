@@ -32,7 +32,7 @@ executions includes the empty slots, so `memory` should not be longer than episo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
@@ -124,17 +125,25 @@ class Reinforce:
         self.value = build_model(1).to(device) if options.baseline == "value" else None
         self.value_adam = None if self.value is None else Adam(self.value, options.lr, options.quantum_lr)
         self.epoch = 0
-        self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
-        # the steps of unfinished episodes, the last step in the last slot; a row is observation, action, reward
-        self.carried = torch.zeros((self.S, self.E, options.memory, self.obs_dim + 2), device=device)
+        self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
         self.lengths = torch.zeros((self.S, self.E), dtype=torch.int64)  # slots of `carried` in use
         # where an episode ended among them; none where episodes carry over
         self.carried_ends = torch.zeros(self.carried.shape[:3], dtype=torch.bool)
 
+    def _hold(self, observations: Tensor) -> None:
+        """Keep current observations, with masks behind them if there are any, and room for steps of the kind."""
+        self.observations, self.seen_dim = observations, observations.shape[2]
+        # the steps of unfinished episodes, the last step in the last slot; a row is observation, action, reward
+        shape = (self.S, self.E, self.options.memory, self.seen_dim + 2)
+        self.carried = torch.zeros(shape, device=self.device)
+
     def start(self) -> None:
         """Reset the environments."""
-        first, _ = self.envs.reset()
-        self.observations = by_seed(first, self.S, self.device)
+        first, infos = self.envs.reset()
+        seen = masks.behind(by_seed(first, self.S, self.device), infos)
+        if self.epoch == 0:
+            self._hold(seen)
+        self.observations = seen
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Collect `rounds` steps of every environment and make one update.
@@ -189,7 +198,7 @@ class Reinforce:
         Returns
         -------
         tuple
-            With T = memory + rounds slots: rows (S, E, T, obs + 2), whether an episode ended at a step (S, E, T),
+            With T = memory + rounds slots: rows (S, E, T, seen + 2), whether an episode ended at a step (S, E, T),
             whether it did by truncation (S, E, T), and where truncated steps arrived (S, E, rounds, obs).
         """
         memory, shape = self.options.memory, (self.S, self.E, self.options.memory + rounds)
@@ -197,14 +206,14 @@ class Reinforce:
         for s, streams in enumerate(self.streams):
             noise[s] = streams.numpy("exploration", self.epoch).gumbel(size=noise.shape[1:])
         gumbel = torch.from_numpy(noise).to(self.device)
-        rows = torch.zeros((*shape, self.obs_dim + 2), device=self.device)
+        rows = torch.zeros((*shape, self.seen_dim + 2), device=self.device)
         rows[:, :, :memory] = self.carried
         ended, cut = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
         ended[:, :, :memory] = self.carried_ends.numpy()
         final = torch.zeros((self.S, self.E, rounds, self.obs_dim), device=self.device)
         for k in range(rounds):
             with torch.no_grad():
-                actions = (self.policy(self.observations) + gumbel[:, k]).argmax(2)  # (S, E)
+                actions = (self._logits(self.observations) + gumbel[:, k]).argmax(2)  # (S, E)
             lanes = actions.reshape(-1).cpu().numpy()
             after, reward, terminated, truncated, infos = self.envs.step(lanes)
             slot = memory + k
@@ -217,8 +226,12 @@ class Reinforce:
                 arrived = by_seed(infos["final_obs"], self.S, self.device)
                 mask = torch.from_numpy(cut[:, :, slot, None]).to(self.device)
                 final[:, :, k] = torch.where(mask, arrived, final[:, :, k])
-            self.observations = by_seed(after, self.S, self.device)
+            self.observations = masks.behind(by_seed(after, self.S, self.device), infos)
         return rows, ended, cut, final
+
+    def _logits(self, seen: Tensor) -> Tensor:
+        """Return the policy's logits (S, B, actions), lowest where actions are forbidden."""
+        return masks.masked(self.policy(masks.observed(seen, self.obs_dim)), seen, self.obs_dim)
 
     @torch.no_grad()
     def _beyond(self, final: Tensor) -> FloatArray:
@@ -235,7 +248,7 @@ class Reinforce:
         Parameters
         ----------
         rows:
-            Observation and action of every slot (S, E, T, obs + 1).
+            Observation and action of every slot (S, E, T, seen + 1).
         returns:
             Reward-to-go (S, E, T).
         learned:
@@ -248,7 +261,7 @@ class Reinforce:
         baseline = (g * weight).sum(1, keepdims=True) if self.options.baseline == "mean" else 0.0
         columns = np.stack([weight, g - baseline]).astype(np.float32)
         w, advantage = torch.from_numpy(columns).to(self.device)  # (S, N) each, N = E x T
-        every = rows.reshape(self.S, -1, self.obs_dim + 1)
+        every = rows.reshape(self.S, -1, self.seen_dim + 1)
         self.adam.zero_grad()
         if self.value_adam is not None:
             self.value_adam.zero_grad()
@@ -278,14 +291,14 @@ class Reinforce:
         Parameters
         ----------
         states:
-            (S, B, obs).
+            (S, B, seen).
         actions, weights, advantages:
             (S, B); weights are 1/n, or 0 in slots that are not learned from.
         """
-        log_policy = torch.log_softmax(self.policy(states), -1).gather(2, actions[..., None]).squeeze(2)
+        log_policy = torch.log_softmax(self._logits(states), -1).gather(2, actions[..., None]).squeeze(2)
         value_loss = torch.zeros(self.S, device=self.device)
         if self.value is not None:
-            error = self.value(states).squeeze(2) - advantages
+            error = self.value(masks.observed(states, self.obs_dim)).squeeze(2) - advantages
             value_loss = (weights * error.square()).sum(1)
             advantages = -error.detach()
         loss = -(weights * advantages * log_policy).sum(1)
@@ -301,11 +314,13 @@ class Reinforce:
         rows = rows[:, :, -memory:]
         self.carried = torch.where(kept[..., None].to(self.device), rows, torch.zeros_like(rows))
 
-    def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (S, B) for observations (S, B, obs)."""
-        with torch.no_grad():
-            logits: Tensor = self.policy(torch.from_numpy(observations).to(self.device))
-        result: NDArray[np.int64] = logits.argmax(2).cpu().numpy()
+    @torch.no_grad()
+    def act(
+        self, observations: NDArray[np.float32], infos: Mapping[str, Any] = masks.NOTHING
+    ) -> NDArray[np.int64]:
+        """Return the greedy actions (S, B) for observations (S, B, obs), none that `infos` forbid."""
+        seen = masks.behind(torch.from_numpy(observations).to(self.device), infos)
+        result: NDArray[np.int64] = self._logits(seen).argmax(2).cpu().numpy()
         return result
 
     def policy_state(self) -> dict[str, Tensor]:
@@ -336,11 +351,11 @@ class Reinforce:
         if self.value is not None and self.value_adam is not None:
             self.value.load_state_dict(part(state, "value"))
             self.value_adam.load_state_dict(part(state, "value_adam"))
+        self._hold(state["observations"].clone().to(self.device))
         self.carried.copy_(state["carried"])
         self.lengths.copy_(state["lengths"])
         if self.options.epochs_per_update > 1:
             self.carried_ends.copy_(state["carried_ends"])
-        self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])
 
 

@@ -50,6 +50,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
+from qrlsuite import masks
 from qrlsuite.actions import from_units, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
@@ -147,17 +148,25 @@ class SAC:
                 ("temperature_adam", self.temperature),
             )
         }  # fmt: skip
-        self.replay = Replay(
-            self.S, options.buffer, device,
-            observation=self.obs_dim, arrived=self.obs_dim, action=1 if self.discrete else self.N, reward=1, alive=1,
-        )  # fmt: skip
         self.epoch = 0
-        self.observations = torch.zeros((self.S, self.E, self.obs_dim), device=device)
+        self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
+
+    def _hold(self, observations: Tensor) -> None:
+        """Keep current observations, with masks behind them if there are any, and room for such transitions."""
+        self.observations, seen = observations, observations.shape[2]
+        self.replay = Replay(
+            self.S, self.options.buffer, self.device,
+            observation=seen, arrived=seen, action=1 if self.discrete else self.N, reward=1, alive=1,
+        )  # fmt: skip
 
     def start(self) -> None:
         """Reset the environments."""
-        first, _ = self.envs.reset()
-        self.observations = by_seed(first, self.S, self.device)
+        self._hold(self._seen(*self.envs.reset()))
+
+    def _seen(self, observations: NDArray[Any], infos: Mapping[str, Any], arrived: bool = False) -> Tensor:
+        """Return observations of lanes (S, E, obs); of discrete actions with masks behind them if there are any."""
+        own = by_seed(observations, self.S, self.device)
+        return masks.behind(own, infos, arrived) if self.discrete else own
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds.
@@ -170,8 +179,10 @@ class SAC:
         total = torch.zeros((4, self.S), dtype=torch.float64, device=self.device)
         steps = 0
         for k in range(rounds):
-            ready = self.replay.stored >= o.warm_up
-            self._interact(self._draw(self.observations, explore[:, k]) if ready else uniform[:, k])
+            if self.replay.stored >= o.warm_up:
+                self._interact(self._draw(self.observations, explore[:, k]))
+            else:
+                self._interact(self._uniform(uniform[:, k], k))
             for u in range(k * o.updates, (k + 1) * o.updates) if self.replay.stored >= o.warm_up else ():
                 total += self._learn(self.replay.batch(draws[:, u]), noise[:, u])
                 steps += 1
@@ -214,12 +225,22 @@ class SAC:
         outputs = self.actor(observations)
         return outputs[..., : self.N], outputs[..., self.N :].clamp(*LOG_SPREAD)
 
+    def _uniform(self, drawn: Tensor, step: int) -> Tensor:
+        """Return uniform actions as they were drawn, of discrete ones (S, E, 1) those among the free."""
+        if not self.discrete:
+            return drawn
+        seen, inputs = self.observations, self.obs_dim
+        return masks.drawn(drawn[..., 0], seen, inputs, self.streams, self.epoch, step)[..., None]
+
+    def _logits(self, seen: Tensor) -> Tensor:
+        """Return the logits (S, B, N) of discrete actions, lowest where they are forbidden."""
+        return masks.masked(self.actor(masks.observed(seen, self.obs_dim)), seen, self.obs_dim)
+
     @torch.no_grad()
     def _draw(self, observations: Tensor, noise: Tensor) -> Tensor:
         """Draw actions (S, B, A) in -1 .. 1, or the numbers of discrete ones (S, B, 1)."""
         if self.discrete:
-            logits: Tensor = self.actor(observations)
-            return (logits + noise).argmax(2, keepdim=True)
+            return (self._logits(observations) + noise).argmax(2, keepdim=True)
         mean, log_spread = self._policy(observations)
         return torch.tanh(mean + noise * log_spread.exp())
 
@@ -230,12 +251,12 @@ class SAC:
         )
         self.replay.add(
             observation=self.observations,
-            arrived=by_seed(arrived(after, infos), self.S, self.device),
+            arrived=self._seen(arrived(after, infos), infos, arrived=True),
             action=chosen,
             reward=by_seed(rewards, self.S, self.device),
             alive=1.0 - by_seed(terminated, self.S, self.device),
         )
-        self.observations = by_seed(after, self.S, self.device)
+        self.observations = self._seen(after, infos)
 
     def _lanes(self, chosen: Tensor) -> NDArray[Any]:
         """Return actions (..., A) or (..., 1) as the environments take them."""
@@ -246,9 +267,10 @@ class SAC:
         """Return soft values V and entropies of states (S, B, obs) under the policy, both (S, B)."""
         alpha = self.temperature.log.detach().exp()[:, None]
         if self.discrete:
-            log_policy = torch.log_softmax(self.actor(observations), -1)
+            log_policy = torch.log_softmax(self._logits(observations), -1)
             policy = log_policy.exp()
-            least = torch.minimum(*(critic(observations) for critic in critics))
+            plain = masks.observed(observations, self.obs_dim)
+            least = torch.minimum(*(critic(plain) for critic in critics))
             entropy = -(policy * log_policy).sum(2)
             return (policy * least).sum(2) + alpha * entropy, entropy
         mean, log_spread = self._policy(observations)
@@ -267,7 +289,8 @@ class SAC:
             y = batch["reward"] + o.gamma * batch["alive"] * beyond[..., None]
         if self.discrete:
             picked = batch["action"].long()
-            values = [critic(states).gather(2, picked) for critic in self.critics]
+            plain = masks.observed(states, self.obs_dim)
+            values = [critic(plain).gather(2, picked) for critic in self.critics]
         else:
             taken = torch.cat([states, batch["action"]], 2)
             values = [critic(taken) for critic in self.critics]
@@ -290,11 +313,16 @@ class SAC:
         return torch.stack(seen).to(torch.float64)
 
     @torch.no_grad()
-    def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        """Return the most probable actions (S, B), or tanh of the means (S, B, ...), for observations (S, B, obs)."""
+    def act(
+        self, observations: NDArray[np.float32], infos: Mapping[str, Any] = masks.NOTHING
+    ) -> NDArray[Any]:
+        """Return the most probable actions (S, B), or tanh of the means (S, B, ...), for observations (S, B, obs).
+
+        None is chosen that `infos` forbid.
+        """
         seen = torch.from_numpy(observations).to(self.device)
         if self.discrete:
-            return self._lanes(self.actor(seen).argmax(2, keepdim=True))
+            return self._lanes(self._logits(masks.behind(seen, infos)).argmax(2, keepdim=True))
         return self._lanes(torch.tanh(self._policy(seen)[0]))
 
     def policy_state(self) -> dict[str, Tensor]:
@@ -317,9 +345,9 @@ class SAC:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
+        self._hold(state["observations"].clone().to(self.device))
         for name, each in self._parts().items():
             each.load_state_dict(part(state, name))
-        self.observations = state["observations"].clone().to(self.device)
         self.epoch = int(state["epoch"][0])
 
 

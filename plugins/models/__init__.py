@@ -10,7 +10,7 @@ from qrlsuite.specs import NO_MODEL, ModelSpec
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `gru`, `lstm`, `none`, and `vqc-`, `qlstm-` and `qfwp-BACKEND`."""
+    """Register `mlp`, `fourier`, `cnn`, `gru`, `lstm`, `none`, and `vqc-`, `qlstm-` and `qfwp-BACKEND`."""
     register(
         ModelSpec(
             name="mlp",
@@ -31,6 +31,15 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             build="qrlsuite.plugins.models.fourier:build",
             population="qrlsuite.plugins.models.fourier:population",
             memory="qrlsuite.plugins.models.fourier:memory",
+        )
+    )
+    register(
+        ModelSpec(
+            name="cnn",
+            summary="Convolutions and a hidden layer, for images; options: channels, depth, kernel, stride, width",
+            family="classical",
+            options="qrlsuite.plugins.models.cnn:CNNOptions",
+            build="qrlsuite.plugins.models.cnn:build",
         )
     )
     for name, unit in (("gru", "Gated recurrent unit"), ("lstm", "Long short-term memory")):

@@ -161,6 +161,26 @@ def require_same_code(runs: Path, entries: Sequence[Entry], where: Where, quiet:
             codes.require(store, code)
 
 
+def require_trainable(entries: Sequence[Entry], where: Where) -> None:
+    """Refuse what cannot be trained together, before anything is trained or handed to a queue: wrong actions, say.
+
+    Raises
+    ------
+    QrlSuiteError
+        Saying what goes instead; not where the environment is lacking here, and other machines train.
+    """
+    from qrlsuite.training import trainer  # imports torch
+
+    for entry in {entry.population_key: entry for entry in entries}.values():
+        try:
+            trainer.build_envs(entry, 1, lambda: None)
+        except QrlSuiteError:
+            if where.remote:
+                continue
+            raise
+        trainer.require_trainable(entry)
+
+
 class _TimeIsUp(Exception):
     """Ends an engine's work as Ctrl-C does."""
 
@@ -222,6 +242,8 @@ def train(
     codes.require(work.store, code)
     if certain(work.store):  # somebody has begun it, and maybe no seed says so yet
         codes.require_sent(work.store, code, socket.gethostname())
+    if work.groups:
+        require_trainable([work.entry], where)
     if not where.remote and work.groups:
         _check_device(where.device)
         check_memory(work, where)

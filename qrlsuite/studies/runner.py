@@ -13,7 +13,7 @@ from rich.text import Text
 
 from qrlsuite import registry, specs
 from qrlsuite.engine.display import RunDisplay
-from qrlsuite.engine.missing import find, require_same_code, train
+from qrlsuite.engine.missing import find, require_same_code, require_trainable, train
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.engine.where import Where
@@ -367,6 +367,7 @@ class Session:
         """
         if self._began is None:
             self._began = self.clock()
+        require_trainable([item.missing.entry for item in items if item.missing.groups], self.where)
         left_over = []
         order = cheapest_first(items)
         for number, first in enumerate(order, start=1):

@@ -19,7 +19,7 @@ from qrlsuite import specs
 from qrlsuite.actions import check_actions, size
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import SIZES, Checklist, Finding, one_thread, require
-from qrlsuite.testing.group import ROUNDS, E, ToyGroup, World, array, differs
+from qrlsuite.testing.group import ACTIONS, ROUNDS, E, ToyGroup, World, array, differs
 
 S = 5
 
@@ -34,9 +34,8 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
     """
     assert isinstance(subject.spec, specs.AlgorithmSpec)
     first, *others = subject.spec.actions
-    asks = inspect.signature(getattr(specs.resolve(subject.spec.factory), "act", len)).parameters.get(
-        "begins"
-    )
+    taken = inspect.signature(getattr(specs.resolve(subject.spec.factory), "act", len)).parameters
+    asks = taken.get("begins")
     optional = asks is not None and asks.default is None
     hidden = asks is not None and not optional
     if task is not None:
@@ -46,6 +45,9 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
         worlds = {f"{kind} actions": World.toy(kind) for kind in others}
         if optional:
             worlds["memory of episodes"] = World.toy(first, hidden=True)
+        if "infos" in taken and first == "discrete":
+            hidden = asks is not None and not optional
+            worlds["masks"] = World.toy(first, hidden=hidden, masked=True)
         for rule, world in worlds.items():
             findings += _check_more(subject, world, rule)
     return findings
@@ -99,7 +101,9 @@ def _check_more(subject: Subject, world: World, rule: str) -> list[Finding]:
     def all_of_it() -> None:
         for each in (_trains, _interactions, _acts, _learns, _independence, _state):
             each(trial)
-        if world.hidden:
+        if world.masked:
+            _heeds(trial)
+        elif world.hidden:
             _remembers(trial)
 
     with one_thread():
@@ -108,6 +112,9 @@ def _check_more(subject: Subject, world: World, rule: str) -> list[Finding]:
         if world.hidden:
             cause = "act(observations, begins=None, infos=None): begins is given where networks remember"
             looked_at = "with networks that remember, it trains, acts, learns and resumes, seeds apart"
+        if world.masked:
+            cause = "infos['action_mask'] says what can be chosen, and qrlsuite.masks keeps it behind observations"
+            looked_at = "nothing forbidden is chosen; it trains, acts, learns and resumes, seeds apart"
         rules.run(rule, looked_at, all_of_it, cause)
     return rules.findings
 
@@ -156,10 +163,14 @@ def _interactions(trial: Trial) -> None:
     group = trial.group(range(S)).start()
     for epoch in (1, 2):
         group.train()
+        if getattr(group.algorithm, "offline", False):
+            require(group.steps == 0, "the algorithm is `offline`, and steps the lanes in training")
+            continue
         require(
             group.steps == epoch * ROUNDS,
             f"after {epoch} epochs of {ROUNDS} rounds the lanes were stepped {group.steps} times: sample "
-            "complexity counts interactions, so an epoch is cut where its rounds end, also inside an episode",
+            "complexity counts interactions, so an epoch is cut where its rounds end, also inside an episode (an "
+            "algorithm that learns from data of its own, and steps nothing, says so by self.offline = True)",
         )
 
 
@@ -241,6 +252,18 @@ def _remembers(trial: Trial) -> None:
             other.shape == value.shape,
             f"policy '{name}' has shape {tuple(value.shape)} with {E} lanes and {tuple(other.shape)} with one: what is "
             "remembered of episodes is no part of a policy",
+        )
+
+
+def _heeds(trial: Trial) -> None:
+    """Where one action alone can be chosen, it is chosen."""
+    group = trial.group(range(S)).start()
+    group.train()
+    for number in range(ACTIONS):
+        mask = np.broadcast_to(np.arange(ACTIONS) == number, (S, 8, ACTIONS))
+        require(
+            bool((group.act(infos={"action_mask": mask}) == number).all()),
+            "act chooses what infos['action_mask'] forbids",
         )
 
 

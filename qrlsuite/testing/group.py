@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from qrlsuite import population, specs
 from qrlsuite.actions import check_actions
 from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.masks import NOTHING
 from qrlsuite.seeding import Streams, pack, unpack
 from qrlsuite.testing.common import Subject
 from qrlsuite.testing.findings import require
@@ -43,11 +44,14 @@ class Toy(LaneEnv):
     """Reward 1 for the action that the observation shows, part of it for a part; episodes of 2 to 10 steps.
 
     They are terminated or truncated. With `hidden`, an episode has one context, which only its first observation shows.
+    With `masked`, one of the discrete actions is forbidden, another at every other step, and never the best.
     """
 
-    def __init__(self, lanes: int, kind: str = "discrete", hidden: bool = False) -> None:
+    def __init__(
+        self, lanes: int, kind: str = "discrete", hidden: bool = False, masked: bool = False
+    ) -> None:
         batched_spaces(self, Box(0.0, 2.0, (OBS,)), SPACES[kind], lanes)
-        self.hidden = hidden
+        self.hidden, self.masked = hidden, masked
         self.streams = []
         self.begun = False
         self.kept = np.zeros((lanes, 4), dtype=np.int64)
@@ -62,6 +66,11 @@ class Toy(LaneEnv):
         if self.hidden:
             shown[self.kept[:, 0] > 0] = 0
         return np.column_stack([shown, self.kept[:, 0] / 10]).astype(np.float32)
+
+    def masks(self) -> dict[str, Any]:
+        """Return infos with what can be chosen now (L, actions); nothing without `masked`."""
+        forbidden = (self.kept[:, 2] + 1 + self.kept[:, 0] % 2) % ACTIONS
+        return {"action_mask": forbidden[:, None] != np.arange(ACTIONS)} if self.masked else {}
 
     def _rewards(self, taken: NDArray[Any]) -> NDArray[np.float64]:
         context, space = self.kept[:, 2], self.single_action_space
@@ -82,7 +91,7 @@ class Toy(LaneEnv):
         self.begun = True
         for lane in range(self.num_envs):
             self._begin(lane)
-        return self._observe(), {}
+        return self._observe(), self.masks()
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take actions (L, ...)."""
@@ -94,13 +103,13 @@ class Toy(LaneEnv):
             self.kept[:, 2] = [stream.integers(ACTIONS) for stream in self.streams]
         done = self.kept[:, 0] >= self.kept[:, 1]
         cut = self.kept[:, 3] == 1
-        final = self._observe()
+        final, last = self._observe(), self.masks()
         for lane in np.flatnonzero(done):
             self._begin(int(lane))
         infos: dict[str, Any] = {}
         if done.any():
-            infos = {"final_obs": final, "_final_obs": done, "final_info": {}, "_final_info": done}
-        return self._observe(), rewards, done & ~cut, done & cut, infos
+            infos = {"final_obs": final, "_final_obs": done, "final_info": last, "_final_info": done}
+        return self._observe(), rewards, done & ~cut, done & cut, {**infos, **self.masks()}
 
     def state_dict(self) -> State:
         """Return the lanes' state (L, 4)."""
@@ -132,6 +141,13 @@ def _require_actions(taken: NDArray[Any], envs: Toy) -> None:
         f"the environment was stepped with actions {taken.min()}..{taken.max()}, and there are {ACTIONS}: they "
         "count from 0",
     )
+    if envs.masked:
+        free = envs.masks()["action_mask"][np.arange(lanes), taken]
+        require(
+            bool(free.all()),
+            "the environment was stepped with actions that infos['action_mask'] forbids: exploring ones too are drawn "
+            "among the others (qrlsuite.masks)",
+        )
 
 
 @dataclass(frozen=True)
@@ -144,15 +160,18 @@ class World:
         Builds a number of lanes.
     hidden:
         Whether something has to be remembered, so that networks do.
+    masked:
+        Whether actions are forbidden.
     """
 
     make: Callable[[int], LaneEnv]
     hidden: bool = False
+    masked: bool = False
 
     @classmethod
-    def toy(cls, kind: str, hidden: bool = False) -> World:
+    def toy(cls, kind: str, hidden: bool = False, masked: bool = False) -> World:
         """Return the toy with a kind of actions."""
-        return cls(lambda lanes: Toy(lanes, kind, hidden), hidden)
+        return cls(lambda lanes: Toy(lanes, kind, hidden, masked), hidden, masked)
 
     @classmethod
     def of_task(cls, name: str) -> World:
@@ -267,7 +286,10 @@ class ToyGroup:
         return np.stack([s.numpy("look").random(size).astype(np.float32) for s in self.streams])
 
     def act(
-        self, observations: NDArray[np.float32] | None = None, begins: NDArray[np.bool_] | None = None
+        self,
+        observations: NDArray[np.float32] | None = None,
+        begins: NDArray[np.bool_] | None = None,
+        infos: Mapping[str, Any] = NOTHING,
     ) -> NDArray[Any]:
         """Return the greedy actions on observations (S, B, inputs), the fixed ones where none are given.
 
@@ -275,12 +297,15 @@ class ToyGroup:
         ----------
         begins:
             Where episodes begin (S, B), for an algorithm that asks; None: everywhere.
+        infos:
+            What lanes say of the observations, for an algorithm that asks.
         """
         seen = self.look() if observations is None else observations
         more: tuple[Any, ...] = ()
         if self.remembers:
-            more = np.ones(seen.shape[:2], np.bool_) if begins is None else begins, {}
-        chosen: NDArray[Any] = self.algorithm.act(seen, *more)
+            more = np.ones(seen.shape[:2], np.bool_) if begins is None else begins, infos
+        heeds = {"infos": infos} if infos and not more else {}
+        chosen: NDArray[Any] = self.algorithm.act(seen, *more, **heeds)
         return chosen
 
     @property

@@ -6,9 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
 from qrlsuite import own, specs
+from qrlsuite.actions import choices
 from qrlsuite.environment import LaneEnv, State, batched_spaces
 from qrlsuite.errors import EnvironmentFailure, PluginError, nearest
 from qrlsuite.experiment.task import ScoreSection
@@ -45,6 +47,7 @@ class MeteredEnv(LaneEnv):
         self.tick = tick
         batched_spaces(self, inner.single_observation_space, inner.single_action_space, inner.num_envs)
         self.unflattened_space = inner.unflattened_space
+        self._choices = choices(inner.single_action_space)
         self.returns = np.zeros(inner.num_envs)
         self.observe: Callable[[NDArray[np.float32]], None] | None = None
         self.measured: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {}
@@ -57,11 +60,13 @@ class MeteredEnv(LaneEnv):
         self.returns[:] = 0.0
         try:
             with self.fence.around(f"environment '{self.environment_name}', reset"):
-                return self.inner.reset(seed=seed, options=options)
+                observations, infos = self.inner.reset(seed=seed, options=options)
         except PluginError:
             raise
         except Exception as error:
             raise self._failure(error) from error
+        self._require_choice(infos)
+        return observations, infos
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step every lane."""
@@ -70,6 +75,10 @@ class MeteredEnv(LaneEnv):
                 observations, rewards, terminated, truncated, infos = self.inner.step(actions)
             if self.observe is not None:
                 self.observe(observations)
+        except InvalidAction as error:
+            raise PluginError(
+                f"environment '{self.environment_name}' was given what is no action of it: {error}"
+            ) from error
         except PluginError:
             raise
         except Exception as error:
@@ -80,8 +89,31 @@ class MeteredEnv(LaneEnv):
             self.finished.append((ended, self.returns[ended].copy(), self._scores(ended, infos)))
             self.returns[ended] = 0.0
             self._measure(ended, infos)
+        self._require_choice(infos)
+        if "action_mask" in infos and truncated.any() and "action_mask" not in infos.get("final_info", {}):
+            raise EnvironmentFailure(
+                f"environment '{self.environment_name}': a time limit ended an episode, and infos['final_info'] lacks "
+                "'action_mask', what could be chosen then"
+            )
         self.tick()
         return observations, rewards, terminated, truncated, infos
+
+    def _require_choice(self, infos: Mapping[str, Any]) -> None:
+        """Refuse masks of another shape, and one that leaves nothing to choose."""
+        if "action_mask" not in infos or not self._choices:
+            return
+        given = np.asarray(infos["action_mask"])
+        what = f"environment '{self.environment_name}': info['action_mask']"
+        if given.shape != (self.num_envs, sum(self._choices)):
+            raise EnvironmentFailure(
+                f"{what} has {given[0].size} numbers, and there are {sum(self._choices)} choices: give one for each, "
+                "1 where it can be chosen"
+            )
+        starts = np.cumsum([0, *self._choices[:-1]])
+        if not np.logical_or.reduceat(given != 0, starts, axis=1).all():
+            raise EnvironmentFailure(
+                f"{what} leaves no action, and the episode goes on: end it there (terminated), or allow an action"
+            )
 
     def _scores(self, ended: NDArray[np.int64], infos: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the scores of the episodes that have just ended in the lanes `ended`."""

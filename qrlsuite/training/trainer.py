@@ -113,20 +113,49 @@ def require_actions(entry: Entry, space: spaces.Space[Any]) -> None:
         )
     raise OptionError(
         f"algorithm '{entry.algorithm.name}' takes {' and '.join(entry.algorithm.actions)} actions, and those of "
-        f"environment '{entry.task.environment.name}' are {space}: {advice}"
+        f"task '{entry.task.name}' are {space}: {advice}"
     )
 
 
-def _that_remember(model: str) -> str:
-    """Say which algorithms train a model that remembers."""
-    known = registry.load()
+def require_trainable(entry: Entry) -> None:
+    """Refuse, by one agent that is built and not trained, what an algorithm, a model and a task cannot do together.
+
+    Raises
+    ------
+    QrlSuiteError
+        Saying what goes instead.
+    """
+    if entry.model.name == specs.NO_MODEL:
+        require_actions(entry, build_envs(entry, 1, lambda: None).single_action_space)
+        return
+    act = getattr(specs.resolve(entry.algorithm.factory), "act", len)
+    if population.remembers(first_network(entry)) and not asks_for_more(act):
+        raise _forgets(entry)
+
+
+def _no_network(entry: Entry) -> OptionError:
+    """Return the refusal of a model by an algorithm that builds no network when it is made."""
+    name, model = entry.algorithm.name, entry.model.name
+    return OptionError(
+        f"algorithm '{name}' builds no network, so that model '{model}' would say nothing: write "
+        f"'{name} {specs.NO_MODEL}'"
+    )
+
+
+def _forgets(entry: Entry) -> OptionError:
+    """Return the refusal of a model that remembers by an algorithm that does not tell it where episodes begin."""
+    model, known = entry.model.name, registry.load()
     found = [
         name
         for name in known.names(specs.AlgorithmSpec)
         if asks_for_more(getattr(specs.resolve(registry.get(specs.AlgorithmSpec, name).factory), "act", len))
     ]
-    return (
-        f"take one of {', '.join(found)}: qrlsuite run '{found[0]} {model}'" if found else "no algorithm does"
+    advice = (
+        f"take one of {', '.join(found)}: qrlsuite run '{found[0]} {model}'" if found else "none does not"
+    )
+    return OptionError(
+        f"model '{model}' remembers what it saw in an episode, and algorithm '{entry.algorithm.name}' would make it "
+        f"forget: {advice}"
     )
 
 
@@ -140,9 +169,7 @@ def first_network(entry: Entry) -> nn.Module:
     Raises
     ------
     OptionError
-        If the algorithm does not take the environment's actions.
-    PluginError
-        If it asks for no network.
+        If the algorithm does not take the environment's actions, or asks for no network.
     """
     envs = build_envs(entry, 1, lambda: None)
     require_actions(entry, envs.single_action_space)
@@ -161,7 +188,7 @@ def first_network(entry: Entry) -> nn.Module:
         except _FirstNetwork as found:
             outputs, inputs, role = found.args
         else:
-            raise PluginError(f"algorithm '{entry.algorithm.name}' builds no network when it is made")
+            raise _no_network(entry)
     with _building(entry.model), seeded(0):
         return build_agent(
             specs.resolve(entry.model.build),
@@ -230,16 +257,18 @@ def informed(policy: Policy) -> Callable[[NDArray[np.float32], NDArray[np.bool_]
     """
     if asks_for_more(policy):
         return policy
+    if asks_for_more(policy, "infos"):
+        return lambda observations, begins, infos: policy(observations, infos=infos)
     return lambda observations, begins, infos: policy(observations)
 
 
-def asks_for_more(function: Callable[..., Any]) -> bool:
-    """Tell whether a policy takes `begins` and `infos` too, and not observations alone."""
+def asks_for_more(function: Callable[..., Any], name: str = "begins") -> bool:
+    """Tell whether a policy takes more than observations: `begins` and then `infos`, or `infos` alone."""
     try:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # of another language
         return False
-    return any(each.name == "begins" or each.kind is inspect.Parameter.VAR_POSITIONAL for each in given)
+    return any(each.name == name or each.kind is inspect.Parameter.VAR_POSITIONAL for each in given)
 
 
 def play_episodes(envs: MeteredEnv, begin: Callable[[], Policy]) -> Episodes:
@@ -509,19 +538,13 @@ class Trainer:
             factory = specs.resolve(self.entry.algorithm.factory)
             own_options = population.joined([each.algorithm_options for each in self._entries])
             self.algorithm = factory(self.envs, self.models, own_options, self.streams, self.device)
-        name = self.entry.algorithm.name
         if not self.models.built and self.entry.model.name != specs.NO_MODEL:
-            raise OptionError(
-                f"algorithm '{name}' builds no network, so that model '{self.entry.model.name}' would say nothing: "
-                f"write '{name} {specs.NO_MODEL}'"
-            )
+            raise _no_network(self.entry)
         self._informed = asks_for_more(self.algorithm.act)
+        self._heeds = asks_for_more(self.algorithm.act, "infos")
         self._remembers = any(population.remembers(module) for module in self.models.built)
         if self._remembers and not self._informed:
-            raise OptionError(
-                f"model '{self.entry.model.name}' remembers what it saw in an episode, and algorithm '{name}' would "
-                f"make it forget: {_that_remember(self.entry.model.name)}"
-            )
+            raise _forgets(self.entry)
 
     @functools.cached_property
     def validation(self) -> MeteredEnv:
@@ -749,6 +772,7 @@ class Trainer:
         """
         stacked = np.ascontiguousarray(observations, np.float32)
         seen = stacked.reshape(self.S, len(stacked) // self.S, -1)
+        told = _by_seed(infos or {}, *seen.shape[:2])
         more: tuple[Any, ...] = ()
         if self._informed and begins is None:
             optional = inspect.signature(self.algorithm.act).parameters["begins"].default is None
@@ -756,10 +780,11 @@ class Trainer:
                 raise ValueError(
                     f"algorithm '{self.entry.algorithm.name}' remembers episodes: give act() where they begin"
                 )
-        elif self._informed and begins is not None:
-            more = begins.reshape(seen.shape[:2]), _by_seed(infos or {}, *seen.shape[:2])
+        if self._informed:
+            more = None if begins is None else begins.reshape(seen.shape[:2]), told
+        heeds = {"infos": told} if self._heeds and not self._informed else {}
         with self.fence.around(f"algorithm '{self.entry.algorithm.name}', act"):
-            actions: NDArray[Any] = self.algorithm.act(seen, *more)
+            actions: NDArray[Any] = self.algorithm.act(seen, *more, **heeds)
         shape = *seen.shape[:2], *(self.envs.single_action_space.shape or ())
         if np.shape(actions) != shape:
             raise PluginError(

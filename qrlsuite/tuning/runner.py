@@ -98,6 +98,7 @@ def _run(
     def train(entries: Sequence[Entry], seeds: Sequence[int], epochs: int) -> list[EntryStore]:
         nonlocal trained
         missing.require_same_code(runs / FOLDER, entries, where, display.console.quiet)
+        missing.require_trainable(entries, where)
         works = [missing.find(runs / FOLDER, entry, where, seeds, epochs) for entry in entries]
         for work in works:
             missing.check_memory(work, where)

@@ -16,7 +16,8 @@ from tests.algorithms.worlds import Clock, Contexts, Group, Perceptron, Table
 def tabular(transition: list[float]) -> DDQN:
     """One agent with two states and two actions, one transition in its buffer: s (2), s' (2), a, r, alive."""
     made: DDQN = Group("ddqn", [0], Contexts(1), batch=1, gamma=0.5, buffer=1).algorithm
-    made.obs_dim, made.columns = 2, 7
+    made.obs_dim = 2
+    made._hold(torch.zeros(1, 1, 2))
     made.online = Table(torch.tensor([[[0.5, -3.0], [1.0, 2.0]]]))
     made.target = Table(torch.tensor([[[7.0, 7.0], [10.0, 5.0]]]))
     made.adam = Adam(made.online, 1e-3, 1e-3)

@@ -186,6 +186,12 @@ GIVEN = {
     "tiny.toml": TINY + "[protocol.algorithm_epochs]\nppo = 30\n",
     "bar.toml": STUDY + 'kind = "bar"\n',
     "many.toml": STUDY + 'kind = "estimator"\nsettings = { runs = "many" }\n',
+    "mixed.toml": STUDY.partition("[[")[0]
+    + "".join(
+        f'[[entries]]\nname = "{task}"\ntask = "{task}"\nmodel = "mlp"\nalgorithm = "ddqn"\n'
+        for task in ("cartpole", "pendulum")
+    )
+    + '[[pictures]]\nname = "x"\nkind = "curves"\n',
     "episodes.toml": STUDY + 'kind = "histogram"\n',
     "nowhere.toml": STUDY + 'kind = "deployed"\nevaluation = { episodes = 3 }\n',
     "backend.toml": DEPLOYED.replace("B", "nativ").replace("V", "shots").replace("N", "9"),
@@ -227,6 +233,13 @@ run vqc-native qubits=21 --task beam6g => qubits = 21
 run vqc-native qubits=1 --task beam6g => needs 2 to 20
 run vqc-native gate=rott --task beam6g => gate = 'rott'
 run vqc-native ansatz=ipq --task beam6g => unknown ansatz 'ipq'; did you mean 'iqp'
+run 'ddqn mlp' --task pendulum => 'ddqn' takes discrete actions, and those of task 'pendulum' are Box(-2.0
+run 'td3 mlp' --task cartpole => 'td3' takes box actions, and those of task 'cartpole' are Discrete(2): take one of
+run mlp --task gym:tests.environments.strangers:Unbounded-v0 => has no bounds: state finite ones, gymnasium.spaces.Box
+run 'ddqn gru' --task cartpole => model 'gru' remembers what it saw in an episode, and algorithm 'ddqn' would make it
+run 'ddqn cnn' --task cartpole => model 'cnn' needs images, a Box of (height, width)
+run vqc-native qubits=4 linear=false --task pendulum => the circuit has 4 inputs and 4 expectation values, the actor 3
+study run mixed.toml => 'ddqn' takes discrete actions, and those of task 'pendulum' are Box(-2.0
 run mlp --task beam6g --minutes 3 => --minutes is gone: --budget 30min
 run mlp --task beam6g --preset x => --preset is gone: write it into the entry
 list modles => did you mean 'models'

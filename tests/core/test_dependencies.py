@@ -19,7 +19,7 @@ FOLDERS = {
 }
 TOP = {
     "actions", "algorithm", "cells", "environment", "errors", "files", "gymlanes", "hookspecs", "normalization",
-    "notation", "options", "own", "population", "registry", "replay", "seeding", "shortforms",
+    "masks", "notation", "options", "own", "population", "registry", "replay", "seeding", "shortforms",
     "specs",
 }  # fmt: skip
 """What a plugin or a user may import, beside `qrlsuite.api`."""

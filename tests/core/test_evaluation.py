@@ -225,7 +225,7 @@ def test_actions_need_not_be_discrete(walk: Entry) -> None:
     assert (again.returns == random.returns).all()
     with pytest.raises(
         OptionError,
-        match=r"'reinforce' takes discrete actions, and those of environment 'gym' are Box\(2.0, 3.0",
+        match=r"'reinforce' takes discrete actions, and those of task '.*' are Box\(2.0, 3.0",
     ):
         count_parameters(entry)
 

@@ -177,7 +177,9 @@ def test_a_quick_look_from_the_command_line(tmp_path: Path) -> None:
     assert wrong.returncode == 2
     assert not (tmp_path / "tmp" / "gym-pendulum-v1").exists() or not list((tmp_path / "tmp").rglob("seed-*"))
     assert wrong.stderr.count("qrlsuite: ") == 1
-    assert "'ddqn' takes discrete actions, and those of environment 'gym' are Box(-2.0, 2.0" in wrong.stderr
+    assert (
+        "'ddqn' takes discrete actions, and those of task 'gym-pendulum-v1' are Box(-2.0, 2.0" in wrong.stderr
+    )
 
 
 TASK = """

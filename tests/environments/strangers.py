@@ -10,6 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from pydantic.dataclasses import dataclass
 
+from qrlsuite import actions as action_spaces
+
 HERE = "tests.environments.strangers"
 
 
@@ -62,7 +64,8 @@ class Walk(gymnasium.Env[Any, Any]):
         return self._observe(), self._info()
 
     def _info(self) -> dict[str, Any]:
-        mask = np.array([self.steps % 2, 1, 1], np.int8) * (self.masked != "all")
+        choices = sum(action_spaces.choices(self.action_space)) or 3
+        mask = np.array([self.steps % 2, *[1] * (choices - 1)], np.int8) * (self.masked != "all")
         return {"action_mask": mask} if self.masked else {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
