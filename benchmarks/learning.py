@@ -1,16 +1,23 @@
-"""Learning on CartPole, side by side with Stable-Baselines3's DQN and PPO at equal settings.
+"""Learning on CartPole, side by side with Stable-Baselines3's DQN and PPO, and CleanRL's SAC, at equal settings.
 
     pip install 'qrlsuite[bench]'
-    python benchmarks/learning.py [--algorithms ddqn ppo] [--seeds 10] [--epochs 100] [--json out.json]
+    python benchmarks/learning.py [--algorithms ddqn ppo sac] [--seeds 10] [--epochs 100] [--json out.json]
 
 Every agent has the same network, learning rate, discount, batch, replay buffer, target updates, exploration and
 gradient steps per interaction; it learns from 10 environments, and every 1000 interactions it plays the same 100
-greedy episodes as its peers. Settings are those of the task's preset `tuned`, but for PPO's minibatches: 50 divides
-1000 samples, so that both make equally many. What Stable-Baselines3 does otherwise by default is switched to what the
-suite does: no clipping of gradients, constant exploration, no warm-up, ReLU and torch's own initialization, Adam's
-eps 1e-8. Two differences remain in its DQN and cannot be switched: targets are not double, and the error is
-Huber's; with several environments it also flips one coin for all of them where the suite flips one each. The third
-row, `SB3 DQN, our update`, is the same class with these three replaced, as the suite has them.
+greedy episodes as its peers. Settings of DDQN and PPO are those of the task's preset `tuned`, but for PPO's
+minibatches: 50 divides 1000 samples, so that both make equally many. What Stable-Baselines3 does otherwise by default
+is switched to what the suite does: no clipping of gradients, constant exploration, no warm-up, ReLU and torch's own
+initialization, Adam's eps 1e-8. Two differences remain in its DQN and cannot be switched: targets are not double, and
+the error is Huber's; with several environments it also flips one coin for all of them where the suite flips one each.
+The third row, `SB3 DQN, our update`, is the same class with these three replaced, as the suite has them.
+
+Discrete SAC (Christodoulou 2019) is held to the equations of CleanRL's `sac_atari.py` (commit 004f8a0), written out
+here for CartPole's network: the loss of its temperature is linear in alpha and not in log alpha, means of the actor's
+and the temperature's losses run over actions too, and one Adam serves both critics. Two gradient steps follow every
+step of the 10 environments, the learning rate is 1e-3, the target entropy 0.5 log 2, the copies follow by 0.005 a
+step, and 1000 uniform interactions come first. CleanRL's own settings are Atari's: 0.89 log n, and copies every 8000
+steps.
 
 Printed are medians over seeds and, in brackets, their 5th to 95th bootstrap percentiles (whole runs resampled, 10,000
 times): interactions until a mean score first reaches 0.5 and 0.95 of the optimum, the mean score of the whole curve,
@@ -21,6 +28,9 @@ ours minus theirs. One thread; all 10 seeds of the suite are trained together, t
 from __future__ import annotations
 
 import argparse
+import copy
+import functools
+import itertools
 import json
 import os
 import time
@@ -46,7 +56,11 @@ FloatArray = NDArray[np.float64]
 Act = Callable[[NDArray[np.float32]], NDArray[np.int64]]
 EPISODES, ENVIRONMENTS, INTERACTIONS = 100, 10, 1000
 THRESHOLDS: tuple[float, ...] = (0.5, 0.95)
-SETTINGS = {"ddqn": [], "ppo": ["batch=50"]}
+SETTINGS = {
+    "ddqn": [],
+    "ppo": ["batch=50"],
+    "sac": ["lr=1e-3", "batch=64", "updates=2", "warm_up=1000", f"target_entropy={0.5 * np.log(2):.6f}"],
+}
 
 
 class Runs:
@@ -228,6 +242,85 @@ def sb3_ppo(entry: Entry) -> Callable[[Any, int], Any]:
     return make
 
 
+class CleanSAC:
+    """One agent by the equations of CleanRL's discrete SAC, with the methods that `theirs` calls."""
+
+    def __init__(self, entry: Entry, environments: Any, seed: int) -> None:
+        torch.manual_seed(seed)
+        self.o, self.environments = entry.algorithm_options, environments
+        self.random = np.random.default_rng(seed)
+        width, depth = entry.model_options.width, entry.model_options.depth
+        self.actor, *critics = (self._network(width, depth) for _ in range(3))
+        self.critics = torch.nn.ModuleList(critics)
+        self.targets = copy.deepcopy(self.critics)
+        self.log_alpha = torch.zeros(1, requires_grad=True)
+        self.adams = [
+            torch.optim.Adam(parameters, lr=self.o.lr)
+            for parameters in (self.critics.parameters(), self.actor.parameters(), [self.log_alpha])
+        ]
+        self.rows = np.zeros((self.o.buffer, 11), np.float32)  # state, arrived, action, reward, terminated
+        self.stored = 0
+        self.seen = environments.reset()
+
+    @staticmethod
+    def _network(width: int, depth: int) -> torch.nn.Module:
+        sizes = [4, *[width] * depth]
+        layers = [[torch.nn.Linear(*pair), torch.nn.ReLU()] for pair in itertools.pairwise(sizes)]
+        return torch.nn.Sequential(*itertools.chain(*layers), torch.nn.Linear(width, 2))
+
+    def predict(self, observations: Any, deterministic: bool) -> tuple[NDArray[np.int64], None]:
+        """Return the most probable actions."""
+        with torch.no_grad():
+            return self.actor(torch.as_tensor(observations)).argmax(1).numpy(), None
+
+    def learn(self, interactions: int, reset_num_timesteps: bool) -> None:
+        """Interact and learn."""
+        for _ in range(interactions // ENVIRONMENTS):
+            if self.stored < self.o.warm_up:
+                actions = self.random.integers(2, size=ENVIRONMENTS)
+            else:
+                with torch.no_grad():
+                    logits = self.actor(torch.as_tensor(self.seen))
+                actions = torch.distributions.Categorical(logits=logits).sample().numpy()
+            after, rewards, done, infos = self.environments.step(actions)
+            arrived, cut = after.copy(), np.zeros(ENVIRONMENTS, np.bool_)
+            for lane in np.flatnonzero(done):
+                arrived[lane] = infos[lane]["terminal_observation"]
+                cut[lane] = infos[lane]["TimeLimit.truncated"]
+            places = (self.stored + np.arange(ENVIRONMENTS)) % len(self.rows)
+            self.rows[places] = np.column_stack([self.seen, arrived, actions, rewards, done & ~cut])
+            self.stored, self.seen = self.stored + ENVIRONMENTS, after
+            for _ in range(self.o.updates if self.stored >= self.o.warm_up else 0):
+                self._update()
+
+    def _step(self, which: int, loss: torch.Tensor) -> None:
+        self.adams[which].zero_grad()
+        loss.backward()
+        self.adams[which].step()
+
+    def _update(self) -> None:
+        picked = self.random.integers(min(self.stored, len(self.rows)), size=self.o.batch)
+        rows = torch.as_tensor(self.rows[picked])
+        states, arrived, action = rows[:, :4], rows[:, 4:8], rows[:, 8].long()[:, None]
+        alpha = self.log_alpha.exp().item()
+        with torch.no_grad():
+            log_pi = torch.log_softmax(self.actor(arrived), 1)
+            least = torch.minimum(*(target(arrived) for target in self.targets))
+            beyond = (log_pi.exp() * (least - alpha * log_pi)).sum(1)
+            y = rows[:, 9] + (1 - rows[:, 10]) * self.o.gamma * beyond
+        taken = [critic(states).gather(1, action).squeeze(1) for critic in self.critics]
+        self._step(0, sum(torch.nn.functional.mse_loss(value, y) for value in taken))  # type: ignore[arg-type]
+        log_pi = torch.log_softmax(self.actor(states), 1)
+        with torch.no_grad():
+            least = torch.minimum(*(critic(states) for critic in self.critics))
+        self._step(1, (log_pi.exp() * (alpha * log_pi - least)).mean())
+        short = (log_pi + self.o.target_entropy).detach()
+        self._step(2, (log_pi.exp().detach() * (-self.log_alpha.exp() * short)).mean())
+        with torch.no_grad():
+            for target, parameter in zip(self.targets.parameters(), self.critics.parameters()):
+                target.lerp_(parameter, self.o.tau)
+
+
 def draws(values: FloatArray, source: int, resamples: int = 10_000) -> FloatArray:
     """Return the medians of resamples of `values` (seeds,)."""
     picked = np.random.default_rng(source).integers(len(values), size=(resamples, len(values)))
@@ -261,7 +354,7 @@ def main() -> None:
     parser.add_argument("--algorithms", nargs="+", choices=sorted(SETTINGS), default=sorted(SETTINGS))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--epochs", type=int, default=100, help="of 1000 interactions each")
-    parser.add_argument("--preset", default="tuned", help="the task's preset that both learn with")
+    parser.add_argument("--preset", help="the preset of the task that both learn with")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another setting")
     parser.add_argument("--json", type=Path, help="also write every curve to this file")
     arguments = parser.parse_args()
@@ -269,9 +362,12 @@ def main() -> None:
     seeds, stored = range(arguments.seeds), {}
     for algorithm in arguments.algorithms:
         settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *arguments.set]]
-        entry = resolve("cartpole", "mlp", algorithm, settings, arguments.preset)
+        preset = arguments.preset or (None if algorithm == "sac" else "tuned")  # which has nothing for it
+        entry = resolve("cartpole", "mlp", algorithm, settings, preset)
         all_runs = [ours(entry, seeds, arguments.epochs)]
         peers: dict[str, Callable[[Any, int], Any]] = {"SB3 PPO": sb3_ppo(entry)}
+        if algorithm == "sac":
+            peers = {"CleanRL SAC": functools.partial(CleanSAC, entry)}
         if algorithm == "ddqn":
             peers = {"SB3 DQN": sb3_dqn(entry, False), "SB3 DQN, our update": sb3_dqn(entry, True)}
         all_runs += [theirs(name, make, entry, seeds, arguments.epochs) for name, make in peers.items()]

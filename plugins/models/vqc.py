@@ -7,11 +7,13 @@ layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as i
 et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
 
 What an algorithm asks for, logits, values, means and logarithms of spreads, are outputs like any other. Expectation
-values lie in -1 .. 1, and what is behind the circuit takes them elsewhere. Means are in halves of an action's range, or
-pass through a hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its
-learning rate per step: `output_rate = 100` gives what is behind the circuit 0.1 beside 0.001, as Skolik et al. have it.
-`critic = "mlp"` takes a perceptron for what estimates values, as Lan (2021, "Variational quantum soft actor-critic",
-arXiv:2112.11921), whose policy alone is hybrid: also where a critic is given (s, a), which the circuit may not fit.
+values lie in -1 .. 1, and what is behind the circuit takes them elsewhere. Means are in halves of an action's range,
+or pass through a hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its
+learning rate per step: in 20,000 steps of 0.001 four qubits and a bias come to 100 at most. `output_rate` is a factor
+on the learning rate of what is behind the circuit; Skolik et al. have 0.1 there, for Q-values, beside 0.001: a factor
+of 100. `critic = "mlp"` takes a perceptron for what estimates values, as Lan (2021, "Variational quantum soft
+actor-critic", arXiv:2112.11921), whose policy alone is hybrid: also where a critic is given (s, a), which the circuit
+may not fit.
 
 One module serves all backends; the models differ in which backend computes the circuit.
 """
