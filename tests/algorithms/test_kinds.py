@@ -15,12 +15,14 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from qrlsuite import masks, specs
+from qrlsuite import masks, registry, specs
 from qrlsuite.errors import EnvironmentFailure, OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.population import Adam, by_seed, gradients, part, prefixed
 from qrlsuite.seeding import Streams
-from qrlsuite.testing import check
+from qrlsuite.testing import algorithm, check
+from qrlsuite.testing.common import Subject
+from qrlsuite.testing.group import World
 from qrlsuite.training.trainer import Trainer
 from tests.environments.strangers import HERE
 
@@ -140,6 +142,15 @@ def test_masks_leave_something_to_choose(tmp_path: Path) -> None:
     outputs = torch.tensor([[[3.0, 9.0, float("-inf")]] * 200] * 2)
     assert masks.masked(outputs, seen, 1).argmax(2).unique().tolist() == [0]
     assert torch.softmax(masks.masked(outputs, seen, 1), 2)[..., 1].sum() == 0
+
+
+@pytest.mark.parametrize("broken", ["masked", "drawn"])
+def test_check_finds_an_algorithm_that_ignores_masks(broken: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(masks, broken, lambda values, *more: values)
+    subject = Subject(registry.get(specs.AlgorithmSpec, "ddqn"), None, (), {})
+    (finding,) = algorithm._check_more(subject, World.toy("discrete", masked=True), "masks")
+    assert not finding.ok
+    assert "infos['action_mask'] forbids" in finding.message
 
 
 @dataclass(frozen=True)
