@@ -64,12 +64,7 @@ ONES = np.ones((3, 2))
     ("inputs", "change", "options", "message"),
     [
         (ONES * np.nan, {}, {}, "inputs: every number must be finite"),
-        (
-            ONES,
-            {"weights": np.full((2, 2, 3), np.inf)},
-            {},
-            "parameter 'weights': every number must be finite",
-        ),
+        (ONES, {"weights": np.full((2, 2, 3), np.inf)}, {}, "parameter 'weights': every number must be finite"),
         (np.ones((3, 4)), {}, {}, r"inputs have shape \(3, 4\): this circuit needs \(batch, 2\)"),
         (np.ones(2), {}, {}, r"inputs have shape \(2,\)"),
         (np.ones((0, 2)), {}, {}, r"inputs have shape \(0, 2\)"),
@@ -79,14 +74,9 @@ ONES = np.ones((3, 2))
         (ONES, {"wieghts": 1.0}, {}, "no parameter 'wieghts'; did you mean 'weights'?"),
         (ONES, {"weights": np.ones(12)}, {}, r"'weights' has shape \(12,\), declared is \(2, 2, 3\)"),
         (ONES, {}, {"dtype": "float16"}, "dtype = float16: circuits are computed in float32 or float64"),
-        (
-            ONES,
-            {},
-            {"backend": "pennylane", "shot": 5},
-            "'pennylane' has no option 'shot'; did you mean 'shots'?",
-        ),
+        (ONES, {}, {"backend": "pennylane", "shot": 5}, "'pennylane' has no option 'shot'; did you mean 'shots'?"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_refused_with_what_is_wrong(circuit, parameters, inputs, change, options, message):
     given = {name: value for name, value in {**parameters, **change}.items() if value is not None}
     with pytest.raises(OptionError, match=message):
@@ -94,9 +84,7 @@ def test_bad_input_is_refused_with_what_is_wrong(circuit, parameters, inputs, ch
 
 
 def test_an_unknown_backend_names_the_nearest(circuit, parameters):
-    with pytest.raises(
-        UnknownNameError, match=r"unknown circuit backend 'penylane'; did you mean 'pennylane'\?"
-    ):
+    with pytest.raises(UnknownNameError, match="circuit backend 'penylane'; did you mean 'pennylane'"):
         expectations(circuit, ONES, parameters, backend="penylane")
 
 
@@ -114,9 +102,7 @@ def test_a_circuit_that_grew_is_computed_anew_and_the_old_content_as_before(back
     grown.append("RX", 0, grown.input(0))
     after = expectations(grown, [[0.3]], {}, backend=backend)
     fresh = expectations(one(), [[0.3]], {}, backend=backend)
-    assert [float(v) for v in (before, after, fresh)] == pytest.approx(
-        [np.cos(0.3), np.cos(0.6), np.cos(0.3)]
-    )
+    assert [before.item(), after.item(), fresh.item()] == pytest.approx(np.cos([0.3, 0.6, 0.3]))
 
 
 def test_what_is_measured_and_the_options_are_part_of_a_circuits_content():

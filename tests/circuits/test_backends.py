@@ -1,6 +1,5 @@
 """What every circuit backend must do, run on every registered ansatz and backend."""
 
-import functools
 import importlib
 import importlib.util
 import pkgutil
@@ -18,7 +17,6 @@ from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError
 from qrlsuite.options import field_names
 from qrlsuite.plugins.circuits.qiskit import QiskitBackend
-from qrlsuite.testing.dense import expectation_values
 from tests.testing.broken import assert_all_good
 
 BACKENDS = registry.load().names(specs.CircuitBackendSpec)
@@ -57,22 +55,13 @@ def assert_close(got, expected, tolerance):
         assert float((a - b).abs().max()) < tolerance
 
 
-@functools.cache
-def reference(name, gate, qubits):
-    circuit = ansatz(name, qubits, 2, **({} if gate is None else {"gate": gate}))
-    given = draw(circuit, 2, 1)
-    return circuit, given, evaluate(create_backend("pennylane", circuit), *given)
-
-
-@pytest.mark.parametrize(
-    ("backend", "qubits"),
-    [(name, qubits) for name in BACKENDS if name != "pennylane" for qubits in (2, 3, 5)],
-)
 @pytest.mark.parametrize(("name", "gate"), VARIANTS)
-def test_every_ansatz_on_every_backend_agrees_with_pennylane(backend, name, gate, qubits):
-    circuit, given, expected = reference(name, gate, qubits)
-    got = evaluate(create_backend(backend, circuit), *given)
-    assert_close(got, expected, 1e-10)
+def test_every_ansatz_on_every_backend_agrees_with_pennylane(name, gate):
+    circuit = ansatz(name, 3, 2, **({} if gate is None else {"gate": gate}))
+    given = draw(circuit, 2, 1)
+    expected = evaluate(create_backend("pennylane", circuit), *given)
+    for backend in BACKENDS:
+        assert_close(evaluate(create_backend(backend, circuit), *given), expected, 1e-10)
 
 
 @pytest.mark.parametrize(
@@ -83,28 +72,6 @@ def test_devices_pass_the_checks_of_backends(backend, options):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("gate", ["Rot", "U3"])
-@pytest.mark.parametrize("control", [None, 0])
-def test_constants_may_stand_beside_variable_angles(backend, gate, control):
-    circuit = Circuit(2)
-    w = circuit.parameter("w", (3,))
-    circuit.append("RY", 0, 0.8)
-    for variable in range(3):
-        circuit.append(gate, 1, *[w[k] if k == variable else 0.3 + k for k in range(3)], control=control)
-    parameters = {"w": torch.tensor([[0.2, 1.1, 2.3]], dtype=torch.float64, requires_grad=True)}
-    values = create_backend(backend, circuit)(torch.zeros(1, 1, 2, dtype=torch.float64), parameters)
-    values.sum().backward()
-    w = parameters["w"].detach().numpy()[0]
-
-    def total(w):
-        return expectation_values(circuit, np.zeros(2), {"w": w}).sum()
-
-    assert float(values.detach().sum()) == pytest.approx(total(w), abs=1e-10)
-    slopes = [(total(w + step) - total(w - step)) / 2e-5 for step in 1e-5 * np.eye(3)]
-    np.testing.assert_allclose(parameters["w"].grad[0].numpy(), slopes, atol=1e-8)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_circuit_without_variable_angles(backend):
     circuit = Circuit(1)
     circuit.append("X", 0)
@@ -112,17 +79,6 @@ def test_a_circuit_without_variable_angles(backend):
     values = create_backend(backend, circuit)(torch.zeros(2, 3, 1, dtype=torch.float64), {})
     assert values.shape == (2, 3, 1)
     assert_close([values], [torch.full((2, 3, 1), -np.cos(0.5), dtype=torch.float64)], 1e-12)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_float32_in_float32_out(backend):
-    circuit = ansatz("cz", 2, 1)
-    inputs, parameters, cotangent = draw(circuit, 1, 2)
-    single = {name: value.float() for name, value in parameters.items()}
-    got = evaluate(create_backend(backend, circuit), inputs.float(), single, cotangent.float())
-    assert {value.dtype for value in got} == {torch.float32}
-    expected = evaluate(create_backend("pennylane", circuit), inputs, parameters, cotangent)
-    assert_close(got, expected, 1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -139,8 +95,8 @@ def test_backends_survive_without_gradients(backend):
 
 
 @pytest.mark.parametrize("qubits", [2, 3, 4, 5, 6])
-@pytest.mark.parametrize("batch", [1, 16, 64])
-@pytest.mark.parametrize("name", ["iqp", "cx", "skolik"])
+@pytest.mark.parametrize("batch", [1, 64])
+@pytest.mark.parametrize("name", ["iqp", "skolik"])
 def test_a_seed_has_the_same_bits_at_every_place_of_pennylanes_broadcast(name, batch, qubits):
     circuit = ansatz(name, qubits, 2)
     backend = create_backend("pennylane", circuit)
@@ -163,14 +119,11 @@ def test_seeds_that_do_not_fit_in_memory_are_recomputed_with_the_same_bits(monke
     whole = evaluate(backend, *given)
     executed = []
     execute = backend.execute
-    monkeypatch.setattr(
-        backend, "execute", lambda angles, *rest: executed.append(rest) or execute(angles, *rest)
-    )
+    monkeypatch.setattr(backend, "execute", lambda *given: executed.append(given) or execute(*given))
     evaluate(backend, *given)
     assert len(executed) == 1
-    monkeypatch.setattr(
-        "qrlsuite.plugins.circuits.pennylane.MEMORY", 4 * (len(circuit) // 2) * 20 * 16 * 8 * 2
-    )
+    memory = 4 * (len(circuit) // 2) * 20 * 16 * 8 * 2
+    monkeypatch.setattr("qrlsuite.plugins.circuits.pennylane.MEMORY", memory)
     in_parts = evaluate(backend, *given)
     assert len(executed) == 1 + 2 * 3  # two seeds at a time, forward and backward
     assert all(torch.equal(a, b) for a, b in zip(whole, in_parts))
@@ -188,25 +141,8 @@ def test_shifts_that_do_not_fit_in_memory_are_executed_in_parts(monkeypatch):
 
 # Finite shots.
 
-SAMPLING = [
-    ("native", {}),
-    ("pennylane", {}),
-    ("pennylane", {"device": "lightning.qubit"}),
-    ("qiskit", {}),
-    ("qiskit", {"estimator": "aer"}),
-]
-
-
-@pytest.mark.parametrize(("backend", "options"), SAMPLING)
-def test_samples_scatter_about_the_exact_value(backend, options):
-    circuit = ansatz("iqp", 2, 1)
-    inputs, parameters, _ = draw(circuit, 1, 60)
-    exact = create_backend("pennylane", circuit)(inputs, parameters)
-    sampled = create_backend(backend, circuit, shots=400, **options)(inputs, parameters, [7])
-    error = (sampled - exact) * np.sqrt(400)  # 120 numbers of standard deviation sqrt(1 - exact^2), or 1
-    spread = torch.ones_like(exact) if (backend, options) == ("qiskit", {}) else torch.sqrt(1 - exact**2)
-    assert abs(float((error / spread).mean())) < 4 / np.sqrt(120)
-    assert 0.7 < float((error / spread).std()) < 1.3
+LIGHTNING, AER = {"device": "lightning.qubit"}, {"estimator": "aer"}
+SAMPLING = [("native", {}), ("pennylane", {}), ("pennylane", LIGHTNING), ("qiskit", {}), ("qiskit", AER)]
 
 
 @pytest.mark.parametrize(("backend", "options"), SAMPLING)
@@ -214,9 +150,8 @@ def test_sampled_gradients_scatter_about_the_exact_gradient(backend, options):
     circuit = ansatz("iqp", 2, 1)
     inputs, parameters, cotangent = draw(circuit, 1, 2)
     exact = evaluate(create_backend("pennylane", circuit), inputs, parameters, cotangent)
-    sampled = evaluate(
-        create_backend(backend, circuit, shots=20000, **options), inputs, parameters, cotangent, seeds=[3]
-    )
+    sampler = create_backend(backend, circuit, shots=20000, **options)
+    sampled = evaluate(sampler, inputs, parameters, cotangent, seeds=[3])
     for a, b in zip(sampled, exact):
         assert 0 < float((a - b).abs().max()) < 0.1
 
@@ -254,9 +189,8 @@ def test_sampling_leaves_global_random_numbers_alone():
 
     for backend, options in SAMPLING:
         before = state()
-        evaluate(
-            create_backend(backend, circuit, shots=20, **options), inputs, parameters, cotangent, seeds=[1]
-        )
+        sampler = create_backend(backend, circuit, shots=20, **options)
+        evaluate(sampler, inputs, parameters, cotangent, seeds=[1])
         assert all(np.array_equal(a, b) for a, b in zip(before, state()))
 
 
@@ -398,29 +332,6 @@ def test_qiskits_spsa_is_an_unbiased_guess():
     x = torch.full((1, 1, 1), 0.7, dtype=torch.float64, requires_grad=True)
     create_backend("qiskit", circuit, gradient="spsa")(x, {}, [1]).sum().backward()
     assert float(x.grad) == pytest.approx(-np.sin(0.7), abs=1e-4)  # one angle: SPSA is a central difference
-
-
-def test_aer_is_exact_and_loses_contrast_under_noise():
-    circuit = ansatz("iqp", 2, 1, gate="u3")
-    given = draw(circuit, 1, 1)
-    expected = evaluate(create_backend("pennylane", circuit), *given)
-    assert_close(evaluate(create_backend("qiskit", circuit, estimator="aer"), *given), expected, 1e-10)
-    noisy = {"estimator": "aer", "noise_model": "depolarizing"}
-    got = evaluate(create_backend("qiskit", circuit, **noisy, noise_rate=0.0), *given)
-    assert_close(got, expected, 1e-10)
-    weaker = create_backend("qiskit", circuit, **noisy, noise_rate=0.2)(given[0], given[1])
-    assert float(weaker.abs().max()) < float(expected[0].abs().max())
-
-
-@pytest.mark.parametrize("shots", [None, 20000])
-def test_qiskits_readout_errors_shrink_expectation_values(shots):
-    circuit = Circuit(1)
-    circuit.append("RY", 0, circuit.input(0))
-    x = torch.tensor([[[0.0], [np.pi], [1.0]]], dtype=torch.float64)
-    noise = {"estimator": "aer", "noise_model": "depolarizing", "noise_rate": 0.0, "readout_error": 0.1}
-    values = create_backend("qiskit", circuit, shots=shots, **noise)(x, {}, [1])
-    tolerance = 1e-12 if shots is None else 4 / np.sqrt(20000)
-    assert_close([values], [0.8 * torch.cos(x)], tolerance)
 
 
 @pytest.mark.parametrize("shots", [None, 1000])

@@ -34,16 +34,6 @@ def values(circuit: Circuit, leaves: list[Tensor], backend: str = "native") -> T
     return create_backend(backend, circuit)(leaves[0], dict(zip(circuit.parameters, leaves[1:])))
 
 
-@pytest.mark.parametrize("backend", ["native", "pennylane", "qiskit"])
-@pytest.mark.parametrize("gate", GATES)
-def test_separable_agrees_with_dense_matrices_on_every_backend(gate: str, backend: str) -> None:
-    circuit = ansatz("iqp", 3, 3, gate=gate, entangled="separable")
-    leaves = given(circuit, 1, 2)
-    parameters = {name: p[0].numpy() for name, p in zip(circuit.parameters, leaves[1:])}
-    expected = [expectation_values(circuit, x, parameters) for x in leaves[0][0].numpy()]
-    np.testing.assert_allclose(values(circuit, leaves, backend)[0], expected, rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize("gate", GATES)
 def test_separable_is_the_same_for_all_structures(gate: str) -> None:
     """A gate on its own qubit, H between layers: written down for two qubits and two layers."""
@@ -105,19 +95,6 @@ def test_mean_field_by_hand() -> None:
     assert expectations(circuit, [[a, 0.0]], {})[0, 0] == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    "circuit",
-    [
-        ansatz("iqp", 3, 2, gate="u3", entangled="mean-field"),
-        every_gate(mean_field=True),
-    ],
-    ids=["iqp", "every gate"],
-)
-def test_gradients_of_mean_fields_are_those_of_finite_differences(circuit: Circuit) -> None:
-    leaves = [leaf.requires_grad_() for leaf in given(circuit, 2, 3)]
-    assert torch.autograd.gradcheck(lambda *leaves: values(circuit, list(leaves)), leaves)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_a_seed_of_a_mean_field_does_not_depend_on_its_company(
     dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
@@ -169,13 +146,9 @@ def test_backends_that_run_circuits_refuse_mean_fields(backend: str) -> None:
 
 
 def test_the_circuit_and_its_mean_field_are_prepared_apart() -> None:
-    arguments = (
-        [[0.3, 0.4]],
-        {name: np.full(p.shape, 0.7) for name, p in ansatz("cz", 2, 3).parameters.items()},
-    )
-    apart = [
-        expectations(ansatz("cz", 2, 3, entangled=e), *arguments) for e in (True, "separable", "mean-field")
-    ]
+    parameters = {name: np.full(p.shape, 0.7) for name, p in ansatz("cz", 2, 3).parameters.items()}
+    circuits = [ansatz("cz", 2, 3, entangled=e) for e in (True, "separable", "mean-field")]
+    apart = [expectations(circuit, [[0.3, 0.4]], parameters) for circuit in circuits]
     for a, b in itertools.combinations(apart, 2):
         assert float((a - b).abs().max()) > 1e-3
 

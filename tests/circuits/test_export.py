@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from qiskit.quantum_info import SparsePauliOp, Statevector
-from typer.testing import CliRunner
 
 from qrlsuite.circuit import Circuit, ansatz, expectations
 from qrlsuite.circuit.export import FORMATS, export
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.testing.circuits import every_gate
 from tests.circuits.test_products import rich
+from tests.commands import say
 
 CIRCUITS = [every_gate, rich, lambda: ansatz("iqp", 3, 1), lambda: ansatz("iqp", 2, 1, gate="u3")]
 
@@ -71,10 +70,8 @@ def test_the_qasm3_text(make: Any) -> None:
     for name, array in parameters.items():
         given |= {"_".join([name, *map(str, index)]): array[index] for index in np.ndindex(array.shape)}
     flat = {parameter: given[parameter.name] for parameter in read.parameters}
-    observables = [
-        SparsePauliOp.from_sparse_list([("Z" * len(qubits), qubits, 1.0)], circuit.qubits)
-        for qubits in circuit.measured
-    ]
+    words = ([("Z" * len(qubits), qubits, 1.0)] for qubits in circuit.measured)
+    observables = [SparsePauliOp.from_sparse_list(word, circuit.qubits) for word in words]
     np.testing.assert_allclose(values(read.assign_parameters(flat), observables), expected, atol=1e-12)
 
 
@@ -85,30 +82,22 @@ def test_a_small_circuit_by_hand() -> None:
     circuit.append("RZ", 1, math.pi, control=0)
     circuit.measure([(0, 1)])
     assert export(circuit, "qasm3").splitlines() == [
-        "OPENQASM 3.0;",
-        'include "stdgates.inc";',
-        "// observables: Z_0*Z_1",
-        "input float[64] x_0;",
-        "input float[64] w_0_0;",
-        "input float[64] w_0_1;",
-        "qubit[2] q;",
-        "rx(w_0_1 * x_0 + 0.5) q[0];",
+        "OPENQASM 3.0;", 'include "stdgates.inc";', "// observables: Z_0*Z_1", "input float[64] x_0;",
+        "input float[64] w_0_0;", "input float[64] w_0_1;", "qubit[2] q;", "rx(w_0_1 * x_0 + 0.5) q[0];",
         f"crz({math.pi}) q[0], q[1];",
-    ]
+    ]  # fmt: skip
     assert "circuit.rx(w[1] * x[0] + 0.5, 0)" in export(circuit, "qiskit")
     assert "qml.RX(w[0, 1] * x[..., 0] + 0.5, wires=0)" in export(circuit, "pennylane")
 
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_command_prints_nothing_but_the_text(format: str) -> None:
-    result = CliRunner().invoke(build(), ["show", "ansatz", "iqp", "qubits=3", "--format", format])
+    result = say("show", "ansatz", "iqp", "qubits=3", "--format", format)
     assert result.stdout == export(ansatz("iqp", 3, 2), format)
 
 
 def test_what_cannot_be_written_is_refused() -> None:
-    with pytest.raises(
-        OptionError, match="--format qasm: one of qasm3, qiskit, pennylane; did you mean 'qasm3'"
-    ):
+    with pytest.raises(OptionError, match=r"--format qasm: one of qasm3, .*; did you mean 'qasm3'"):
         export(ansatz("iqp", 2, 1), "qasm")
     with pytest.raises(OptionError, match="the mean-field approximation of a circuit is none"):
         export(ansatz("iqp", 2, 1, entangled="mean-field"), "qiskit")

@@ -137,23 +137,3 @@ def test_stable_baselines3_trains_it_as_a_features_extractor() -> None:
     assert not any(torch.equal(a, b) for a, b in zip(before, after))
     action, _ = model.predict(model.get_env().reset(), deterministic=True)  # type: ignore[union-attr]
     assert action.shape == (1,)
-
-
-def test_a_dqn_loop_in_one_file_trains_it() -> None:
-    """A CleanRL-like update: online and target network, Adam, one batch again and again."""
-    torch.manual_seed(0)
-    online = nn.Sequential(nn.Linear(4, 3), qrlsuite.layer("cz", qubits=3, layers=2), nn.Linear(3, 2))
-    target = copy.deepcopy(online)
-    optimizer = torch.optim.Adam(online.parameters(), lr=1e-2)
-    observations, following = torch.randn(32, 4), torch.randn(32, 4)
-    actions, rewards = torch.randint(2, (32, 1)), torch.rand(32)
-    losses = []
-    for _ in range(60):
-        with torch.no_grad():
-            goal = rewards + 0.9 * target(following).max(dim=1).values
-        loss = nn.functional.mse_loss(online(observations).gather(1, actions).squeeze(1), goal)
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.5 * losses[0]

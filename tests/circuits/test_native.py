@@ -118,9 +118,8 @@ def test_any_circuits_gradients_equal_pennylanes(circuit: Circuit) -> None:
         leaf = x[0].clone().requires_grad_()
         state = {name: p[0].clone().requires_grad_() for name, p in parameters.items()}
         if backend == "torch":
-            values = run(NativeBackend(circuit), "torch", leaf[None], {k: v[None] for k, v in state.items()})[
-                0
-            ]
+            given = {name: value[None] for name, value in state.items()}
+            values = run(NativeBackend(circuit), "torch", leaf[None], given)[0]
         else:
             values = expectations(circuit, leaf, state, backend=backend)
         weights = torch.linspace(-1, 1, values.numel(), dtype=torch.float64).view_as(values)
@@ -173,14 +172,10 @@ def test_a_forward_pass_alone_gives_the_same_bits(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("dtype", "size", "message"),
     [
-        (
-            torch.float32,
-            3e4,
-            r"float32 holds angles up to about 1e7, .* input is 3e\+04, .* 3e\+04: .* in float64$",
-        ),
+        (torch.float32, 3e4, r"float32 holds angles up to about 1e7, .* input is 3e\+04, .* 3e\+04: .* in float64$"),
         (torch.float64, 1e9, r"float64 holds angles up to about 1e15, .* initial parameters smaller$"),
     ],
-)
+)  # fmt: skip
 def test_angles_that_the_precision_cannot_hold_are_not_called_infinite(
     dtype: torch.dtype, size: float, message: str
 ) -> None:
@@ -209,11 +204,8 @@ def test_programs_are_as_short_as_they_should_be(name: str) -> None:
     """10 qubits, 4 layers: opening Hadamards are free, others join blocks, rings of fixed gates are one sweep."""
     kinds = compile_circuit(ansatz(name, qubits=10, layers=4)).steps[:, 0].tolist()
     assert kinds.count(ROTATE) == 40
-    assert [kinds.count(k) for k in (HADAMARD, PERMUTE, SIGN)] == {
-        "iqp": [0, 0, 0],
-        "cx": [0, 3, 0],
-        "cz": [0, 0, 3],
-    }[name]
+    expected = {"iqp": [0, 0, 0], "cx": [0, 3, 0], "cz": [0, 0, 3]}
+    assert [kinds.count(k) for k in (HADAMARD, PERMUTE, SIGN)] == expected[name]
     xyz = compile_circuit(ansatz(name, qubits=10, layers=4, gate="xyz")).steps[:, 0].tolist()
     assert xyz.count(ROTATE) == 40, "three rotations of one target under one control are one block"
 
@@ -300,10 +292,7 @@ def test_backends_with_one_state_for_all_qubits_take_twenty(backend: str) -> Non
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"inputs": torch.zeros(2, 3)},
-            r"inputs have shape \(2, 3\): this circuit needs \(seeds, batch, 3\)",
-        ),
+        ({"inputs": torch.zeros(2, 3)}, r"inputs have shape \(2, 3\): this circuit needs \(seeds, batch, 3\)"),
         ({"inputs": torch.zeros(2, 4, 5)}, "needs"),
         ({"inputs": torch.zeros(2, 4, 3, dtype=torch.int64)}, "dtype torch.int64"),
         ({"weights": None}, r"parameter 'weights' of shape \(2, 2, 3, 3\) is missing"),
@@ -311,7 +300,7 @@ def test_backends_with_one_state_for_all_qubits_take_twenty(backend: str) -> Non
         ({"weights": torch.zeros(2, 2, 3, 3, dtype=torch.float64)}, "has dtype torch.float64"),
         ({"inputs": torch.full((2, 4, 3), math.nan)}, "not finite"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments(change: dict[str, Tensor | None], message: str) -> None:
     backend = NativeBackend(ansatz("cz", qubits=3, layers=2))
     given = {

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from qrlsuite.circuit import Angle, Circuit, ansatz, create_backend
+from qrlsuite.circuit import Circuit, ansatz, create_backend
 from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.errors import OptionError
@@ -16,6 +16,7 @@ from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.circuits.native import draws
 from qrlsuite.plugins.circuits.native.noise import PauliNoise
+from qrlsuite.testing.circuits import every_gate
 from tests.circuits.test_backends import assert_close, draw, evaluate
 
 NOISE = {"noise_model": "depolarizing", "noise_rate": 0.1, "readout_error": 0.03}
@@ -58,23 +59,10 @@ def counted(shots, probabilities, seed=5, **options):
 
 @pytest.mark.parametrize(
     ("shots", "p"),
-    [
-        (1, 0.3),
-        (3, 0.4),
-        (4, 0.3),
-        (19, 0.5),
-        (50, 0.21),
-        (1000, 0.93),
-        (1000, 0.009),
-        (10_000, 0.3),
-        (10_000_000, 1e-6),
-    ],
-)
+    [(1, 0.3), (3, 0.4), (4, 0.3), (19, 0.5), (50, 0.21), (1000, 0.93), (1000, 0.009), (10**4, 0.3), (10**7, 1e-6)],
+)  # fmt: skip
 def test_counts_follow_the_binomial_law_whichever_way_they_are_drawn(shots, p):
-    rows, first = (
-        40_000,
-        np.array([[1 - p - 0.001, p, 0.001, 0]]),
-    )  # the second outcome: after another was drawn
+    rows, first = 40_000, np.array([[1 - p - 0.001, p, 0.001, 0]])  # p is drawn after another outcome was
     counts = counted(np.full(rows, shots), np.repeat(first, rows, axis=0))
     assert counts.min() >= 0
     assert set(counts.sum(axis=1)) == {shots}
@@ -170,34 +158,9 @@ def test_gradients_under_noise_agree_with_density_matrices(options):
     assert_close(evaluate(backend, *given, seeds=[2]), expected, 0.1)
 
 
-def every_gate():
-    """A circuit on 3 qubits with every gate, each between rotations that tell its errors apart."""
-    circuit = Circuit(3, inputs=1)
-    angle = 0.3
-
-    def turn():
-        nonlocal angle
-        for q in range(3):
-            circuit.append("RX", q, Angle(constant=(angle := angle + 0.4)))
-            circuit.append("RY", q, Angle(constant=(angle := angle + 0.4)))
-
-    turn()
-    for gate in ("H", "X", "Y", "Z", "S", "T"):
-        circuit.append(gate, 1)
-        turn()
-    for gate in ("CNOT", "CZ", "SWAP"):
-        circuit.append(gate, (2, 0))
-        turn()
-    for gate in ("RX", "RY", "RZ"):
-        circuit.append(gate, 0, circuit.input(0), control=1)
-    circuit.append("U3", 2, circuit.input(0), Angle(constant=0.2), Angle(constant=1.2), control=0)
-    circuit.append("RYY", (1, 2), circuit.input(0))
-    circuit.measure([0, 1, 2, (0, 1), (0, 1, 2)])
-    return circuit
-
-
 def test_errors_at_the_end_are_what_they_are_where_they_happen():
     circuit = every_gate()
+    circuit.measure([0, 1, 2, (0, 1), (0, 1, 2)])
     elementary = Elementary(circuit, AngleTable(circuit))
     noise = PauliNoise(elementary, 3, 0.1)
     drawn = noise.draw(200, np.random.default_rng(3))
@@ -211,7 +174,7 @@ def test_errors_at_the_end_are_what_they_are_where_they_happen():
 
     inserted = [
         Circuit(3, inputs=elementary.rotations) for _ in range(200)
-    ]  # each error as gates where it happens
+    ]  # errors as gates where they happen
     for (name, wires, rotation), (places, codes) in zip(elementary.gates, drawn):
         for run in inserted:
             run.append(name, wires, *([] if rotation is None else [run.input(rotation)]))
@@ -281,9 +244,8 @@ def test_an_spsa_gradient_is_right_on_average():
     many = 800
     wide = {name: value.expand(many, *value.shape[1:]) for name, value in parameters.items()}
     backend = create_backend("native", circuit, gradient="spsa")
-    guesses = evaluate(
-        backend, inputs.expand(many, -1, -1), wide, cotangent.expand(many, -1, -1), seeds=list(range(many))
-    )
+    x, cotangents = (value.expand(many, -1, -1) for value in (inputs, cotangent))
+    guesses = evaluate(backend, x, wide, cotangents, seeds=list(range(many)))
     for guess, value in zip(guesses[1:], exact[1:]):
         spread = float(guess.std(0).max()) / math.sqrt(many)
         assert_close([guess.mean(0)], [value[0]], 5 * spread + 0.02)
