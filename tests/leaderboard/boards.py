@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from qrlsuite.errors import QrlSuiteError
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from tests.commands import say
 
 HOSTILE = (
     "<script>alert(1)</script>",
@@ -21,12 +24,7 @@ HOSTILE = (
 
 
 def entry(
-    label: str,
-    seeds: int = 20,
-    epochs: int = 100,
-    speed: float = 1.0,
-    quantum: int = 0,
-    task: str = "beam6g",
+    label: str, seeds: int = 20, epochs: int = 100, speed: float = 1.0, quantum: int = 0, task: str = "beam6g"
 ) -> EntryResults:
     """An entry whose score rises to .93 within about 50 / speed epochs, with noise per run and epoch."""
     file = tasks.load(task).file
@@ -63,3 +61,11 @@ def graded(count: int, seeds: int = 20, epochs: int = 100) -> list[EntryResults]
         entry(f"model-{i} width={2**i % 1000}", seeds, epochs, 2.4 * 0.85**i, quantum=144 * (i % 3 == 1))
         for i in range(count)
     ]
+
+
+def refused(*words: object) -> str:
+    """Return the line with which `qrlsuite WORDS` is refused."""
+    with pytest.raises(QrlSuiteError) as raised:
+        say(*map(str, words))
+    assert "\n" not in str(raised.value)
+    return str(raised.value)

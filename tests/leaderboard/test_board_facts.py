@@ -21,7 +21,7 @@ from qrlsuite.leaderboard import report
 from qrlsuite.leaderboard.boards import board, steps
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.pictures import tiers
-from qrlsuite.leaderboard.shelf import collect, published
+from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.options import parse_setting
@@ -161,12 +161,6 @@ def test_parameters_counted_in_two_ways_are_told_apart(tiny_task: str, tmp_path:
     export(ppo, tmp_path / "old")
     (old,) = collect.collect(tmp_path / "old")[0]
     assert (old.parameters, old.networks) == ((387, 0), None)
-
-
-def test_published_entries_train_one_network() -> None:
-    found, refused = collect.collect(published.PUBLISHED)
-    assert refused == []
-    assert [entry.label for entry in found if entry.first_network_alone] == []
 
 
 def test_devices_that_mix_within_an_entry_are_named() -> None:

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import EnvironmentFailure
 from qrlsuite.experiment import task as tasks
 from qrlsuite.leaderboard.boards import board, ranked
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
-from tests.conftest import TINY, trainer
+from tests.commands import say
+from tests.conftest import TINY, Train, trainer
 from tests.leaderboard.boards import entry as drawn
+from tests.leaderboard.boards import refused
 
 
-def test_extending_a_few_seeds_hides_no_other(train: Callable[..., Path]) -> None:
+def test_extending_a_few_seeds_hides_no_other(train: Train) -> None:
     path = train("runs", range(5), 3)
     train("runs", [1, 3], 4)
     found = collect.read_entry(EntryStore(path))
@@ -38,7 +37,7 @@ def test_extending_a_few_seeds_hides_no_other(train: Callable[..., Path]) -> Non
     assert section.rows[0].entry.left_out == ()
 
 
-def test_every_horizon_shows_the_seeds_that_reach_it(tiny_task: str, train: Callable[..., Path]) -> None:
+def test_every_horizon_shows_the_seeds_that_reach_it(tiny_task: str, train: Train) -> None:
     Path(tiny_task).write_text(TINY.replace("[180]", "[180, 240]"))
     path = train("runs", range(4), 3)
     train("runs", [2], 4)
@@ -49,7 +48,7 @@ def test_every_horizon_shows_the_seeds_that_reach_it(tiny_task: str, train: Call
     assert sections[1].rows[0].entry.left_out == (0, 1, 3)
 
 
-def test_entries_are_compared_at_what_both_have_reached(train: Callable[..., Path]) -> None:
+def test_entries_are_compared_at_what_both_have_reached(train: Train) -> None:
     long = train("runs", range(4), 4)
     short = train("runs", range(4), 3, settings=("width=8",))
     train("runs", [0], 4, settings=("width=8",))
@@ -77,25 +76,23 @@ def test_the_cells_are_those_of_the_registered_task_whatever_an_entry_brings() -
     assert ranked.ranking_of(several[:2]) == ranked.ranking_of(several[1::-1])
 
 
-def test_scores_that_no_board_would_rank_end_the_run_at_once(
-    tiny_task: str, train: Callable[..., Path]
-) -> None:
+def test_scores_that_no_board_would_rank_end_the_run_at_once(tiny_task: str, train: Train) -> None:
     scored = '[score]\nsource = "return"\nmax_return = 0.01\n[ranking]'
     Path(tiny_task).write_text(TINY.replace("[ranking]", scored))
     with pytest.raises(EnvironmentFailure, match=r"has the score [\d.]+, outside \[0, 1\]: is score.max"):
         train("runs", [0], 2)
 
 
-def test_versions_that_mix_are_pointed_out(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_versions_that_mix_are_pointed_out(train: Train, tmp_path: Path) -> None:
     path = train("runs", range(2), 3)
     run = path / "seed-0001" / "run.json"
     record = json.loads(run.read_text())
     record["provenance"][0]["versions"]["torch"] = "2.0"
     run.write_text(json.dumps(record))
-    said = CliRunner().invoke(build(), ["leaderboard", "--explain", "--runs", str(tmp_path / "runs")]).output
+    said = say("leaderboard", "--explain", "--runs", str(tmp_path / "runs")).output
     several = "made with several versions, see `qrlsuite show ENTRY`: ddqn mlp width=16 (torch)"
     assert several in " ".join(said.split())
-    shown = CliRunner().invoke(build(), ["show", path.name, "--runs", str(tmp_path / "runs")]).output
+    shown = say("show", path.name, "--runs", str(tmp_path / "runs")).output
     assert '"torch": "2.0"' in shown
     assert np.__version__ in shown
 
@@ -111,8 +108,8 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
     words = ("--task", "beam6g", "--runs", str(with_smoke), "--out", str(tmp_path / "p.svg"))
 
     def plot(kind: str, *more: str) -> tuple[str, str]:
-        done = CliRunner().invoke(build(), ["plot", kind, *words, *more])
-        assert done.exit_code == 0, done.output + str(done.exception)
+        done = say("plot", kind, *words, *more)
+        assert done.exit_code == 0, done.output
         return done.output, (tmp_path / "p.svg").read_text()
 
     for kind in ("bars", "tiers"):
@@ -131,16 +128,9 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
 
 def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -> None:
     def rows(*words: str) -> dict[int, list[tuple[str, int]]]:
-        done = CliRunner().invoke(
-            build(), ["leaderboard", "--runs", str(with_smoke), "--format", "json", "--published", *words]
-        )
-        assert done.exit_code == 0, str(done.exception)
-        content = json.loads(done.stdout)
-        return {
-            section["horizon"]: [(row["label"], row["seeds"]) for row in section["rows"]]
-            for section in content["sections"]
-            if section["task"] == "beam6g"
-        }
+        done = say("leaderboard", "--runs", str(with_smoke), "--format", "json", "--published", *words)
+        sections = [each for each in json.loads(done.stdout)["sections"] if each["task"] == "beam6g"]
+        return {each["horizon"]: [(row["label"], row["seeds"]) for row in each["rows"]] for each in sections}
 
     own, other = ("ddqn mlp width=16", 3), ("ddqn mlp width=16 (published)", 100)
     both = rows("--entry", "beam6g/mlp width=16")
@@ -163,8 +153,7 @@ def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -
 )  # fmt: skip
 def test_what_leaves_nothing_says_why(words: tuple[str, ...], message: str, with_smoke: Path) -> None:
     for command in (("leaderboard",), ("plot", "bars")):
-        done = CliRunner().invoke(build(), [*command, "--runs", str(with_smoke), *words])
-        assert message in str(done.exception)
+        assert message in refused(*command, "--runs", with_smoke, *words)
 
 
 def test_of_entries_below_every_horizon_the_length_of_half_of_them_counts() -> None:

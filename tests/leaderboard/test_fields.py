@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from qrlsuite import api
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.pictures.fields import draw
@@ -21,6 +18,8 @@ from qrlsuite.leaderboard.shelf import fields
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.statistics import final_scores
 from qrlsuite.statistics.times import mean_time
+from tests.commands import say
+from tests.conftest import Train
 from tests.leaderboard.test_external import ending
 
 NAMES = ["mlp width=16", "mlp width=64", "vqc-native qubits=6"]
@@ -190,10 +189,10 @@ def test_from_the_command_line(runs: Path, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.chdir(tmp_path)
 
     def run(*words: str) -> Any:
-        return CliRunner().invoke(build(), [*words, "--runs", str(runs)])
+        return say(*words, "--runs", str(runs))
 
     drawn = run("plot", "fields", "x=width", "y=area", "where=model=net", "--out", "a.png")
-    assert drawn.output == "wrote a.png\n", drawn.exception
+    assert drawn.output == "wrote a.png\n"
     rows = list(csv.DictReader(io.StringIO(run("runs", "--format", "csv").stdout)))
     assert [(row["entry"], row["model.width"], row["seeds_finished"]) for row in rows] == [
         ("external net width=4 lr=1", "4", "2"),
@@ -204,9 +203,9 @@ def test_from_the_command_line(runs: Path, tmp_path: Path, monkeypatch: pytest.M
     assert run("runs", "--format", "csv", "--task", "beam6g").stdout == ""
 
 
-def test_an_entry_without_a_finished_epoch_is_in_the_csv(train: Callable[..., Path]) -> None:
+def test_an_entry_without_a_finished_epoch_is_in_the_csv(train: Train) -> None:
     folder = train("runs", [0], 1)
     (folder / "seed-0000" / "epochs.parquet").unlink()
-    result = CliRunner().invoke(build(), ["runs", "--format", "csv", "--runs", str(folder.parents[1])])
+    result = say("runs", "--format", "csv", "--runs", str(folder.parents[1]))
     [row] = list(csv.DictReader(io.StringIO(result.stdout)))
     assert (row["name"], row["seeds_finished"]) == (folder.name, "1")

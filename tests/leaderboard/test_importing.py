@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.engine.worker import train_group
 from qrlsuite.errors import StoreError
 from qrlsuite.experiment.entry import resolve
@@ -22,6 +20,7 @@ from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import SeedsClaimedError, acquire
 from qrlsuite.results.seeds import plan_groups
 from qrlsuite.results.store import EntryStore, table_bytes, write_atomically
+from tests.commands import say
 from tests.conftest import TINY
 
 TUNING = {"trials": 3, "seeds": "1000000:1000004", "changed": []}
@@ -234,9 +233,9 @@ def test_wrong_folders(elsewhere: Path, tmp_path: Path) -> None:
 
 def test_the_command(elsewhere: Path, exported: Path, tmp_path: Path) -> None:
     words = ["import", str(exported.parents[1]), "--runs", str(tmp_path / "runs")]
-    done = CliRunner().invoke(build(), words)
+    done = say(*words)
     assert done.exit_code == 0, done.output
     assert "ddqn mlp width=4 depth=1 on tiny: imported seeds 0:2\n" in done.stdout
-    again = CliRunner().invoke(build(), [*words, "--json"])
+    again = say(*words, "--json")
     (entry,) = json.loads(again.stdout)["entries"]
     assert (entry["seeds"], entry["known"]) == ([], [0, 1])

@@ -18,7 +18,7 @@ import pytest
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.report import live
 from tests.commands import HANGS, Command, qrlsuite, start
-from tests.conftest import Hold, trainer
+from tests.conftest import Hold, Train, trainer
 
 View = Callable[..., tuple[Command, str]]
 
@@ -117,7 +117,7 @@ def test_a_browser_follows_a_run(
 
 
 def test_ctrl_c_ends_it_with_a_sentence_and_nothing_is_changed(
-    view: View, train: Callable[..., Path], tmp_path: Path, chromium: Any
+    view: View, train: Train, tmp_path: Path, chromium: Any
 ) -> None:
     train("runs", [0, 1])
     before = contents(tmp_path / "runs")
@@ -135,7 +135,7 @@ def test_ctrl_c_ends_it_with_a_sentence_and_nothing_is_changed(
     tab.close()
 
 
-def test_only_two_addresses_of_this_machine_are_answered(view: View, train: Callable[..., Path]) -> None:
+def test_only_two_addresses_of_this_machine_are_answered(view: View, train: Train) -> None:
     folder = train("runs", [0])
     assert (folder / "entry.json").is_file()
     _, address = view()
@@ -167,7 +167,7 @@ def test_only_two_addresses_of_this_machine_are_answered(view: View, train: Call
 
 
 def test_a_port_in_use_is_told_and_the_next_free_one_is_taken(
-    view: View, train: Callable[..., Path], tmp_path: Path
+    view: View, train: Train, tmp_path: Path
 ) -> None:
     train("runs", [0])
     _, address = view()
@@ -198,9 +198,7 @@ def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     assert "unknown task 'beam6h'; did you mean 'beam6g'?" in unknown.stderr
 
 
-def test_damage_while_it_is_shown_is_told_and_goes_by(
-    view: View, train: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_damage_while_it_is_shown_is_told_and_goes_by(view: View, train: Train, tmp_path: Path) -> None:
     folder = train("runs", [0, 1])
     _, address = view()
     _, first = answer(address)

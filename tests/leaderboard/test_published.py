@@ -19,10 +19,8 @@ import pyarrow.parquet
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from qrlsuite import api, registry, specs
-from qrlsuite.cli.app import build
 from qrlsuite.errors import QrlSuiteError, StoreError
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import studies
@@ -33,7 +31,9 @@ from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results import provenance
 from qrlsuite.results.store import EntryStore
 from qrlsuite.studies.study import parse
-from tests.conftest import TINY, trainer
+from tests.commands import say
+from tests.conftest import TINY, Train, trainer
+from tests.leaderboard.boards import refused
 
 EPOCHS = 3
 
@@ -122,7 +122,7 @@ def test_names_of_hosts_are_not_exported(runs: Path, tmp_path: Path) -> None:
 
 
 def test_a_smaller_entry_replaces_a_larger_one_only_by_force(
-    folder: Path, train: Callable[..., Path], tmp_path: Path
+    folder: Path, train: Train, tmp_path: Path
 ) -> None:
     few = train("few", range(2), EPOCHS)
     with pytest.raises(QrlSuiteError, match=r"has 8 seeds of 3 epochs.*--force"):
@@ -351,7 +351,7 @@ def test_verification_is_no_run_that_trackers_hear_of(folder: Path, monkeypatch:
 
 
 def test_what_a_seed_was_made_with_names_device_and_every_plugin(
-    train: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = registry.load()
     named = {"environments": "beam6g", "algorithms": "ddqn", "ansatzes": "cx", "circuit_backends": "native"}
@@ -478,7 +478,7 @@ def test_boards_of_what_comes_with_the_suite_need_neither_torch_nor_matplotlib(t
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_the_reruns_own_count_decides_circuit_executions(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_the_reruns_own_count_decides_circuit_executions(train: Train, tmp_path: Path) -> None:
     runs = train("runs", range(2), 1, model="vqc-native", settings=("qubits=2", "layers=1"))
     folder = publish(runs, tmp_path / "entries")
     assert verify.verify(folder, rerun=1).check == "verified"
@@ -522,49 +522,43 @@ def test_hours_of_published_entries_rank_nothing(folder: Path) -> None:
     assert costs.price(published.read(folder).entry_results(), "core-hours").problem
 
 
-def command(*words: str) -> Any:
-    return CliRunner().invoke(build(), list(words))
-
-
 def test_commands(folder: Path, trained: Path, tmp_path: Path) -> None:
     out, runs = tmp_path / "out", str(trained / "runs")
-    done = command("export", "all", "--runs", runs, "--out", str(out))
+    done = say("export", "all", "--runs", runs, "--out", str(out))
     assert done.exit_code == 0
     assert "8 seeds" in done.stdout
-    done = command("verify", str(out), "--rerun", "1 choice=3", "--json")
+    done = say("verify", str(out), "--rerun", "1 choice=3", "--json")
     assert done.exit_code == 0
     (told,) = json.loads(done.stdout)["entries"]
     assert (told["choice"], told["check"]) == (3, "repeated")
     assert "seeds are trained again" in done.stderr
-    done = command("verify", str(out), "--rerun", "auto")
+    done = say("verify", str(out), "--rerun", "auto")
     assert ": verified: 8 seeds trained again" in done.stdout
-    assert "--rerun many: write a number of seeds" in str(
-        command("verify", str(out), "--rerun", "many").exception
-    )
+    assert "--rerun many: write a number of seeds" in refused("verify", out, "--rerun", "many")
     rewrite(next(out.glob("*/*")) / "curves.parquet", put("score", 0, 2.0))
-    done = command("verify", str(out))
+    done = say("verify", str(out))
     assert done.exit_code == 1
     assert "outside [0, 1]" in done.stdout
-    done = command("leaderboard", "--runs", str(tmp_path / "entries"), "--format", "csv")
+    done = say("leaderboard", "--runs", str(tmp_path / "entries"), "--format", "csv")
     header, line = done.stdout.splitlines()
     assert header.startswith("task,horizon,rank,rank_worst,entry")
     assert line.startswith("tiny,")
-    assert "export all" in str(command("export", "--runs", runs).exception)
+    assert "export all" in refused("export", "--runs", runs)
     (tmp_path / "none").mkdir()
-    done = command("export", "all", "--runs", str(tmp_path / "none"))
-    assert "holds no complete entry: qrlsuite runs --runs" in str(done.exception)
+    said = refused("export", "all", "--runs", tmp_path / "none")
+    assert "holds no complete entry: qrlsuite runs --runs" in said
 
 
 def test_an_entry_is_verified_from_inside_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for here, path in ((folder, "."), (folder.parent, folder.name), (folder.parents[1], ".")):
         monkeypatch.chdir(here)
-        done = command("verify", path)
+        done = say("verify", path)
         assert done.exit_code == 0, done.stdout
         assert f"{folder.parent.name}/{folder.name}" in done.stdout
 
 
 def test_own_runs_of_a_published_entry_are_shown_once(
-    folder: Path, train: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(published, "PUBLISHED", tmp_path / "entries")
     train("mine", range(2), EPOCHS)
@@ -585,7 +579,7 @@ def test_own_runs_of_a_published_entry_are_shown_once(
 
 
 def test_tuning_seeds_are_not_ranked_and_the_record_of_tuning_is_carried(
-    train: Callable[..., Path], tmp_path: Path
+    train: Train, tmp_path: Path
 ) -> None:
     runs = train("runs", [0, 1_000_000], EPOCHS)
     record = json.loads((runs / "entry.json").read_text())
@@ -647,12 +641,12 @@ def test_entries_of_studies_are_found_by_name_and_by_study_only(two: str, tmp_pa
         labels(study=two, entries=["mlp"])
     with pytest.raises(QrlSuiteError, match=r"study 'estimator' has no entry$"):
         api.board(runs=tmp_path, published=True, study="estimator")
-    done = command("leaderboard", "--study", two, "--published", "--runs", str(tmp_path), "--format", "csv")
+    done = say("leaderboard", "--study", two, "--published", "--runs", str(tmp_path), "--format", "csv")
     assert [line.partition(" mlp ")[2][:8] for line in done.stdout.splitlines()[1:]] == [
         "width=64",
         "width=16",
     ]
-    assert command("verify").stdout.count("ok ") == 2
+    assert say("verify").stdout.count("ok ") == 2
 
 
 def test_a_task_that_only_studies_have_entries_of_has_a_board_of_them(
@@ -691,14 +685,14 @@ def test_an_ambiguous_name_lists_entries_of_boards_where_some_fit(tmp_path: Path
 
 def test_a_study_is_drawn_from_published_entries(two: str, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
-    assert command("study", "draw", two, "--runs", str(runs)).exit_code
-    done = command("study", "draw", two, "--published", "--runs", str(runs))
+    assert "nothing is trained yet" in refused("study", "draw", two, "--runs", runs)
+    done = say("study", "draw", two, "--published", "--runs", str(runs))
     assert "100 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
     assert (runs / "study-two-picture.png").exists()
-    done = command("study", "draw", two, "--published", "--seeds", "20", "--runs", str(runs))
+    done = say("study", "draw", two, "--published", "--seeds", "20", "--runs", str(runs))
     assert "20 seeds: ddqn mlp width=16, ddqn mlp width=64" in done.stdout
-    done = command("study", "draw", two, "--published", "--seeds", "101", "--runs", str(runs))
-    assert "has no complete run of seed 100" in str(done.exception)
+    said = refused("study", "draw", two, "--published", "--seeds", 101, "--runs", runs)
+    assert "has no complete run of seed 100" in said
 
 
 def test_published_entries_play_no_episodes(two: str, tmp_path: Path) -> None:

@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.leaderboard.boards import board
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report import render
 from qrlsuite.results.store import EntryStore, json_line, table_bytes, write_atomically
 from qrlsuite.studies.looks import StudyWithLooks, new
 from qrlsuite.studies.outcome import in_folder
+from tests.commands import say
 from tests.conftest import TINY
 from tests.leaderboard import boards
 
@@ -87,7 +86,7 @@ def test_the_command_puts_studies_on_the_page(runs: Path, tmp_path: Path) -> Non
     changed = tmp_path / "runs" / "decisions" / "two" / "plan.toml"
     changed.write_text(changed.read_text().replace("alpha = 0.05", "alpha = 2"))
     words = ["leaderboard", "--format", "html", "--runs", str(tmp_path / "runs")]
-    result = CliRunner().invoke(build(), words, catch_exceptions=False)
+    result = say(*words)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "runs" / "leaderboard.html").read_text()
     assert "three: Which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in text

@@ -8,12 +8,11 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.boards.scores import rank_by_score
 from qrlsuite.leaderboard.shelf.curves import EntryResults
+from tests.commands import say
 from tests.leaderboard.test_pair import entry, spread
 
 
@@ -57,12 +56,10 @@ def test_bad_input_is_one_error() -> None:
 
 def test_the_board_ranks_by_score_and_what_is_shown_changes_no_rank() -> None:
     words = ["leaderboard", "--published", "--runs", "none", "--task", "beam6g", "--by", "score"]
-    (whole,) = json.loads(CliRunner().invoke(build(), [*words, "--format", "json"]).stdout)["sections"]
+    (whole,) = json.loads(say(*words, "--format", "json").stdout)["sections"]
     assert len(whole["entries"]) == 11
     assert whole["entries"][-1]["label"] == "ddqn mlp width=16"
     low, high = whole["entries"][-1]["ranks"]
-    shown = CliRunner().invoke(build(), [*words, "--entry", "mlp width=16", "--format", "markdown"]).stdout
-    (row,) = [line for line in shown.splitlines() if "mlp width=16" in line]
-    assert row.startswith(f"| {low}-{high} |")
-    rows = list(csv.DictReader(io.StringIO(CliRunner().invoke(build(), [*words, "--format", "csv"]).stdout)))
-    assert (rows[-1]["rank"], rows[-1]["rank_worst"]) == (str(low), str(high))
+    shown = say(*words, "--entry", "mlp width=16", "--format", "csv").stdout
+    (row,) = csv.DictReader(io.StringIO(shown))
+    assert (row["rank"], row["rank_worst"]) == (str(low), str(high))

@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from qrlsuite import api
-from qrlsuite.cli.app import build
 from qrlsuite.engine import sheet
 from qrlsuite.errors import FileError, OptionError
 from qrlsuite.experiment import task as tasks
@@ -28,7 +26,8 @@ from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import EntryStore
 from qrlsuite.statistics import Direction
-from tests.conftest import TINY
+from tests.commands import say
+from tests.conftest import TINY, Train
 from tests.leaderboard import boards
 
 EPSILONS = [0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40]
@@ -124,8 +123,7 @@ def test_a_pair_decided_against_the_order_of_the_means_is_named() -> None:
 def test_alpha_outside_0_and_1_is_refused(alpha: float) -> None:
     with pytest.raises(OptionError, match=r"alpha = .* is outside \(0, 1\)"):
         boards.board.build([boards.entry("one")], alpha=alpha)
-    result = CliRunner().invoke(build(), ["leaderboard", "--published", "--alpha", str(alpha)])
-    assert isinstance(result.exception, OptionError)
+    assert "is outside (0, 1)" in boards.refused("leaderboard", "--published", "--alpha", alpha)
 
 
 def test_alpha_decides_levels_and_pairs() -> None:
@@ -316,7 +314,7 @@ RULED = TINY.replace("[ranking]", '[ranking]\nrule = "times"')
 
 
 def test_a_task_names_its_rule_and_the_command_overrides(
-    tiny_task: str, train: Callable[..., Path], tmp_path: Path
+    tiny_task: str, train: Train, tmp_path: Path
 ) -> None:
     plain = tasks.load(tiny_task)
     Path(tiny_task).write_text(RULED)
@@ -329,7 +327,7 @@ def test_a_task_names_its_rule_and_the_command_overrides(
     assert EntryStore(path).record()["task_file"]["ranking"]["rule"] == "times"
     words = ["leaderboard", "--runs", str(path.parent.parent), "--format", "json"]
     for more, rule in (([], "times"), (["--rule", "intervals"], "intervals")):
-        result = CliRunner().invoke(build(), [*words, *more], catch_exceptions=False)
+        result = say(*words, *more)
         (section,) = json.loads(result.stdout)["sections"]
         assert (section["rule"], json.loads(result.stdout)["rule"]) == (rule, rule)
 
