@@ -197,8 +197,7 @@ def test_what_the_ends_of_a_pattern_leave_without_effect_is_named_and_breaks_not
     )
 
 
-@pytest.mark.parametrize("gate", ["xyz", "u3"])
-@pytest.mark.parametrize("name", ["iqp", "cx", "cz"])
+@pytest.mark.parametrize(("name", "gate"), [("iqp", "xyz"), ("cx", "u3"), ("cz", "xyz")])
 def test_the_gates_of_built_in_ansatzes_have_effects(name: str, gate: str) -> None:
     findings = own_rules(registry.get(specs.AnsatzSpec, name), {"gate": gate})
     assert all(finding.ok for finding in findings), findings
@@ -212,11 +211,7 @@ def test_effects_are_those_of_finite_differences() -> None:
     x, parameters, _ = effects.sample(circuit, effects.POINTS)
     with torch.no_grad():
         values = run(x, parameters)
-        moved = {}
-        for q in range(2):
-            shifted = x.clone()
-            shifted[..., q] += 0.5
-            moved[q] = run(shifted, parameters)
+        moved = {q: run(x + 0.5 * torch.eye(2)[q], parameters) for q in range(2)}
         for index in range(8):
             weights = parameters["weights"].clone()
             weights.view(effects.POINTS, -1)[:, index] += 0.5

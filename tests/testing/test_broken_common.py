@@ -79,10 +79,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def model(
-    options: str = "Good",
-    build: str = f"{STRANGE}:build",
-    name: str = "",
-    memory: str = f"{STRANGE}:memory",
+    options: str = "Good", build: str = f"{STRANGE}:build", name: str = "", memory: str = f"{STRANGE}:memory"
 ) -> ModelSpec:
     return ModelSpec(
         name=name or re.sub(r"\W+", "-", f"{options} {build}".lower()),
