@@ -25,6 +25,8 @@ from tests.commands import HANGS as HANGS  # tests take it from here
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles the suite again
 sys.dont_write_bytecode = False
+for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")  # as in workers; more would wait for each other, at twice the cost
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored,
 # and so would every command that a test interrupts
 
