@@ -11,8 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from qrlsuite import registry, specs
+from qrlsuite.engine.worker import train_group
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
+from qrlsuite.results.store import EntryStore
 from qrlsuite.testing.group import Toy
 from qrlsuite.training.trainer import Trainer, asks_for_more
 from tests.algorithms.worlds import Contexts, Group
@@ -74,9 +76,7 @@ def trained(name: str, seeds: Sequence[int], case: dict[str, Any], **more: Any) 
         for metric, values in made.algorithm.train_epoch(7).items():
             result[f"{metric}{epoch}"] = values
         result[f"actions{epoch}"] = np.stack([actions(made) for _ in range(3)], axis=1)
-    for network, counts in enumerate(
-        made.executions()
-    ):  # one number for all agents, so it must not follow one
+    for network, counts in enumerate(made.executions()):  # one number for all agents: it must not follow one
         for kind, count in counts.items():
             result[f"{kind} executions {network}"] = np.full(len(seeds), count)
     return {**made.save(), **result}
@@ -94,9 +94,8 @@ def assert_same(
 ) -> None:
     assert part.keys() == whole.keys()
     for key, array in whole.items():
-        np.testing.assert_array_equal(
-            part[key], array[list(members)], err_msg=f"{key} of {members}", strict=True
-        )
+        message = f"{key} of {members}"
+        np.testing.assert_array_equal(part[key], array[list(members)], err_msg=message, strict=True)
 
 
 @every_algorithm
@@ -143,11 +142,6 @@ def test_stored_results_do_not_depend_on_groups(
     name: str, case: dict[str, Any], tiny_task: str, tmp_path: Path
 ) -> None:
     """Through the core, with a circuit: curves, executions and agents are the same bytes, also after a pause."""
-    from qrlsuite.engine.worker import train_group
-    from qrlsuite.experiment.entry import resolve
-    from qrlsuite.options import parse_setting
-    from qrlsuite.results.store import EntryStore
-
     settings = {"qubits": 2, "layers": 1, **{f"algorithm.{k}": v for k, v in case.items()}}
     words = [parse_setting(f"{k}={v}") for k, v in settings.items()]
     if "discrete" not in registry.get(specs.AlgorithmSpec, name).actions:

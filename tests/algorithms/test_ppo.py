@@ -35,15 +35,8 @@ def test_generalized_advantages_by_hand(
     def column(values: list[Any]) -> NDArray[Any]:
         return np.array(values).reshape(1, 3, 1)
 
-    result = generalized_advantages(
-        column([1.0, 2.0, 3.0]),
-        column([1.0, 1.0, 1.0]),
-        column([2.0, 4.0, 8.0]),
-        column(terminated),
-        column(truncated),
-        gamma=0.5,
-        gae_lambda=0.5,
-    )
+    given = [1.0, 2.0, 3.0], [1.0, 1.0, 1.0], [2.0, 4.0, 8.0], terminated, truncated
+    result = generalized_advantages(*map(column, given), gamma=0.5, gae_lambda=0.5)
     assert result.ravel().tolist() == expected
 
 
@@ -60,14 +53,7 @@ def test_advantages_with_lambda_one_are_returns_minus_values() -> None:
 
 @pytest.mark.parametrize(
     ("samples", "sizes"),
-    [
-        (2000, [64] * 30 + [80]),
-        (128, [64, 64]),
-        (127, [127]),
-        (64, [64]),
-        (63, [63]),
-        (1, [1]),
-    ],
+    [(2000, [64] * 30 + [80]), (128, [64, 64]), (127, [127]), (64, [64]), (63, [63]), (1, [1])],
 )
 def test_minibatches_merge_the_remainder(samples: int, sizes: list[int]) -> None:
     pieces = minibatches(samples, 64)
@@ -125,12 +111,8 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
         entropy = -(p * logs).sum(1)
         critic = critics[s](x)[:, 0]
         error = critic - returns[s].numpy()
-        expected = [
-            -np.minimum(free, held).mean(),
-            (error**2).mean(),
-            entropy.mean(),
-            np.mean(old[s].numpy() - logs[rows, a]),
-        ]
+        kl = np.mean(old[s].numpy() - logs[rows, a])
+        expected = [-np.minimum(free, held).mean(), (error**2).mean(), entropy.mean(), kl]
         np.testing.assert_allclose(measured[:, s], expected, rtol=1e-4, atol=1e-6)
         learns = free <= held
         outside = np.abs(ratio - 1) > clip
@@ -154,9 +136,8 @@ def test_advantages_are_normalized_within_the_minibatch() -> None:
         advantages = torch.randn((1, 16), generator=generator)
         old = torch.full((1, 16), -1.1)
         actions = torch.arange(16)[None] % 3
-        results.append(
-            made._learn(states, actions[..., None], old, advantages * scale + shift, torch.zeros(1, 16))
-        )
+        scaled = advantages * scale + shift
+        results.append(made._learn(states, actions[..., None], old, scaled, torch.zeros(1, 16)))
     torch.testing.assert_close(results[0], results[1], rtol=1e-3, atol=1e-5)
     assert torch.isfinite(ppo([0])._learn(states[:, :1], actions[:, :1, None], *[torch.ones(1, 1)] * 3)).all()
 

@@ -78,16 +78,8 @@ def test_unfinished_episodes_carry_over(monkeypatch: pytest.MonkeyPatch) -> None
     learn = made._learn
 
     def spy(rows: torch.Tensor, returns: Any, learned: Any) -> Any:
-        lanes = [
-            [
-                (float(rows[0, e, t, 0]) * 10, float(rows[0, e, t, 1]) * 10, returns[0, e, t])
-                for t in range(13)
-            ]
-            for e in range(2)
-        ]
-        seen.append(
-            [[step for step, used in zip(lane, learned[0, e]) if used] for e, lane in enumerate(lanes)]
-        )
+        steps = torch.cat([10 * rows[0, ..., :2], torch.from_numpy(returns[0])[..., None]], -1)
+        seen.append([[tuple(step) for step in steps[e][learned[0, e]].tolist()] for e in range(2)])
         return learn(rows, returns, learned)
 
     monkeypatch.setattr(made, "_learn", spy)

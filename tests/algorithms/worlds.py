@@ -12,57 +12,23 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from qrlsuite import options, population, registry, specs
-from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.environment import LaneEnv, batched_spaces
 from qrlsuite.seeding import Streams, pack, unpack
+from qrlsuite.testing.group import Toy
 
 torch.set_num_threads(1)
 
 
-class Contexts(LaneEnv):
-    """A bandit with three contexts: reward 1 for the action of the context's number.
-
-    Observations are the context, one-hot, and the step's number over 10. Episodes last 2 to 10 steps and are
-    terminated or truncated, all drawn from the lane's stream.
-    """
+class Contexts(Toy):
+    """The toy of discrete actions: reward 1 for the action of the context that is shown, beside the step over 10."""
 
     def __init__(self, lanes: int) -> None:
-        batched_spaces(self, Box(0, 2, (4,)), Discrete(3), lanes)
-        self.t, self.length, self.context = (np.zeros(lanes, dtype=np.int64) for _ in range(3))
-        self.cut = np.zeros(lanes, dtype=bool)
+        super().__init__(lanes)
         self.history: list[NDArray[np.int64]] = []
-
-    def _begin(self, lane: int) -> None:
-        stream = self.streams[lane]
-        self.t[lane], self.length[lane] = 0, stream.integers(2, 11)
-        self.cut[lane], self.context[lane] = stream.random() < 0.5, stream.integers(3)
-
-    def _observe(self) -> NDArray[np.float32]:
-        return np.column_stack([np.eye(3)[self.context], self.t / 10]).astype(np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        for lane in range(self.num_envs):
-            self._begin(lane)
-        return self._observe(), {}
 
     def step(self, actions: NDArray[np.int64]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.history.append(actions.copy())
-        rewards = (actions == self.context).astype(np.float64)
-        self.t += 1
-        self.context[:] = [stream.integers(3) for stream in self.streams]
-        ended = self.t >= self.length
-        terminated, truncated = ended & ~self.cut, ended & self.cut
-        final = self._observe()
-        for lane in np.flatnonzero(ended):
-            self._begin(lane)
-        infos = {"final_obs": final, "_final_obs": ended} if ended.any() else {}
-        return self._observe(), rewards, terminated, truncated, infos
-
-    def state_dict(self) -> State:
-        return {"t": self.t, "length": self.length, "context": self.context, "cut": self.cut}
-
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        for name, array in state.items():
-            setattr(self, name, np.array(array))
+        return super().step(actions)
 
 
 class Clock(LaneEnv):

@@ -156,38 +156,6 @@ def test_the_limits(variable: int, limit: float, sign: int) -> None:
     assert env.step(np.zeros(2, dtype=np.int64))[2].tolist() == [False, True]
 
 
-def test_without_autoreset_an_ended_lane_stays_put() -> None:
-    env = lanes(3)
-    env.autoreset = False
-    env.reset(options={"state": [[0, 0, 0, 0], [0, 0, 0.3, 0], [0, 0, 0, 0]]})
-    fallen, rewards, terminated, _, infos = env.step(np.ones(3, dtype=np.int64))
-    assert terminated.tolist() == [False, True, False]
-    assert rewards.tolist() == [1, 1, 1]
-    np.testing.assert_array_equal(infos["final_obs"][1], fallen[1])
-    free, _ = lanes(1), lanes(1).reset()
-    free.reset(options={"state": np.zeros((1, 4))})
-    for _ in range(4):
-        free.step(np.ones(1, dtype=np.int64))
-    for _ in range(3):
-        observations, rewards, terminated, truncated, infos = env.step(np.ones(3, dtype=np.int64))
-        np.testing.assert_array_equal(observations[1], fallen[1])
-        assert rewards.tolist() == [1, 0, 1]
-        assert not (terminated | truncated).any()
-        assert not infos
-    np.testing.assert_array_equal(env.state[:, 2], free.state[:, 0])
-    env.reset()
-    assert env.step(np.ones(3, dtype=np.int64))[1].tolist() == [1, 1, 1]
-
-
-def test_resuming_without_autoreset_keeps_ended_lanes_ended() -> None:
-    env, other = lanes(2), lanes(2)
-    env.autoreset = other.autoreset = False
-    env.reset(options={"state": [[0, 0, 0.3, 0], [0, 0, 0, 0]]})
-    env.step(np.zeros(2, dtype=np.int64))
-    other.load_state_dict(env.state_dict())
-    assert other.step(np.zeros(2, dtype=np.int64))[1].tolist() == [0, 1]
-
-
 def test_normalizations() -> None:
     start = [[2.4, -2.5, 0.21, 0.0], [-1.2, 1.25, 0.0, 5.0]]
     raw = np.array(start, dtype=np.float32)

@@ -90,26 +90,6 @@ def test_lanes_that_end_together_are_reset_in_lane_order() -> None:
             env.step(np.zeros(4, dtype=np.int64))
 
 
-def test_without_autoreset_an_ended_lane_stays_put() -> None:
-    env = lanes(WALK, 3)
-    env.autoreset = False
-    env.reset()
-    seeds = env.state_dict()["seed"]
-    last: dict[int, Any] = {}
-    for _ in range(15):
-        observations, rewards, terminated, _, infos = env.step(np.ones(3, dtype=np.int64))
-        for lane in range(3):
-            if lane in last:
-                np.testing.assert_array_equal(observations[lane], last[lane])
-                assert rewards[lane] == 0
-                assert not terminated[lane]
-            elif terminated[lane]:
-                last[lane] = observations[lane]
-                np.testing.assert_array_equal(infos["final_obs"][lane], observations[lane])
-    assert sorted(last) == [0, 1, 2]
-    np.testing.assert_array_equal(env.state_dict()["seed"], seeds)
-
-
 def test_scores_come_from_info_where_there_are_any() -> None:
     for scored in (True, False):
         env = lanes(WALK, 4, scored=scored)
@@ -251,21 +231,6 @@ def test_resuming_is_exact_and_states_are_sliced_and_joined(env_id: str, acts: s
     joined = {name: np.concatenate([half.state_dict()[name] for half, _ in halves]) for name in state}
     for name, values in straight.state_dict().items():
         np.testing.assert_array_equal(values, joined[name])
-
-
-def test_resuming_without_autoreset_keeps_ended_lanes_ended() -> None:
-    env = lanes(WALK, 3)
-    env.autoreset = False
-    env.reset()
-    for _ in range(8):
-        env.step(np.ones(3, dtype=np.int64))
-    other = GymLanes(WALK, 3)
-    other.autoreset = False
-    other.load_state_dict(env.state_dict())
-    for _ in range(5):
-        found, expected = (each.step(np.ones(3, dtype=np.int64))[:4] for each in (other, env))
-        for values, wanted in zip(found, expected):
-            np.testing.assert_array_equal(values, wanted)
 
 
 def test_a_state_is_as_wide_as_the_time_limit() -> None:

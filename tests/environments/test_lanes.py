@@ -48,6 +48,31 @@ def test_observations_and_states_are_copies(name: str) -> None:
         np.testing.assert_array_equal(values, before[key])
 
 
+@pytest.mark.parametrize("name", ["cartpole", "gym"])
+def test_without_autoreset_an_ended_lane_stays_put_also_when_it_is_resumed(name: str) -> None:
+    env, other, last, resumed = lanes(name, 3), lanes(name, 3), dict[int, Any](), False
+    env.autoreset = other.autoreset = False
+    env.reset()
+    for row in np.random.default_rng(1).integers(0, HIGHEST[name] + 1, (80, 3)):
+        again = other.step(row) if resumed else ()
+        step = observations, rewards, terminated, truncated, infos = env.step(row)
+        for lane, ended in enumerate(terminated | truncated):
+            if lane in last:
+                np.testing.assert_array_equal(observations[lane], last[lane])
+                assert (rewards[lane], ended) == (0, False)
+            elif ended:
+                last[lane] = observations[lane]
+                np.testing.assert_array_equal(infos["final_obs"][lane], observations[lane])
+        for found, expected in zip(again[:4], step):
+            np.testing.assert_array_equal(found, expected)
+        if len(last) in (1, 2) and not resumed:
+            other.load_state_dict(env.state_dict())
+            resumed = True
+    assert sorted(last) == [0, 1, 2]
+    env.reset()
+    assert not (env.step(np.zeros(3, np.int64))[0] == np.stack([last[lane] for lane in range(3)])).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

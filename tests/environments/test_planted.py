@@ -62,17 +62,19 @@ def test_bad_input() -> None:
 
 
 @pytest.mark.parametrize(
-    "controls",
+    ("controls", "starts", "steps"),
     [
-        ("mean-field, teacher's own", "mlp"),
-        pytest.param(("mean-field", "separable", "sin, gain 2"), marks=pytest.mark.long),
+        (("mean-field, teacher's own", "mlp"), 1, 300),
+        pytest.param(("mean-field", "separable", "sin, gain 2"), 2, 500, marks=pytest.mark.long),
     ],
 )
-def test_the_circuit_fits_the_classes_and_matched_controls_do_not(controls: tuple[str, ...]) -> None:
+def test_the_circuit_fits_the_classes_and_matched_controls_do_not(
+    controls: tuple[str, ...], starts: int, steps: int
+) -> None:
     """The best of several random starts of each; mean-field is also given the teacher's parameters to start from."""
-    circuit_size, circuit = fit("circuit", starts=2, steps=500)
+    circuit_size, circuit = fit("circuit", starts, steps)
     for control in controls:
-        size, right = fit(control, starts=2, steps=500)
+        size, right = fit(control, starts, steps)
         gap = 0.1 if "mean-field" in control or control == "separable" else 0.01
         assert right[-1] < circuit[-1] - gap, control
         assert circuit_size <= size <= 1.2 * circuit_size, control

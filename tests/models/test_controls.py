@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from qrlsuite import population, registry, specs
-from qrlsuite.circuit import Circuit
+from qrlsuite.circuit import Circuit, ansatz
 from qrlsuite.circuit.resources import jacobian_rank
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry, resolve
@@ -24,7 +24,7 @@ from qrlsuite.specs import AnsatzSpec
 from qrlsuite.training import memory
 from qrlsuite.training.trainer import Trainer
 from qrlsuite.tuning.space import declared
-from tests.conftest import results
+from tests.conftest import Train, results
 
 
 def entry(model: str, *words: str) -> Entry:
@@ -134,7 +134,7 @@ FIXED = {"fourier": ("frequencies", 15), "vqc-native": ("circuit.scaling", 12)}
 
 
 @pytest.mark.parametrize("model", SMALL)
-def test_fixed_parameters_stay_and_a_resumed_run_ends_alike(model: str, train: Callable[..., Path]) -> None:
+def test_fixed_parameters_stay_and_a_resumed_run_ends_alike(model: str, train: Train) -> None:
     straight = train("straight", [0, 1], 4, model=model, settings=SMALL[model])
     resumed = train("resumed", [0, 1], 2, model=model, settings=SMALL[model])
     name, size = FIXED[model]
@@ -163,7 +163,7 @@ def agent_of(folder: Path, model: str) -> nn.Module:
     return trainer.models.built[0]
 
 
-def test_boards_tell_fixed_numbers_apart(train: Callable[..., Path], tmp_path: Path) -> None:
+def test_boards_tell_fixed_numbers_apart(train: Train, tmp_path: Path) -> None:
     train("board", [0], 2, model="fourier", settings=("frequencies=5", "train=linear"))
     train("board", [0], 2, settings=("width=4",))
     found = {e.model: e for e in collect(tmp_path / "board")[0]}
@@ -186,8 +186,6 @@ def test_parameters_without_effect_at_four_layers(
     name: str, options: dict[str, str], missing: Callable[[int], int]
 ) -> None:
     """`cz`: the last RZ of a layer commutes with the CZs and merges with the next layer's first."""
-    from qrlsuite.circuit import ansatz
-
     for qubits in (3, 4):
         circuit = ansatz(name, qubits, 4, **options)
         assert jacobian_rank(circuit) == circuit.parameter_count - missing(qubits)
@@ -231,9 +229,8 @@ def test_circuits_without_that_parameter(
     words: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = registry.load().entries[specs.AnsatzSpec]
-    spec = AnsatzSpec(
-        "unscaled", "Nothing scaled", "qrlsuite.plugins.circuits.ansatz:NoOptions", f"{__name__}:unscaled"
-    )
+    no_options = "qrlsuite.plugins.circuits.ansatz:NoOptions"
+    spec = AnsatzSpec("unscaled", "Nothing scaled", no_options, f"{__name__}:unscaled")
     monkeypatch.setitem(known, "unscaled", replace(known["iqp"], spec=spec))
     with pytest.raises(OptionError, match=message) as refused:
         entry("vqc-native", *words)
@@ -245,10 +242,7 @@ def test_circuits_without_that_parameter(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ("frequencies=100000000",),
-            "frequencies = 100000000: Input should be less than or equal to 65536",
-        ),
+        (("frequencies=100000000",), "frequencies = 100000000: Input should be less than or equal to 65536"),
         (("bandwidth=0",), "bandwidth = 0: Input should be greater than 0"),
         (("train=frequencies",), "train = 'frequencies': Input should be 'all' or 'linear'"),
     ],

@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qrlsuite.statistics import (
-    Grid,
-    LearningCurves,
-    bootstrap_draws,
-    bootstrap_interval,
-    sample_complexity,
-)
+from qrlsuite.statistics import Grid, LearningCurves, bootstrap_draws, bootstrap_interval, sample_complexity
 from qrlsuite.statistics.bootstrap import weighted_epochs, whole_product
 from qrlsuite.statistics.estimator import epochs_below
 from tests.statistics.conftest import DELTAS, EPSILONS
@@ -61,16 +55,10 @@ def test_blocks_of_resamples_are_joined_in_order() -> None:
     assert (whole == np.concatenate(parts, axis=2)).all()
 
 
-def test_one_run_has_no_spread() -> None:
-    curves = [[0.1, 0.9, 0.5, 0.95]]
-    assert bootstrap_interval(curves, Grid.relative([0.1], [0.5]), 10, n_resamples=50).tolist() == [
-        [[20, 20]]
-    ]
-
-
-def test_all_censored_is_the_horizon_and_all_there_is_zero() -> None:
-    assert bootstrap_interval(np.zeros((5, 4)), Grid.relative([0.1], [0.5]), 10).tolist() == [[[40, 40]]]
-    assert bootstrap_interval(np.ones((5, 4)), Grid.relative([0.1], [0.5]), 10).tolist() == [[[0, 0]]]
+def test_one_run_and_runs_that_are_all_alike_have_no_spread() -> None:
+    for curves, value in (([[0.1, 0.9, 0.5, 0.95]], 20), (np.zeros((5, 4)), 40), (np.ones((5, 4)), 0)):
+        interval = bootstrap_interval(curves, Grid.relative([0.1], [0.5]), 10, n_resamples=50)
+        assert interval.tolist() == [[[value, value]]]
 
 
 def test_two_runs_of_which_one_learns_is_a_coin() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,32 +12,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from qrlsuite.statistics import (
-    Grid,
-    at_cap,
-    sample_complexity,
-    unsettled,
-)
+from qrlsuite.statistics import Grid, at_cap, sample_complexity, unsettled
+
+CURVE, SOME = [[0.1, 0.9, 0.5, 0.95]], [[-500.0, -110.0, -np.inf], [np.inf, -90.0, -110.0]]
 
 
-def test_one_run_counts_its_epochs_below_the_threshold() -> None:
-    curve = [[0.1, 0.9, 0.5, 0.95]]
-    assert sample_complexity(curve, Grid.relative([0.1], [0.5]), 10).tolist() == [[20]]
-
-
-def test_every_epoch_counts_also_after_the_first_crossing() -> None:
-    assert sample_complexity([[0.0, 1.0, 0.0, 0.0, 1.0]], Grid.relative([0.5], [1.0]), 1).tolist() == [[3]]
-
-
-def test_a_run_that_touches_the_threshold_has_reached_it() -> None:
-    # 1 - 0.85 is 0.15000000000000002 in floating point
-    assert sample_complexity([[0.15]], Grid.relative([0.85], [1.0]), 1).tolist() == [[0]]
-    assert sample_complexity([[np.nextafter(0.15, 0)]], Grid.relative([0.85], [1.0]), 1).tolist() == [[1]]
-
-
-def test_thresholds_are_read_in_the_precision_of_the_curves() -> None:
-    assert float(np.float32(0.7)) < 0.7
-    assert sample_complexity(np.array([[0.7]], np.float32), Grid.relative([0.3], [1.0]), 1).tolist() == [[0]]
+@pytest.mark.parametrize(
+    ("curves", "grid", "steps", "expected"),
+    [
+        (CURVE, Grid.relative([0.1], [0.5]), 10, [[20]]),
+        ([[0.0, 1.0, 0.0, 0.0, 1.0]], Grid.relative([0.5], [1.0]), 1, [[3]]),  # after the first crossing, too
+        ([[0.15]], Grid.relative([0.85], [1.0]), 1, [[0]]),  # touched; 1 - 0.85 is 0.15000000000000002
+        ([[np.nextafter(0.15, 0)]], Grid.relative([0.85], [1.0]), 1, [[1]]),
+        (np.array([[0.7]], np.float32), Grid.relative([0.3], [1.0]), 1, [[0]]),  # 0.7 in float32 is less than 0.7
+        (np.zeros((4, 5)), Grid.relative([0.1, 0.2], [0.5]), 7, [[35], [35]]),
+        (np.ones((4, 5)), Grid.relative([0.0], [1.0]), 7, [[0]]),
+        (SOME, Grid.absolute([-110, 0], [0.5, 1]), 10, [[0, 20], [20, 30]]),
+    ],
+)  # fmt: skip
+def test_epochs_below_the_threshold_are_counted(
+    curves: Any, grid: Grid, steps: int, expected: list[list[int]]
+) -> None:
+    assert sample_complexity(curves, grid, steps).tolist() == expected
 
 
 @pytest.mark.parametrize("delta", [0.7, "0.7", Decimal("0.7"), np.float32(0.7), np.arange(0.1, 1, 0.1)[6]])
@@ -60,38 +57,17 @@ def test_noise_of_a_computed_grid_does_not_ask_for_one_run_more() -> None:
     assert Grid.relative([0.1], [noisy]).required_counts(100).tolist() == [30]
 
 
-def test_never_reached_is_the_horizon_and_unsettled() -> None:
-    curves = np.zeros((4, 5))
-    assert sample_complexity(curves, Grid.relative([0.1, 0.2], [0.5]), 7).tolist() == [
-        [35],
-        [35],
-    ]
-    assert unsettled(curves, Grid.relative([0.1, 0.2], [0.5])).tolist() == [[True], [True]]
-
-
-def test_always_reached_is_zero_and_settled() -> None:
-    curves = np.ones((4, 5))
-    assert sample_complexity(curves, Grid.relative([0.0], [1.0]), 7).tolist() == [[0]]
-    assert unsettled(curves, Grid.relative([0.0], [1.0])).tolist() == [[False]]
-
-
 def test_unsettled_looks_at_the_last_epoch_only() -> None:
     curves = [[0, 1, 0], [0, 1, 1]]
     assert unsettled(curves, Grid.relative([0.5], [0.5, 0.6])).tolist() == [[False, True]]
     assert unsettled(curves, Grid.absolute([1], [0.5, 0.6])).tolist() == [[False, True]]
+    assert unsettled(np.zeros((4, 5)), Grid.relative([0.1, 0.2], [0.5])).tolist() == [[True], [True]]
+    assert unsettled(np.ones((4, 5)), Grid.relative([0.0], [1.0])).tolist() == [[False]]
 
 
 def test_at_cap_looks_at_the_upper_percentile() -> None:
     intervals = [[[10.0, 200.0], [10.0, 199.9], [200.0, 200.0]]]
     assert at_cap(intervals, 200).tolist() == [[True, False, True]]
-
-
-def test_thresholds_may_be_any_number_and_curves_too() -> None:
-    curves = [[-500.0, -110.0, -np.inf], [np.inf, -90.0, -110.0]]
-    assert sample_complexity(curves, Grid.absolute([-110, 0], [0.5, 1]), 10).tolist() == [
-        [0, 20],
-        [20, 30],
-    ]
 
 
 unit = st.floats(0, 1, width=32)
@@ -105,19 +81,13 @@ hundredths = st.lists(st.integers(1, 99), min_size=1, max_size=5, unique=True).m
 def test_s_hat_is_the_sum_of_the_definition(
     curves: np.ndarray, epsilons: list[int], deltas: list[int], steps: int
 ) -> None:
-    n_runs, n_epochs = curves.shape
-    expected = [
-        [
-            steps
-            * sum(
-                Fraction(sum(bool(v >= float(Decimal(100 - e) / 100)) for v in curves[:, t]), n_runs)
-                < Fraction(d, 100)
-                for t in range(n_epochs)
-            )
-            for d in deltas
+    def s_hat(epsilon: int, delta: int) -> int:
+        shares = [
+            Fraction(int((at >= float(Decimal(100 - epsilon) / 100)).sum()), len(at)) for at in curves.T
         ]
-        for e in epsilons
-    ]
+        return steps * sum(share < Fraction(delta, 100) for share in shares)
+
+    expected = [[s_hat(epsilon, delta) for delta in deltas] for epsilon in epsilons]
     found = sample_complexity(
         curves, Grid.relative([e / 100 for e in epsilons], [d / 100 for d in deltas]), steps
     )

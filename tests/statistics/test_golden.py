@@ -12,9 +12,7 @@ from tests.statistics.conftest import GOLDEN
 @pytest.mark.parametrize("case", GOLDEN, ids=lambda case: str(case["name"]))
 def test_sample_complexity_is_exactly_the_published_codes(case: dict) -> None:
     found = sample_complexity(
-        case["curves"],
-        Grid.relative(case["epsilons"], case["deltas"]),
-        case["steps_per_epoch"],
+        case["curves"], Grid.relative(case["epsilons"], case["deltas"]), case["steps_per_epoch"]
     )
     assert found.tolist() == case["sample_complexity"]
 

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.simulated import power
 from qrlsuite.errors import OptionError
-from qrlsuite.leaderboard import rules
 from qrlsuite.statistics import (
     Evidence,
     Grid,
@@ -21,14 +20,7 @@ from qrlsuite.statistics import (
     TimesRule,
     compare,
 )
-from qrlsuite.statistics.permutation import (
-    CHUNK,
-    relabelings,
-    relabelings_for,
-    skewed_t,
-    smallest,
-    welch_t,
-)
+from qrlsuite.statistics.permutation import CHUNK, relabelings, relabelings_for, skewed_t, smallest, welch_t
 from tests.statistics.conftest import SURFACE, entry
 
 
@@ -264,9 +256,3 @@ def test_the_skewed_rule_errs_less_where_runs_of_one_entry_fail() -> None:
         test.extend(10_000)
         rates.append(float((test.p <= 0.05).mean()))
     assert rates[0] > 0.07 > rates[1]
-
-
-def test_the_skewed_rule_is_registered_and_judges() -> None:
-    rule = rules.load("times-skewed")
-    assert rule.name == "times-skewed"
-    assert (np.asarray(rule(*(Evidence(each, SURFACE, 30) for each in (entry(0), entry(1))))) > 0).all()

@@ -103,10 +103,8 @@ def test_equal_entries_are_found_equal_once_that_is_allowed() -> None:
 
 
 def test_few_percent_fewer_is_both() -> None:
-    runs = {
-        "a": learner("a", 99, 101, n_runs=100, epochs=200),
-        "b": learner("b", 102, 104, n_runs=100, epochs=200),
-    }
+    starts = {"a": (99, 101), "b": (102, 104)}
+    runs = {name: learner(name, *each, n_runs=100, epochs=200) for name, each in starts.items()}
     [pair] = decide(design(looks=(40, 100)), runs, CELL).pairs
     assert pair.verdict == "a needs fewer, by under 10 percent"
 
@@ -121,9 +119,8 @@ def test_a_look_waits_for_the_runs_of_open_pairs_only() -> None:
     nothing = decide(three, {}, SURFACE)
     assert nothing.wanted == {"a": 20, "b": 20, "late": 20}
     assert [pair.verdict for pair in nothing.pairs] == ["open"] * 3
-    first = decide(
-        three, {name: LearningCurves(each.values[:20], 2000) for name, each in runs.items()}, SURFACE
-    )
+    twenty = {name: LearningCurves(each.values[:20], 2000) for name, each in runs.items()}
+    first = decide(three, twenty, SURFACE)
     assert [pair.decided for pair in first.pairs] == [None, Decided.FIRST, Decided.FIRST]
     assert first.wanted == {"a": 40, "b": 40}, "the late one is done"
     assert not first.finished
@@ -149,11 +146,8 @@ def test_levels_are_divided_and_grow_with_each_rejection() -> None:
 
 
 def test_a_pair_found_equal_keeps_its_share_of_alpha() -> None:
-    runs = {
-        "a": learner("a", 20, 22, n_runs=60),
-        "b": learner("b", 20, 22, n_runs=60),
-        "c": learner("c", *range(5, 38), n_runs=60),
-    }
+    starts = {"a": (20, 22), "b": (20, 22), "c": range(5, 38)}
+    runs = {name: learner(name, *each, n_runs=60) for name, each in starts.items()}
     pairs = decide(design("a", "b", "c", looks=(40, 60)), runs, CELL).pairs
     assert pairs[0].decided is Decided.EQUAL
     assert pairs[1].levels[1] == nominal_levels((40, 60), 0.05 / 3, Spending.POCOCK)[1]
@@ -170,9 +164,8 @@ def test_labels_are_nested_across_looks() -> None:
         test.extend(CHUNK)
     # a block in which nothing varies adds nothing to any difference: the same relabelings are at least as large
     assert (later.reached == early.reached).all()
-    other = MaxT(
-        [(np.concatenate([constant, first]), np.concatenate([constant, second]))], ((20, 20), (20, 20))
-    )
+    after = np.concatenate([constant, first]), np.concatenate([constant, second])
+    other = MaxT([after], ((20, 20), (20, 20)))
     other.extend(CHUNK)
     assert (other.reached != early.reached).all(), "as the second block they are relabeled otherwise"
 

@@ -15,9 +15,8 @@ from qrlsuite.statistics import (
     Resampling,
     SmoothedRuns,
     TimesRule,
-    bootstrap_interval,
 )
-from tests.statistics.conftest import DELTAS, EPSILONS, SURFACE, entry
+from tests.statistics.conftest import SURFACE, entry
 
 FAST = Resampling(300)
 
@@ -28,21 +27,6 @@ def test_unequal_numbers_of_one_network_rarely_make_a_winner(index: int, n_first
     rates = power(model, model, n_first, n_second, SURFACE, n_pairs=100, resampling=FAST)
     assert rates.winner <= 0.12
     assert rates.per_cell.max() <= 0.05
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_their_own_intervals_would_make_a_winner_of_the_smaller_entry_often(index: int) -> None:
-    """Why entries are compared at equal numbers: the same draws as above, judged at 10 and at 40 runs."""
-    model, generator = SmoothedRuns(entry(index)), np.random.default_rng(0)
-    found = 0
-    for _ in range(50):
-        small, large = (
-            bootstrap_interval(model.draw(n, generator).values, Grid.relative(EPSILONS, DELTAS), 2000, 300)
-            for n in (10, 40)
-        )
-        fewer, more = small[..., 1] < large[..., 0], small[..., 0] > large[..., 1]
-        found += fewer.any() != more.any()
-    assert found / 50 > 0.2
 
 
 def test_equal_numbers_of_one_network_rarely_make_a_winner_in_a_cell() -> None:
