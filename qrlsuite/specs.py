@@ -135,6 +135,9 @@ class EnvironmentSpec(NumericSpec):
         agent is shown. Uniformly random actions need no policy.
     pictures:
         What `qrlsuite plot` can draw of it.
+    views:
+        Options that change what agents see, and nothing of what happens or what they earn: a study with looks compares
+        entries of tasks that differ in these alone.
     """
 
     kind, kinds = "environment", "environments"
@@ -145,6 +148,7 @@ class EnvironmentSpec(NumericSpec):
     vector: str | None = None
     policies: dict[str, str] = field(default_factory=dict)
     pictures: tuple[PictureSpec, ...] = ()
+    views: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

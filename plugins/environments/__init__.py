@@ -26,6 +26,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
                 "optimal": f"{_BEAM6G}.policies:Optimal",
                 "nearest antenna": f"{_BEAM6G}.policies:NearestAntenna",
             },
+            views=("stack",),
             pictures=(
                 PictureSpec(
                     name="trajectories",
@@ -54,6 +55,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
                 "optimal": f"{_BEAM6G}.angle:BestAngle",
                 "same angle": f"{_BEAM6G}.angle:SameAngle",
             },
+            views=("stack",),
         )
     )
     register(
@@ -65,6 +67,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             entry_point=f"{_HERE}.room:Room",
             vector=f"{_HERE}.room:make_vector",
             policies={"shortest way": f"{_HERE}.room:ShortestWay"},
+            views=("view", "sight"),
         )
     )
     register(

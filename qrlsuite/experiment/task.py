@@ -347,6 +347,13 @@ class Task:
                 f"{source}: without score.max_return, ranking.thresholds are needed instead of epsilons"
             )
 
+    @property
+    def world(self) -> str:
+        """The hash without what changes agents' observations alone: entries of tasks with one world can be compared."""
+        seen = dict.fromkeys(self.environment.views)
+        world = {**self.definition, "environment_options": {**self.definition["environment_options"], **seen}}
+        return digest(world)
+
     def epochs(self, algorithm: str) -> int:
         """Return the epochs of a complete run of an algorithm."""
         return self.file.protocol.algorithm_epochs.get(algorithm, self.file.protocol.epochs)

@@ -444,7 +444,8 @@ def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:
                 )
     looks = study.file.looks or LooksSection()
     entries = [member.entry for member in members]
-    if len(tasks := sorted({entry.task.hash: entry.task.name for entry in entries}.values())) > 1:
+    if len({entry.task.world for entry in entries}) > 1:
+        tasks = sorted({entry.task.name for entry in entries})
         raise OptionError(f"{source}: entries of {' and '.join(tasks)}: a study with looks has one task")
     fixed: dict[str, Any] = {"epochs": looks.epochs or _common_epochs(source, entries)}
     if looks.epsilons is None and looks.thresholds is None:

@@ -11,7 +11,7 @@ from qrlsuite import registry, specs
 from qrlsuite.errors import FileError, OptionError, UnknownNameError
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.options import parse_setting
-from qrlsuite.studies import study
+from qrlsuite.studies import looks, study
 from qrlsuite.studies.sizes import nearest_size, parameters
 from tests.conftest import cases
 
@@ -268,3 +268,12 @@ def test_speeds_come_with_the_studies() -> None:
         for member in study.load(name).members() if name != "matched" else []:
             entry = member.entry
             assert (entry.task.environment.name, entry.algorithm.name, entry.model.name) in kinds
+
+
+def test_a_study_with_looks_compares_what_agents_see(tmp_path: Path) -> None:
+    """Stacked observations are another task of the same world; paths of another degree are another world."""
+    words = ["mlp width=64", "mlp width=64 environment.stack=8"]
+    made = looks.new("memory", "beam6g", words, tmp_path)
+    assert [entry.task.file.environment.options.get("stack", 1) for entry in made.entries.values()] == [1, 8]
+    with pytest.raises(OptionError, match=r"beam6g and beam6g\+\w+: a study with looks has one task"):
+        looks.new("degree", "beam6g", [words[0], "mlp width=64 environment.degree=4"], tmp_path)
