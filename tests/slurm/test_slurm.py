@@ -129,6 +129,7 @@ def test_canceled_killed_and_timed_out_tasks_all_finish_once(tmp_path: Path, tra
 
     until(lambda: store.seed(0).lines.exists() and store.seed(1).lines.exists(), "epochs are recorded")
     subprocess.run(["scancel", f"{job}_0"], check=True)
+    until(lambda: worker(1), "the second task runs, again where it has reached its limit")
     killed = worker(1)
     assert killed is not None
     os.kill(os.getpgid(killed), 0)
