@@ -79,10 +79,10 @@ class Leaderboard(Shown):
         """Return one row of values per entry and section, for a spreadsheet."""
         return [row for section in self.sections for row in section.flat()]
 
-    def sheets(self, explain: bool = False, pairs: bool = False) -> list[Sheet]:
-        """Return a table per task; `explain` adds what its columns and marks mean, `pairs` the matrix of pairs."""
+    def sheets(self, explain: bool = False) -> list[Sheet]:
+        """Return a table per task; `explain` adds what its columns and marks mean, and the matrix of its pairs."""
         if all(isinstance(section, steps.Section) for section in self.sections):
-            return tables.sheets(self.sections, explain, pairs)
+            return tables.sheets(self.sections, explain)
         return [section.sheet(explain) for section in self.sections]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

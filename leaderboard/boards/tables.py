@@ -27,17 +27,17 @@ MARKS = {
 }
 
 
-def sheets(sections: Sequence[Section], explain: bool = False, pairs: bool = False) -> list[Sheet]:
+def sheets(sections: Sequence[Section], explain: bool = False) -> list[Sheet]:
     """Return a table per task, at the horizon that most of its entries reach; the others have a line below it.
 
-    With `pairs` the matrix of all pairs follows each.
+    With `explain` the matrix of all pairs follows each.
     """
     made = []
     for task in dict.fromkeys(section.task for section in sections):
         of_task = [section for section in sections if section.task == task]
         main = main_section(of_task)
         made.append(replace(sheet(main, explain), lines=tuple(_elsewhere(main, of_task))))
-        made += [pairs_sheet(main)] * (pairs and len(main.rows) > 1)
+        made += [pairs_sheet(main)] * (explain and len(main.rows) > 1)
     return made
 
 

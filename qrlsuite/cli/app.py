@@ -121,6 +121,7 @@ RENAMED_OPTIONS = {
     "leaderboard": {
         "--across": "--task A --task B",
         "--min-seeds": "--entry chooses what is shown, --horizon leaves out shorter runs",
+        "--pairs": "--explain prints the matrix of all pairs, too",
     },
     "plot": {
         "--set": f"{_AFTER} `qrlsuite plot surface style=3d`",

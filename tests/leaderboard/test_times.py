@@ -49,7 +49,7 @@ def times_of(*entries: EntryResults, alpha: float = 0.05) -> Any:
 
 
 def markdown(*entries: EntryResults) -> str:
-    (made,) = boards.of(entries).sheets(explain=True)
+    made = boards.of(entries).sheets(explain=True)[0]
     return made.markdown()
 
 
@@ -232,7 +232,7 @@ def test_filters_change_no_rank() -> None:
 
 
 def test_the_matrix_of_pairs() -> None:
-    _, found = boards.of([*crossing(), reaching("few", (1, 3), seeds=5)]).sheets(pairs=True)
+    _, found = boards.of([*crossing(), reaching("few", (1, 3), seeds=5)]).sheets(explain=True)
     assert [row[2:] for row in found.rows] == [
         ("", "+/-", "+", "?"), ("+/-", "", "+", "?"), ("-", "-", "", "?"), ("?", "?", "?", ""),
     ]  # fmt: skip
@@ -246,7 +246,7 @@ def crossing() -> list[EntryResults]:
 def test_the_paper_s_rule_gives_the_published_tiers() -> None:
     """As the paper defines them; README of version 0.1.1 printed the same."""
     made = api.board("beam6g", rule="paper", published=True, runs="none")
-    found, pairs = made.sheets(pairs=True)
+    found, pairs = made.sheets(explain=True)
     heads = ["tier", "entry", "sample complexity (5%-95%)", "rests on", "cells +/-"]
     assert [column.head for column in found.columns[:5]] == heads
     assert [(row[0], row[1].removesuffix(" †"), row[3], row[4]) for row in found.rows] == [

@@ -77,9 +77,9 @@ def leaderboard(
             autocompletion=lambda: list(AXES),
         ),
     ] = "steps",
-    pairs: Annotated[bool, typer.Option("--pairs", help="Print the matrix of all pairs, too.")] = False,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Say below the table what its columns and marks mean.")
+        bool,
+        typer.Option("--explain", help="Say what columns and marks mean, and how each pair was decided."),
     ] = False,
     published: PublishedOption = False,
     runs: RunsOption = Path("runs"),
@@ -110,10 +110,6 @@ def leaderboard(
     if output is not None and format_ is not Format.html:
         raise OptionError(f"--out {output}: only the page is written to a file; add --format html")
     tasks = list(task or ())
-    if pairs and (len(tasks) > 1 or by != "steps"):
-        raise OptionError(
-            "--pairs: only the board of one task by steps has the matrix of pairs; --format json has the others'"
-        )
 
     asked: dict[str, Any] = {
         "by": by,
@@ -142,7 +138,7 @@ def leaderboard(
     if format_ is Format.csv:
         typer.echo(csv_rows(board.flat()), nl=False)
     else:
-        _write(board.sheets(explain, pairs), format_)
+        _write(board.sheets(explain), format_)
 
 
 def _left_out(lines: Sequence[str]) -> None:
