@@ -45,6 +45,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     axes = figure.subplots()
     few = sum(len(entry.seeds) for entry in entries) <= 40  # more lines than that hide each other
     single = few if chosen.runs is None else chosen.runs
+    lines = []
     for i, entry in enumerate(entries):
         look = style.of(entry, i)
         steps = np.arange(1, entry.curves.shape[1] + 1) * entry.steps_per_epoch
@@ -56,6 +57,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
         (line,) = axes.plot(
             steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry)
         )
+        lines.append(line)
         if len(steps) == 1:  # a line of one point is nothing to see
             line.set(marker="o", markersize=9)
             axes.errorbar(steps, middle, [middle - low, high - middle], color=look.color, linewidth=2)
@@ -70,8 +72,9 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     title = f"{entries[0].task}: median of the runs{'' if many else ', 5th to 95th percentile'}"
     axes.set_title(title, fontsize="medium", loc="left")
     legend = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
-    if many:
-        figure.legend(loc="outside right upper", fontsize=8, alignment="left", **legend)
+    if many:  # in the order in which the lines lie one above the other
+        handles = sorted(lines, key=lambda line: -float(np.mean(line.get_ydata())))
+        figure.legend(handles=handles, loc="outside right upper", fontsize=8, alignment="left", **legend)
     else:
         rising = entries[0].task_file.score.sign > 0
         axes.legend(loc="lower right" if rising else "upper right", **legend)
