@@ -57,7 +57,11 @@ REPLACED = {
 }
 """Words that had a second meaning or a second name, and what is written now."""
 ALLOWED = {
-    "docs/error-rates.md": ("plans rather too many seeds", "benchmarks/calibration.py"),
+    "docs/error-rates.md": (
+        "plans rather too many seeds",
+        "benchmarks/calibration.py",
+        *(f"{part} --pairs" for part in ("verdicts_calibration.py", "unequal", "replication")),
+    ),
     "docs/plugins.md": ("rzz-cost --qubits 4 --layers 2",),  # a plugin's command
     "docs/statistics.md": ("How many runs to plan",),
     "docs/tuning.md": ('"Hyperparameter optimization"',),  # the paper's title of a table
