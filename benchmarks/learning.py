@@ -1,4 +1,4 @@
-"""Learning on CartPole, side by side with Stable-Baselines3's DQN and PPO, and CleanRL's SAC, at equal settings.
+"""Learning on CartPole at equal settings, side by side with Stable-Baselines3, CleanRL's SAC, JAX and plain torch.
 
     pip install 'qrlsuite[bench]'
     python benchmarks/learning.py [--algorithms ddqn ppo sac] [--seeds 10] [--epochs 100] [--json out.json]
@@ -11,6 +11,8 @@ is switched to what the suite does: no clipping of gradients, constant explorati
 initialization, Adam's eps 1e-8. Two differences remain in its DQN and cannot be switched: targets are not double, and
 the error is Huber's; with several environments it also flips one coin for all of them where the suite flips one each.
 The third row, `SB3 DQN, our update`, is the same class with these three replaced, as the suite has them.
+`JAX, jit and vmap` is the same loop in `jax_ddqn.py`, with every seed and the environment in one compiled epoch; its
+compilation is not counted. `torch, one seed` is the loop in the manner of CleanRL's single files.
 
 Discrete SAC (Christodoulou 2019) is held to the equations of CleanRL's `sac_atari.py` (commit 004f8a0), written out
 here for CartPole's network: the loss of its temperature is linear in alpha and not in log alpha, means of the actor's
@@ -207,6 +209,89 @@ def sb3_dqn(entry: Entry, equal: bool) -> Callable[[Any, int], Any]:
     return make
 
 
+class PlainDDQN:
+    """One agent in plain torch, in the manner of CleanRL's single files: Gymnasium's vector, one network, one loop."""
+
+    def __init__(self, entry: Entry, environments: Any, seed: int) -> None:
+        self.o, self.envs, self.rng = entry.algorithm_options, environments, np.random.default_rng(seed)
+        torch.manual_seed(seed)
+        sizes = [4, *[entry.model_options.width] * entry.model_options.depth, 2]
+        layers: list[torch.nn.Module] = []
+        for i, o in itertools.pairwise(sizes):
+            layers += [torch.nn.Linear(i, o), torch.nn.ReLU()]
+        self.online = torch.nn.Sequential(*layers[:-1])
+        self.target = copy.deepcopy(self.online)
+        self.adam = torch.optim.Adam(self.online.parameters(), self.o.lr)
+        self.buffer, self.stored, self.updates = np.zeros((self.o.buffer, 11), np.float32), 0, 0
+        self.observations = environments.reset()
+
+    def learn(self, interactions: int, reset_num_timesteps: bool) -> None:
+        """Interact and learn."""
+        o, n = self.o, self.envs.num_envs
+        for _ in range(interactions // n):
+            with torch.no_grad():
+                actions = self.online(torch.from_numpy(self.observations)).argmax(1).numpy()
+            actions = np.where(self.rng.random(n) < o.epsilon, self.rng.integers(2, size=n), actions)
+            after, rewards, over, infos = self.envs.step(actions)
+            arrived = np.array([infos[i].get("terminal_observation", after[i]) for i in range(n)], np.float32)
+            alive = [not over[i] or infos[i]["TimeLimit.truncated"] for i in range(n)]
+            rows = [self.observations, arrived, actions[:, None], rewards[:, None], np.array(alive)[:, None]]
+            self.buffer[(self.stored + np.arange(n)) % o.buffer] = np.concatenate(rows, 1)
+            self.stored, self.observations = self.stored + n, after
+            picked = self.rng.integers(min(self.stored, o.buffer), size=o.batch)
+            batch = torch.from_numpy(self.buffer[picked])
+            following, chosen = batch[:, 4:8], batch[:, 8:9].long()
+            with torch.no_grad():
+                best = self.online(following).argmax(1, keepdim=True)
+                y = batch[:, 9:10] + o.gamma * batch[:, 10:11] * self.target(following).gather(1, best)
+            loss = torch.nn.functional.mse_loss(self.online(batch[:, :4]).gather(1, chosen), y)
+            self.adam.zero_grad()
+            loss.backward()
+            self.adam.step()
+            self.updates += 1
+            if self.updates % o.target_steps == 0:
+                self.target.load_state_dict(self.online.state_dict())
+
+    def predict(self, observations: NDArray[np.float32], deterministic: bool) -> tuple[Any, None]:
+        """Return greedy actions."""
+        with torch.no_grad():
+            return self.online(torch.from_numpy(observations)).argmax(1).numpy(), None
+
+
+def by_jax(entry: Entry, seeds: range, epochs: int) -> Runs:
+    """Train JAX's agents together, see `jax_ddqn`; compilation is not counted."""
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    import jax
+    import jax_ddqn
+
+    assert jax_ddqn.check() < 1e-5, "JAX's CartPole is another one"
+    o, model = entry.algorithm_options, entry.model_options
+    settings = jax_ddqn.Settings(
+        width=model.width,
+        depth=model.depth,
+        lr=o.lr,
+        gamma=o.gamma,
+        epsilon=o.epsilon,
+        buffer=o.buffer,
+        batch=o.batch,
+        target_steps=o.target_steps,
+        environments=ENVIRONMENTS,
+        rounds=INTERACTIONS // ENVIRONMENTS,
+    )
+    begin, epoch, act = jax_ddqn.compiled(settings)
+    keys = jax.vmap(jax.random.key)(np.array(seeds))
+    jax.block_until_ready(epoch(begin(keys)))  # compiles
+    agents = begin(keys)
+    play = Evaluation(entry, [Streams(entry.task.hash, seed) for seed in seeds])
+    seconds, scores = 0.0, []
+    for number in range(epochs):
+        begun = time.process_time()
+        agents = jax.block_until_ready(epoch(agents))
+        seconds += time.process_time() - begun
+        scores.append(play(lambda x, agents=agents: np.asarray(act(agents, x)), number + 1))
+    return Runs("JAX, jit and vmap", np.stack(scores, axis=1), seconds / len(seeds))
+
+
 def sb3_ppo(entry: Entry) -> Callable[[Any, int], Any]:
     """Return a maker of PPO agents at an entry's settings."""
     from stable_baselines3 import PPO
@@ -369,7 +454,12 @@ def main() -> None:
         if algorithm == "sac":
             peers = {"CleanRL SAC": functools.partial(CleanSAC, entry)}
         if algorithm == "ddqn":
-            peers = {"SB3 DQN": sb3_dqn(entry, False), "SB3 DQN, our update": sb3_dqn(entry, True)}
+            peers = {
+                "SB3 DQN": sb3_dqn(entry, False),
+                "SB3 DQN, our update": sb3_dqn(entry, True),
+                "torch, one seed": functools.partial(PlainDDQN, entry),
+            }
+            all_runs.append(by_jax(entry, seeds, arguments.epochs))
         all_runs += [theirs(name, make, entry, seeds, arguments.epochs) for name, make in peers.items()]
         report(all_runs)
         stored[algorithm] = {
