@@ -1,4 +1,4 @@
-"""A model that asks for the observations' space is checked on an image, and on a task's own observations."""
+"""The model of images in a loop over agents and on a task of its own, and its convolutions beside those of torch."""
 
 from __future__ import annotations
 
@@ -8,22 +8,24 @@ import pytest
 import torch
 from torch import nn
 
+from qrlsuite import registry, specs
 from qrlsuite.population import stack
 from qrlsuite.testing import check
-from tests.testing.images import SPEC
 
 
-@pytest.mark.parametrize("population", [None, "qrlsuite.population:loop"])
-def test_convolutions_keep_every_rule(population: str | None) -> None:
+def test_a_loop_over_agents_keeps_every_rule_of_a_population() -> None:
     """Seeds alone, in pairs and among five: to the last bit, though torch's own convolutions are not."""
-    findings = check("model", replace(SPEC, population=population))
+    spec = replace(
+        registry.get(specs.ModelSpec, "cnn"), name="in-a-loop", population="qrlsuite.population:loop"
+    )
+    findings = check("model", spec)
     assert not [finding for finding in findings if not finding.ok]
     assert "seed independence" in {finding.rule for finding in findings}
 
 
 def test_a_tasks_observations_take_the_place_of_the_image() -> None:
-    [first] = [finding for finding in check("model", SPEC, task="cartpole") if not finding.ok]
-    assert (first.rule, "not enough values to unpack" in first.message) == ("builds", True)
+    [first] = [finding for finding in check("model", "cnn", task="cartpole") if not finding.ok]
+    assert (first.rule, "model 'cnn' needs images" in first.message) == ("builds", True)
 
 
 @pytest.mark.parametrize(
