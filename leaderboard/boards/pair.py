@@ -101,11 +101,12 @@ class PairVerdict:
     def sentence(self) -> str:
         """The verdict, its size and how sure it is; of shorter runs than the task asks for, it begins with that."""
         if self.times.horizon >= self.whole:
-            return self._said
-        return f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {self._said}"
+            return self.said
+        return f"after {steps_text(self.times.horizon)} of {steps_text(self.whole)} steps: {self.said}"
 
     @property
-    def _said(self) -> str:
+    def said(self) -> str:
+        """The same without its beginning, for a list that has said it."""
         first, second = self.labels
         pair = self.times
         if (pair.at_cap == 1).all():

@@ -243,7 +243,7 @@ def test_the_demo_ends_with_a_sentence_for_each_pair(
     assert all("neither reached any of the 7 thresholds within 2k steps" in line for line in verdicts), (
         verdicts
     )
-    assert "Your 2 seeds, 2000 steps each" in said.out
+    assert "Your 2 seeds, pair by pair, after 2k of 200k steps:" in said.out
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import typer
 from qrlsuite.cli.app import build
 from qrlsuite.cli.arguments import RunsOption
 from qrlsuite.engine.terminal import command
+from qrlsuite.results.text import steps_text
 
 TASK = "beam6g"
 ENTRIES = ("mlp width=16", "mlp width=64", "vqc-native qubits=6")
@@ -41,9 +42,12 @@ def demo(runs: RunsOption = Path("runs")) -> None:
     horizon = EPOCHS * trained[0].steps_per_epoch
     _do("leaderboard", "--task", TASK, "--published", "--horizon", str(horizon), runs=runs)
     _do("plot", "curves", "--task", TASK, *(word for e in ENTRIES for word in ("--entry", e)), runs=runs)
-    typer.echo(f"\nYour {SEEDS} seeds, {horizon} steps each, pair by pair:")
+    whole = min(trained[0].task_file.ranking.horizons)
+    typer.echo(
+        f"\nYour {SEEDS} seeds, pair by pair, after {steps_text(horizon)} of {steps_text(whole)} steps:"
+    )
     for first, second in combinations(trained, 2):
-        typer.echo(f"- {api.compare(first, second).verdict}")
+        typer.echo(f"- {api.compare(first, second).pair.said}")
     typer.echo("Next, a circuit of your own: write it in ring.py, as README does, and add --plugin ring.py")
 
 
