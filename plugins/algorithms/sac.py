@@ -54,6 +54,7 @@ from qrlsuite import masks
 from qrlsuite.actions import from_units, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
+from qrlsuite.errors import OptionError
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, follow, gradients, part, prefixed
 from qrlsuite.replay import Replay
@@ -141,6 +142,11 @@ class SAC:
         self.temperature = Temperature(options.temperature or 1.0, self.S).to(device)
         usual = 0.98 * math.log(self.N) if self.discrete else -float(self.N)
         self.least_entropy = usual if options.target_entropy is None else options.target_entropy
+        if self.discrete and self.least_entropy > math.log(self.N):
+            raise OptionError(
+                f"target_entropy = {self.least_entropy:g}: a policy of {self.N} actions has log {self.N} = "
+                f"{math.log(self.N):.4f} at most, and the temperature would grow without end: set a smaller one"
+            )
         self.adams = {
             name: Adam(module, options.lr, options.quantum_lr)
             for name, module in (

@@ -125,6 +125,14 @@ def test_images_masks_memory_and_joint_actions(task: str, text: str, tmp_path: P
     assert_contract(entry(tmp_path, task, text))
 
 
+def test_an_entropy_that_no_policy_has_is_refused(tmp_path: Path) -> None:
+    made = entry(tmp_path, "cartpole", "sac mlp width=5 target_entropy=0.7")
+    with pytest.raises(
+        OptionError, match=r"target_entropy = 0.7: a policy of 2 actions has log 2 = 0.6931 at most"
+    ):
+        Trainer(made, [0])
+
+
 def test_masks_leave_something_to_choose(tmp_path: Path) -> None:
     with pytest.raises(
         EnvironmentFailure, match=r"'action_mask'\] leaves no action, and the episode goes on: end it"
