@@ -45,9 +45,10 @@ def check(subject: Subject, task: str | None = None) -> list[Finding]:
         worlds = {f"{kind} actions": World.toy(kind) for kind in others}
         if optional:
             worlds["memory of episodes"] = World.toy(first, hidden=True)
-        if "infos" in taken and first == "discrete":
-            hidden = asks is not None and not optional
-            worlds["masks"] = World.toy(first, hidden=hidden, masked=True)
+        if "infos" in taken and "discrete" in subject.spec.actions:
+            masked = World.toy("discrete", hidden=hidden, masked=True)
+            if asks is None or _obeys(Trial(subject, masked)):  # who asks for `begins` is given infos, too
+                worlds["masks"] = masked
         for rule, world in worlds.items():
             findings += _check_more(subject, world, rule)
     return findings
@@ -257,14 +258,17 @@ def _remembers(trial: Trial) -> None:
 
 def _heeds(trial: Trial) -> None:
     """Where one action alone can be chosen, it is chosen."""
+    require(_obeys(trial), "act chooses what infos['action_mask'] forbids")
+
+
+def _obeys(trial: Trial) -> bool:
+    """Tell whether an untrained agent chooses each action where it alone can be chosen."""
     group = trial.group(range(S)).start()
-    group.train()
-    for number in range(ACTIONS):
-        mask = np.broadcast_to(np.arange(ACTIONS) == number, (S, 8, ACTIONS))
-        require(
-            bool((group.act(infos={"action_mask": mask}) == number).all()),
-            "act chooses what infos['action_mask'] forbids",
-        )
+    alone = np.eye(ACTIONS, dtype=np.bool_)
+    return all(
+        bool((group.act(infos={"action_mask": np.broadcast_to(mask, (S, 8, ACTIONS))}) == number).all())
+        for number, mask in enumerate(alone)
+    )
 
 
 def _learns(trial: Trial) -> None:

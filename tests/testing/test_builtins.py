@@ -62,16 +62,18 @@ WHERE_OFFERED = {
             *(f"{m}-{b}" for m in ("vqc", "qlstm", "qfwp") for b in BACKENDS),
         )
     },
-    **{("algorithms", name): ["memory"] for name in ("ddqn", "reinforce", "td3")},
-    ("algorithms", "drqn"): ["memory", "memory of episodes"],
+    ("algorithms", "td3"): ["memory"],
+    **{("algorithms", name): ["memory", "masks"] for name in ("ddqn", "reinforce")},
+    ("algorithms", "drqn"): ["memory", "memory of episodes", "masks"],
     ("algorithms", "ppo"): [
         "memory",
+        "masks",
         "box actions",
         "multi-discrete actions",
         "multi-binary actions",
         "memory of episodes",
     ],
-    ("algorithms", "sac"): ["memory", "discrete actions"],
+    ("algorithms", "sac"): ["memory", "masks", "discrete actions"],
 }
 """Rules about what a thing need not have."""
 
