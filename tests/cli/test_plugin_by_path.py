@@ -37,6 +37,22 @@ def run(
     return done.stdout + done.stderr
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which two seeds were trained."""
+    made = tmp_path_factory.mktemp("once")
+    (made / "tiny.toml").write_text(TINY)
+    (made / "ring.py").write_text(RING)
+    run(made)
+    return made
+
+
+@pytest.fixture
+def trained(once: Path, tmp_path: Path) -> Path:
+    """The same, in a copy."""
+    return Path(shutil.copytree(once, tmp_path / "once"))
+
+
 def entry_of(folder: Path) -> Path:
     (found,) = (folder / "runs" / "tiny").iterdir()
     return found
@@ -88,18 +104,17 @@ def test_train_edit_and_read_without_the_file(folder: Path) -> None:
     assert results(entry, 0) == before
 
 
-def test_a_copy_that_was_altered_is_not_imported(folder: Path) -> None:
-    run(folder)
-    entry = entry_of(folder)
+def test_a_copy_that_was_altered_is_not_imported(trained: Path) -> None:
+    entry = entry_of(trained)
     (copy,) = entry.glob("plugins/*/ring.py")
     copy.write_text("open('it-ran', 'w')\n" + RING)
-    (folder / "ring.py").rename(folder / "elsewhere")
+    (trained / "ring.py").rename(trained / "elsewhere")
     for words in (("leaderboard",), ("show", entry.name), ("runs",)):
-        assert qrlsuite(*words, cwd=folder).returncode == 0
-    assert "is not what it was when it was copied" in run(folder, "--seeds", "3", plugin=str(entry), code=2)
-    assert not list(folder.rglob("it-ran"))
-    (folder / "elsewhere").rename(folder / "ring.py")
-    run(folder, "--seeds", "3")
+        assert qrlsuite(*words, cwd=trained).returncode == 0
+    assert "is not what it was when it was copied" in run(trained, "--seeds", "3", plugin=str(entry), code=2)
+    assert not list(trained.rglob("it-ran"))
+    (trained / "elsewhere").rename(trained / "ring.py")
+    run(trained, "--seeds", "3")
     assert copy.read_text() == RING, "a command with the plugin makes the copy anew"
 
 
@@ -112,35 +127,33 @@ def test_a_worker_finds_the_plugin_in_the_entrys_folder_alone(folder: Path) -> N
     assert json.loads((entry_of(folder) / "seed-0002" / "run.json").read_text())["status"] == "finished"
 
 
-def test_an_import_takes_the_copy_along(folder: Path) -> None:
-    run(folder)
-    entry, theirs = entry_of(folder), folder / "theirs"
-    (folder / "runs").rename(theirs)
-    (folder / "ring.py").rename(folder / "elsewhere")
+def test_an_import_takes_the_copy_along(trained: Path) -> None:
+    entry, theirs = entry_of(trained), trained / "theirs"
+    (trained / "runs").rename(theirs)
+    (trained / "ring.py").rename(trained / "elsewhere")
     given = theirs / "tiny" / entry.name
-    lacking = qrlsuite("import", str(given), cwd=folder)
+    lacking = qrlsuite("import", str(given), cwd=trained)
     assert (lacking.returncode, "if you trust it, add --plugin " in lacking.stderr) == (2, True)
-    taken = qrlsuite("import", str(given), "--plugin", str(given), cwd=folder)
+    taken = qrlsuite("import", str(given), "--plugin", str(given), cwd=trained)
     assert taken.returncode == 0, taken.stderr
     shutil.rmtree(theirs)
-    played = qrlsuite("evaluate", entry.name, "--episodes", "2", "--plugin", str(entry), cwd=folder)
+    played = qrlsuite("evaluate", entry.name, "--episodes", "2", "--plugin", str(entry), cwd=trained)
     assert played.returncode == 0, played.stderr
 
 
-def test_a_record_that_names_other_files_is_refused(folder: Path) -> None:
-    run(folder)
-    entry = entry_of(folder)
-    (folder / "evil.py").write_text("open('it-ran', 'w')\n")
+def test_a_record_that_names_other_files_is_refused(trained: Path) -> None:
+    entry = entry_of(trained)
+    (trained / "evil.py").write_text("open('it-ran', 'w')\n")
     path = entry / "entry.json"
     record = json.loads(path.read_text())
-    for place in ("../../../evil.py", str(folder / "evil.py"), "plugins/../../../../evil.py"):
+    for place in ("../../../evil.py", str(trained / "evil.py"), "plugins/../../../../evil.py"):
         record["plugins"] = {code: [place] for code in record["plugins"]}
         path.write_text(json.dumps(record))
         assert "plugins names no copies of plugins; restore the file" in run(
-            folder, plugin=str(entry), code=2
+            trained, plugin=str(entry), code=2
         )
-    assert not (folder / "it-ran").exists()
-    run(folder, "--seeds", "3", code=2)
+    assert not (trained / "it-ran").exists()
+    run(trained, "--seeds", "3", code=2)
 
 
 @pytest.mark.parametrize("engine", ["local", "command"])

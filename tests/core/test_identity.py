@@ -121,13 +121,14 @@ class Author:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.site, self.runs = folder, folder / "site", folder / "runs"
-        self.site.mkdir()
-        install(self.site, "own", PLUGIN)
-        self.edits = 0
-        for name, text in FILES.items():
-            self.write(name, text)
-        self.task = folder / "tiny.toml"
-        self.task.write_text(TINY)
+        self.task, self.edits = folder / "tiny.toml", 100
+        if not self.site.exists():
+            self.site.mkdir()
+            install(self.site, "own", PLUGIN)
+            self.edits = 0
+            for name, text in FILES.items():
+                self.write(name, text)
+            self.task.write_text(TINY)
 
     def write(self, name: str, text: str) -> None:
         """Write a module; its time moves on, so that no compiled copy stands for it."""
@@ -165,6 +166,20 @@ class Author:
 @pytest.fixture
 def author(tmp_path: Path) -> Author:
     return Author(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an author who has trained two seeds of model `line`."""
+    made = Author(tmp_path_factory.mktemp("line"))
+    assert made.run(model="line").returncode == 0
+    return made.folder
+
+
+@pytest.fixture
+def trained(line: Path, tmp_path: Path) -> Author:
+    """The same, in a copy."""
+    return Author(Path(shutil.copytree(line, tmp_path / "line")))
 
 
 def test_an_edited_circuit_is_another_entry(author: Author) -> None:
@@ -216,31 +231,29 @@ def test_an_edited_circuit_is_another_entry(author: Author) -> None:
     assert author.board().keys() != {label}
 
 
-def test_its_author_may_say_that_nothing_changed(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    author.edit("own_helper", "filled(layer, generator):", "filled(layer, generator, more=None):")
-    refused = author.run(model="line", seeds="4")
+def test_its_author_may_say_that_nothing_changed(trained: Author) -> None:
+    trained.edit("own_helper", "filled(layer, generator):", "filled(layer, generator, more=None):")
+    refused = trained.run(model="line", seeds="4")
     assert refused.returncode == 2
     assert "own_helper.py of own (model 'line') has changed" in refused.stderr
-    assert author.run("--same", " ", model="line").returncode == 2
-    both = author.run("--same", "no", "--fresh", model="line")
+    assert trained.run("--same", " ", model="line").returncode == 2
+    both = trained.run("--same", "no", "--fresh", model="line")
     assert both.returncode == 2
     assert "give one of them" in both.stderr
-    assert author.run("--same", "an argument that nobody gives", model="line", seeds="4").returncode == 0
-    assert list(author.board().values()) == [4]
-    (name,) = author.entries()
-    (said,) = read_json(author.runs / "tiny" / name / "entry.json")["same"]
+    assert trained.run("--same", "an argument that nobody gives", model="line", seeds="4").returncode == 0
+    assert list(trained.board().values()) == [4]
+    (name,) = trained.entries()
+    (said,) = read_json(trained.runs / "tiny" / name / "entry.json")["same"]
     assert said["reason"] == "an argument that nobody gives"
     assert len(said["codes"]) == 2
-    assert author.run(model="line", seeds="5").returncode == 0  # it is said once
+    assert trained.run(model="line", seeds="5").returncode == 0  # it is said once
 
 
-def test_docstrings_and_other_modules_do_not_count(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    author.edit("own_helper", '"""Fill it."""', '"""Fill all of it."""  # at random')
-    author.edit("own_aside", "1", "2")
-    author.edit("own", "a circuit", "my circuit")
-    assert author.run(model="line", seeds="3").returncode == 0
+def test_docstrings_and_other_modules_do_not_count(trained: Author) -> None:
+    trained.edit("own_helper", '"""Fill it."""', '"""Fill all of it."""  # at random')
+    trained.edit("own_aside", "1", "2")
+    trained.edit("own", "a circuit", "my circuit")
+    assert trained.run(model="line", seeds="3").returncode == 0
 
 
 def test_a_file_that_an_option_names_counts(author: Author) -> None:
@@ -254,78 +267,73 @@ def test_a_file_that_an_option_names_counts(author: Author) -> None:
     assert "the file 'model.data' has another content" in refused.stderr
 
 
-def test_a_plugins_seeds_from_before_need_a_word(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    (name,) = author.entries()
-    store = EntryStore(author.runs / "tiny" / name)
+def test_a_plugins_seeds_from_before_need_a_word(trained: Author) -> None:
+    (name,) = trained.entries()
+    store = EntryStore(trained.runs / "tiny" / name)
     for seed in store.seeds():
         edit_json(store.seed(seed).path / "run.json", code=None)
-    refused = author.run(model="line", seeds="3")
+    refused = trained.run(model="line", seeds="3")
     assert refused.returncode == 2
     assert "before the code of plugins was recorded" in refused.stderr
-    assert author.run("--fresh", model="line").returncode == 0
-    assert author.entries() == sorted([name, f"{name}@00000000"])
-    assert len(author.board()) == 2
+    assert trained.run("--fresh", model="line").returncode == 0
+    assert trained.entries() == sorted([name, f"{name}@00000000"])
+    assert len(trained.board()) == 2
 
 
-def test_a_worker_with_other_code_refuses(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    author.edit("own_helper", "rand(", "randn(")
-    (name,) = author.entries()
-    folder = author.runs / "tiny" / name
+def test_a_worker_with_other_code_refuses(trained: Author) -> None:
+    trained.edit("own_helper", "rand(", "randn(")
+    (name,) = trained.entries()
+    folder = trained.runs / "tiny" / name
     for seed in (0, 1):
         shutil.rmtree(folder / f"seed-{seed:04d}")
-    worker = start_worker(str(folder), "--seeds", "0:2", "--epochs", "1", env=installed(author.site))
+    worker = start_worker(str(folder), "--seeds", "0:2", "--epochs", "1", env=installed(trained.site))
     message = worker.communicate()[1]
     assert worker.returncode == 2
     assert "than the machine that started it" in message
     assert "own_helper.py of own (model 'line') has changed" in message
 
 
-def test_an_export_carries_the_code_and_is_verified_with_it(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    assert author.command("export", "line", "--out", "out").returncode == 0
-    (path,) = (author.folder / "out").glob("*/*/entry.json")
+def test_an_export_carries_the_code_and_is_verified_with_it(trained: Author) -> None:
+    assert trained.command("export", "line", "--out", "out").returncode == 0
+    (path,) = (trained.folder / "out").glob("*/*/entry.json")
     assert [part["role"] for part in json.loads(path.read_text())["code"]["parts"]][-1] == "model"
     verify = ("verify", str(path.parent), "--rerun", "1")
-    good = qrlsuite(*verify, env=installed(author.site), cwd=author.folder)
+    good = qrlsuite(*verify, env=installed(trained.site), cwd=trained.folder)
     assert good.returncode == 0, good.stdout + good.stderr
-    author.edit("own_helper", "rand(", "randn(")
-    other = qrlsuite(*verify, env=installed(author.site), cwd=author.folder)
+    trained.edit("own_helper", "rand(", "randn(")
+    other = qrlsuite(*verify, env=installed(trained.site), cwd=trained.folder)
     assert other.returncode != 0
     assert "own_helper.py of own" in other.stdout + other.stderr
 
 
-def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    assert author.command("export", "line", "--out", "out").returncode == 0
-    author.edit("own_helper", "rand(", "randn(")
+def test_other_code_neither_plays_nor_exports_nor_takes_over_what_was_trained(trained: Author) -> None:
+    assert trained.command("export", "line", "--out", "out").returncode == 0
+    trained.edit("own_helper", "rand(", "randn(")
     for words in (("evaluate", "line", "--best", "1", "--episodes", "4"), ("export", "line", "--out", "out")):
-        refused = author.command(*words)
+        refused = trained.command(*words)
         assert refused.returncode == 2
         assert "own_helper.py of own (model 'line') has changed" in refused.stderr
-    before, author.runs = author.runs, author.folder / "more"
-    assert author.run(model="line", seeds="2:4").returncode == 0
-    for folder in (before, author.folder / "out"):
-        refused = author.command("import", str(folder))
+    before, trained.runs = trained.runs, trained.folder / "more"
+    assert trained.run(model="line", seeds="2:4").returncode == 0
+    for folder in (before, trained.folder / "out"):
+        refused = trained.command("import", str(folder))
         assert "are not all of one code" in refused.stdout + refused.stderr
         assert "own_helper.py of own" in refused.stdout + refused.stderr
-    assert list(author.board().values()) == [2]
+    assert list(trained.board().values()) == [2]
 
 
-def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(author: Author) -> None:
-    assert author.run(model="line").returncode == 0
-    author.edit("own_helper", "rand(", "randn(")
-    assert author.run("--fresh", model="line").returncode == 0
-    before, author.runs = author.runs, author.folder / "more"
+def test_a_results_folder_is_taken_over_with_the_seeds_that_fresh_put_aside(trained: Author) -> None:
+    trained.edit("own_helper", "rand(", "randn(")
+    assert trained.run("--fresh", model="line").returncode == 0
+    before, trained.runs = trained.runs, trained.folder / "more"
     held = sorted(path.relative_to(before) for path in before.glob("*/*/seed-*/run.json"))
     assert len(held) == 4
     for _ in range(2):  # again, there is nothing new
-        done = author.command("import", str(before))
+        done = trained.command("import", str(before))
         assert done.returncode == 0, done.stdout + done.stderr
-        found = [path.relative_to(author.runs) for path in author.runs.glob("*/*/seed-*/run.json")]
+        found = [path.relative_to(trained.runs) for path in trained.runs.glob("*/*/seed-*/run.json")]
         assert sorted(found) == held
-    assert list(author.board().values()) == [2, 2]
+    assert list(trained.board().values()) == [2, 2]
 
 
 STUDY = """

@@ -179,13 +179,8 @@ def test_a_requirement_that_cannot_be_read(tmp_path: Path) -> None:
 def distribution(folder: Path, requires: list[str]) -> metadata.Distribution:
     info = folder / "acme-2.5.dist-info"
     info.mkdir()
-    lines = [
-        "Metadata-Version: 2.1",
-        "Name: acme",
-        "Version: 2.5",
-        *(f"Requires-Dist: {r}" for r in requires),
-    ]
-    (info / "METADATA").write_text("\n".join(lines) + "\n")
+    lines = [f"Requires-Dist: {r}\n" for r in requires]
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 2.5\n" + "".join(lines))
     return metadata.Distribution.at(info)
 
 
