@@ -73,7 +73,7 @@ def test_ways_are_the_shortest_and_the_policy_walks_them() -> None:
 
 def test_the_beam_earns_what_the_equation_says() -> None:
     """At xi = pi / N_s, in the main lobe, what the sum over the senders gives; on the peak 1 / R^2."""
-    lanes = AngleLanes(AngleOptions(degree=2, steps=2), 1)
+    lanes = AngleLanes(AngleOptions(degree=2, steps=2, turn=None), 1)
     lanes.reset(seed=0)
     state = lanes.state_dict()
     state["support_points"][:] = [[[3, 3], [3, 3.5]]]  # hardly a step from straight above the antenna
@@ -91,13 +91,14 @@ def test_the_beam_earns_what_the_equation_says() -> None:
     assert error == pytest.approx((angle - np.pi / 2) / 2, rel=1e-4)
 
 
-def test_the_best_angle_has_a_score_of_one() -> None:
-    lanes = AngleLanes(AngleOptions(steps=30), 16)
+@pytest.mark.parametrize("turn", [None, 0.5])
+def test_the_best_angle_has_a_score_of_one(turn: float | None) -> None:
+    lanes = AngleLanes(AngleOptions(steps=60, turn=turn), 16)
     seen, _ = lanes.reset(seed=3)
     policy = BestAngle(lanes)
-    for _ in range(30):
+    for _ in range(60):
         seen, _, _, _, infos = lanes.step(policy(seen))
-    np.testing.assert_allclose(infos["final_info"]["score"], 1, atol=1e-6)
+    np.testing.assert_allclose(infos["final_info"]["score"], 1, atol=1e-5 if turn is None else 0.05)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from qrlsuite.leaderboard import pictures
 from qrlsuite.leaderboard.boards import board, tables
 from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.report import render
-from qrlsuite.leaderboard.shelf import collect, import_curves, import_seeds, published, verify
+from qrlsuite.leaderboard.shelf import collect, fields, import_curves, import_seeds, published, verify
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.leaderboard.shelf.export import export
 from qrlsuite.results.store import EntryStore
@@ -106,6 +106,11 @@ def test_a_metric_is_ranked_and_less_is_better(walked: tuple[Path, EntryResults]
         assert [section.entries[i].name for i in section.order] == [entry.name, "other"], by
         assert [section.ranks[i] for i in section.order] == [(1, 1), (2, 2)], by
         assert section.cells(1)[5].startswith("2.000"), "above the first"
+    assert (
+        entry.to_table()["measured.steps-taken"].to_pylist() == entry.metrics["steps-taken"].ravel().tolist()
+    )
+    for rows, count in (("entries", 1), ("seeds", 20), ("epochs", 40)):
+        assert fields.table([entry], rows)["measured.late"].to_pylist() == [1.0] * count
     page = render(made)
     for text in ("Steps above threshold", "Final steps-taken", ">late</th>", "validation steps-taken"):
         assert text in page, text

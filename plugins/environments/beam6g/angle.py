@@ -34,6 +34,14 @@ class AngleOptions:
     ] = ((3.0, 0.0), (1.0, 0.0))
     degree: Annotated[int, Field(ge=2, le=32, description="number of support points of a trajectory")] = 3
     steps: Annotated[int, Field(ge=1, le=100_000, description="actions per episode, the horizon")] = 200
+    turn: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=3.2,
+            description="most that a beam turns in a step, radians; absent: to any angle at once",
+        ),
+    ] = 0.2
     stack: Annotated[
         int, Field(ge=1, le=1000, description="number of last observations that make one, the oldest first")
     ] = 4
@@ -50,8 +58,8 @@ class BeamAngle(OneLane):
     ## Description
 
     A user walks through the field of `beam6g`, on paths of the same law. One antenna serves it, a phased array of N_s =
-    17 senders along the unit vector d. The agent chooses the direction theta of its beam, measured from d, at every
-    step. It sees neither the field nor the user.
+    17 senders along the unit vector d. The agent turns its beam, or chooses the direction theta of it, measured from d,
+    at every step. It sees neither the field nor the user.
 
     The physics is that of the paper, "Benchmarking Quantum Reinforcement Learning", appendix "6G Beam forming and RL
     environment". Its codebook is a list of angles theta_i with the phase gradients phi_i = pi cos(theta_i); here theta
@@ -70,7 +78,8 @@ class BeamAngle(OneLane):
 
     ## Action Space
 
-    `Box(0, pi, (1,), float32)`: theta, radians. An array of senders in a line cannot tell theta from -theta.
+    `Box(-turn, turn, (1,), float32)`: by how much theta changes, radians; it stays in 0 .. pi, for an array of senders
+    in a line cannot tell theta from -theta. Without `turn`, `Box(0, pi, (1,), float32)`: theta itself.
 
     ## Observation Space
 
@@ -103,6 +112,7 @@ class BeamAngle(OneLane):
     | `antenna` | ((3, 0), (1, 0)) | position and orientation                 |
     | `degree`  | 3                | support points of a path, 2 to 32        |
     | `steps`   | 200              | actions per episode                      |
+    | `turn`    | 0.2              | most that a beam turns in a step, radians |
     | `stack`   | 4                | number of last observations that make one |
 
     ## Version History
@@ -120,9 +130,10 @@ class BeamAngle(OneLane):
         antenna: Antenna = ((3.0, 0.0), (1.0, 0.0)),
         degree: int = 3,
         steps: int = 200,
+        turn: float | None = 0.2,
         stack: int = 4,
     ) -> None:
-        values = {"antenna": antenna, "degree": degree, "steps": steps, "stack": stack}
+        values = {"antenna": antenna, "degree": degree, "steps": steps, "turn": turn, "stack": stack}
         super().__init__(AngleLanes(option_words.build(AngleOptions, values, "environment 'beam-angle'"), 1))
 
 
@@ -142,12 +153,14 @@ class AngleLanes(LaneEnv):
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.options = options
         observation = Box(0.0, 1.0, (2 * options.stack,), np.float32)
-        batched_spaces(self, observation, Box(0.0, np.float32(np.pi), (1,), np.float32), num_envs)
+        low, high = (0.0, np.pi) if options.turn is None else (-options.turn, options.turn)
+        batched_spaces(self, observation, Box(np.float32(low), np.float32(high), (1,), np.float32), num_envs)
         self.streams = []
         self._physics = physics("text")
         self._lane = np.arange(num_envs)
         self._support = np.zeros((num_envs, options.degree, 2))
         self._step = np.zeros(num_envs, np.int64)
+        self._angle = np.zeros(num_envs)
         self._sums = np.zeros((num_envs, 2))
         """Received intensity, and distance to the best angle."""
         self._seen = np.zeros((num_envs, 2 * options.stack), np.float32)
@@ -170,14 +183,14 @@ class AngleLanes(LaneEnv):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Point the beams at the angles `actions` (L, 1), radians.
+        """Turn the beams by `actions` (L, 1), or point them there, radians.
 
         Raises
         ------
         gymnasium.error.ResetNeeded
             If there was no reset.
         gymnasium.error.InvalidAction
-            If an action is no angle in 0..pi.
+            If an action is none of the space.
         """
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
@@ -186,6 +199,9 @@ class AngleLanes(LaneEnv):
         running = self._step < self.options.steps
         self._step += running
         angles = actions[:, 0].astype(np.float64)
+        if self.options.turn is not None:
+            angles = np.clip(self._angle + angles, 0.0, np.pi)
+        self._angle[running] = angles[running]
         u, r2 = self._u[self._lane, self._step], self._r2[self._lane, self._step]
         rewards = self._physics.intensity(u, r2, np.pi * np.cos(angles)) * running
         error = np.abs(angles - np.arccos(u / np.pi)) * running
@@ -206,7 +222,7 @@ class AngleLanes(LaneEnv):
     def state_dict(self) -> State:
         """Return the episodes' state, lane-first.
 
-        `support_points` (L, degree, 2), `step` (L,), `sums` (L, 2) and `observations` (L, 2 * stack).
+        `support_points` (L, degree, 2), `step` and `angle` (L,), `sums` (L, 2) and `observations` (L, 2 * stack).
 
         Raises
         ------
@@ -250,6 +266,7 @@ class AngleLanes(LaneEnv):
         return {
             "support_points": self._support,
             "step": self._step,
+            "angle": self._angle,
             "sums": self._sums,
             "observations": self._seen,
         }
@@ -260,9 +277,10 @@ class AngleLanes(LaneEnv):
         self._support[lanes] = trajectory.sample(self.streams, counts.tolist(), self.options.degree)
         self._tabulate(lanes)
         self._step[lanes] = 0
+        self._angle[lanes] = np.arccos(self._u[lanes, 0] / np.pi)
         best = 1.0 / self._r2[lanes, 0]
         self._sums[lanes] = np.stack([best, np.zeros_like(best)], axis=1)
-        first = np.stack([np.arccos(self._u[lanes, 0] / np.pi) / np.pi, best], axis=1)
+        first = np.stack([self._angle[lanes] / np.pi, best], axis=1)
         self._seen[lanes] = np.tile(first.astype(np.float32), (1, self.options.stack))
 
     def _tabulate(self, lanes: NDArray[np.intp]) -> None:
@@ -272,7 +290,7 @@ class AngleLanes(LaneEnv):
 
 
 class BestAngle:
-    """The reference policy that knows where the user will be: a score of 1."""
+    """The reference policy that knows where the user will be: a score of 1, where the beam turns fast enough."""
 
     def __init__(self, envs: LaneEnv) -> None:
         if not isinstance(envs, AngleLanes):
@@ -280,19 +298,24 @@ class BestAngle:
         self.envs = envs
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the angles (L, 1)."""
-        angles: NDArray[np.float32] = self.envs.best_angles()[:, None].astype(np.float32)
-        return angles
+        """Return the turns to the best angles, or these (L, 1)."""
+        space: Any = self.envs.single_action_space
+        from_ = 0.0 if self.envs.options.turn is None else self.envs.state_dict()["angle"]
+        actions = (self.envs.best_angles() - from_)[:, None].astype(np.float32)
+        clipped: NDArray[np.float32] = np.clip(actions, space.low, space.high)
+        return clipped
 
 
 class SameAngle:
     """The reference policy that leaves the beam where the user was at first."""
 
     def __init__(self, envs: LaneEnv) -> None:
-        self._high = envs.single_action_space.high  # type: ignore[attr-defined]
+        self._low, self._high = envs.single_action_space.low, envs.single_action_space.high  # type: ignore[attr-defined]
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the last angles (L, 1)."""
+        """Return no turn, or the last angles (L, 1)."""
+        if self._low[0] < 0:
+            return np.zeros((len(observations), 1), np.float32)
         angles: NDArray[np.float32] = np.clip(observations[:, -2:-1] * np.float32(np.pi), 0, self._high)
         return angles
 
