@@ -96,7 +96,7 @@ class ScoreSection(options.Table):
         """Leave out what no metric needs: tasks keep the hashes that earlier versions gave them."""
         written: dict[str, Any] = write(self)
         if self.metric is None:
-            del written["metric"], written["goal"]
+            written = {name: value for name, value in written.items() if name not in ("metric", "goal")}
         return written
 
     @model_validator(mode="after")
