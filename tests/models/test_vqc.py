@@ -235,7 +235,7 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     own = set(options.field_names(VQCOptions))
     assert own == {
         "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype", "train",
-        "init_scale", "linear",
+        "init_scale", "linear", "output_rate", "critic",
     }  # fmt: skip
     for name in BACKENDS:
         theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, name).options)
@@ -319,5 +319,5 @@ def test_without_linear_layers_the_circuit_stands_alone(backend):
 
 @pytest.mark.parametrize(("obs", "out"), [(4, 2), (3, 4)])
 def test_without_linear_layers_sizes_must_fit(obs, out):
-    with pytest.raises(OptionError, match=f"3 inputs and 3 expectation values, the task {obs} o.*{out} o"):
+    with pytest.raises(OptionError, match=f"3 expectation values, the network {obs} inputs and {out} out"):
         agents(1, small(qubits=3, linear=False), obs=obs, out=out)
