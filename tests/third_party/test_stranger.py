@@ -171,7 +171,10 @@ def ranked(installed: Installation) -> Path:
 def test_the_commands_of_the_page_run(installed: Installation, ranked: Path) -> None:
     """docs/plugins.md, in its order; `new` and installing have tests of their own."""
     shutil.copytree(ranked, installed.folder / "runs")
-    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL)
+    page = (ROOT / "docs" / "plugins.md").read_text()
+    (code,) = re.findall(r"```python\n# mine.py\n(.*?)```", page, re.DOTALL)
+    (installed.folder / "mine.py").write_text(code)
+    blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     lines = [shlex.split(line) for line in "".join(blocks).splitlines()]
     outputs = {}
     for program, *words in lines:
