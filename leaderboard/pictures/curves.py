@@ -57,7 +57,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
         (line,) = axes.plot(
             steps, middle, color=look.color, linestyle=look.line, linewidth=2, label=style.label(entry)
         )
-        lines.append(line)
+        lines.append((float(middle.mean()), line))
         if len(steps) == 1:  # a line of one point is nothing to see
             line.set(marker="o", markersize=9)
             axes.errorbar(steps, middle, [middle - low, high - middle], color=look.color, linewidth=2)
@@ -73,7 +73,7 @@ def draw(entries: Sequence[EntryResults], **settings: Any) -> Figure:
     axes.set_title(title, fontsize="medium", loc="left")
     legend = {"frameon": False, "title": style.note(entries) or None, "title_fontsize": "small"}
     if many:  # in the order in which the lines lie one above the other
-        handles = sorted(lines, key=lambda line: -float(np.mean(line.get_ydata())))
+        handles = [line for _, line in sorted(lines, key=lambda each: -each[0])]
         figure.legend(handles=handles, loc="outside right upper", fontsize=8, alignment="left", **legend)
     else:
         rising = entries[0].task_file.score.sign > 0
