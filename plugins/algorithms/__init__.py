@@ -32,7 +32,7 @@ def register_algorithms(register: Callable[[AlgorithmSpec], None]) -> None:
     register(
         AlgorithmSpec(
             name="ppo",
-            summary="Proximal policy optimization with generalized advantages, separate actor and critic",
+            summary="Proximal policy optimization, generalized advantages; on sequences for models that remember",
             options="qrlsuite.plugins.algorithms.ppo:PPOOptions",
             factory="qrlsuite.plugins.algorithms.ppo:PPO",
             memory="qrlsuite.plugins.algorithms.ppo:memory",
