@@ -12,7 +12,10 @@ from qrlsuite.testing import check
 from qrlsuite.testing.selection import CheckTarget, of_distribution
 
 EVERYTHING = of_distribution("qrlsuite")
-NEEDS = {("engines", "dask"): "distributed", ("tasks", "lunarlander"): "Box2D"}
+NEEDS = {
+    ("engines", "dask"): "distributed",
+    **{("tasks", name): "Box2D" for name in ("lunarlander", "lunarlander-continuous")},
+}
 
 COMMON = ["name", "references", "lazy imports", "spawn"]
 OPTIONS = ["options documented", "options"]
