@@ -334,6 +334,33 @@ def train(tiny_task: str, tmp_path: Path) -> Train:
     return trainer(tiny_task, tmp_path)
 
 
+@pytest.fixture(scope="session")
+def _once(tmp_path_factory: pytest.TempPathFactory) -> Train:
+    """Train in a folder of the session, what was trained there already aside; returns the entry's folder."""
+    root, made = tmp_path_factory.mktemp("kept"), {}
+    (root / "tiny.toml").write_text(TINY)
+
+    def train(*given: Any, **named: Any) -> Path:
+        key = str((given, named))
+        if key not in made:
+            made[key] = trainer(str(root / "tiny.toml"), root)(str(len(made)), *given, **named)
+        return made[key]
+
+    return train
+
+
+@pytest.fixture
+def kept(_once: Train, tmp_path: Path) -> Train:
+    """Return a copy of what `train` would leave, trained once in a session: for tests of what was trained."""
+
+    def copy(folder: str, *given: Any, **named: Any) -> Path:
+        entry = _once(*given, **named)
+        place = tmp_path / folder / entry.parent.name / entry.name
+        return Path(shutil.copytree(entry, place))
+
+    return copy
+
+
 def results(entry: Path, seed: int) -> tuple[bytes, bytes]:
     """The bytes that must not depend on anything but the seed: its curve and its trained agent."""
     folder = entry / f"seed-{seed:04d}"

@@ -19,9 +19,9 @@ def call(runs: Path, *words: str, typed: str | None = None) -> Result:
 
 
 @pytest.fixture
-def two(train: Train) -> tuple[Path, Path]:
+def two(kept: Train) -> tuple[Path, Path]:
     """Two entries of the folder `runs`."""
-    first, second = (train("runs", [0, 1], 1, settings=(f"width={width}",)) for width in (8, 16))
+    first, second = (kept("runs", [0, 1], 1, settings=(f"width={width}",)) for width in (8, 16))
     return first, second
 
 

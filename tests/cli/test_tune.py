@@ -95,11 +95,11 @@ def test_it_says_the_size_first_and_wants_large_searches_confirmed(tiny_task: st
 
 
 def test_a_budget_is_kept_and_the_rest_continues(tiny_task: str, tmp_path: Path) -> None:
-    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3"]
+    words = ["tune", "mlp width=4", "--task", tiny_task, "--vary", "lr=1e-2,1e-3,1e-4"]
     words += ["--seeds", "1", "--epochs", "1", "--workers", "1", "--runs", str(tmp_path / "runs")]
     first = say(*words, "--budget", "0.01s").stdout
-    assert "the budget is spent, 1 trials are left" in first, "after the first trial, no other fits"
-    rest = say(*words).stdout
+    assert "the budget is spent, 2 trials are left" in first, "after the first trial, no other fits"
+    rest = say(*words, "--budget", "1h").stdout
     assert "the budget is spent" not in rest
     assert "wrote " in rest
 

@@ -46,8 +46,8 @@ def unreliable(monkeypatch: pytest.MonkeyPatch) -> type[Unreliable]:
 
 
 @pytest.fixture
-def trained(train: Train) -> EntryStore:
-    return EntryStore(train("runs", [0, 1], 1, "vqc-native", CIRCUIT))
+def trained(kept: Train) -> EntryStore:
+    return EntryStore(kept("runs", [0, 1], 1, "vqc-native", CIRCUIT))
 
 
 @pytest.mark.parametrize("backend", ["native", "pennylane", "qiskit"])
@@ -67,9 +67,9 @@ def test_shots_and_noise_change_what_they_earn(trained: EntryStore) -> None:
     assert "shots=1" in played.name
 
 
-def test_training_options_of_the_backend_stay_behind(train: Train) -> None:
+def test_training_options_of_the_backend_stay_behind(kept: Train) -> None:
     entry = EntryStore(
-        train("runs", [0], 1, "vqc-native", (*CIRCUIT, "shots=5", "activation_in=tanh"))
+        kept("runs", [0], 1, "vqc-native", (*CIRCUIT, "shots=5", "activation_in=tanh"))
     ).entry()
     there = on_backend(entry, "qiskit", {"shots": 7}).model_options
     assert (there.shots, there.qubits, there.activation_in) == (7, 2, "tanh")
@@ -198,8 +198,8 @@ def test_what_cannot_be_done_is_refused_before_it_begins(
         Deployment(trained, backend, values, best=1)
 
 
-def test_entries_without_circuits_or_agents_are_refused(train: Train, trained: EntryStore) -> None:
-    network = EntryStore(train("runs", [0], 1))
+def test_entries_without_circuits_or_agents_are_refused(kept: Train, trained: EntryStore) -> None:
+    network = EntryStore(kept("runs", [0], 1))
     with pytest.raises(OptionError, match="--backend qiskit: model 'mlp' has no circuit"):
         Deployment(network, "qiskit", {}, best=1)
     for seed in (0, 1):

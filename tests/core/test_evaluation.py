@@ -99,8 +99,8 @@ def test_nearest_is_by_distance_to_where_the_user_will_be(tiny_task: str) -> Non
         observations, *_ = envs.step(chosen)
 
 
-def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Train) -> None:
-    store = EntryStore(train("runs", [0, 1, 2], 1))
+def test_agents_do_not_depend_on_their_company_and_episodes_repeat(kept: Train) -> None:
+    store = EntryStore(kept("runs", [0, 1, 2], 1))
     together = evaluation.trained(store, best=3, episodes=120)
     again = evaluation.trained(store, best=3, episodes=120)
     other = evaluation.trained(store, best=3, episodes=120, seed=1)
@@ -113,11 +113,11 @@ def test_agents_do_not_depend_on_their_company_and_episodes_repeat(train: Train)
     assert evaluation.trained(store, 3, 100).returns.tobytes() == together.returns[:, :100].tobytes()
 
 
-def test_loaded_agents_are_the_trained_ones(train: Train) -> None:
+def test_loaded_agents_are_the_trained_ones(kept: Train) -> None:
     """On the validation's own episodes, a loaded agent repeats the last validation scores bit by bit."""
     from qrlsuite.training.trainer import build_envs
 
-    store = EntryStore(train("runs", [0, 1], 2))
+    store = EntryStore(kept("runs", [0, 1], 2))
     entry = store.entry()
     agents = evaluation.trained_agents(entry, store, [0, 1])
     envs = build_envs(entry, 2 * 5, lambda: None)
@@ -131,8 +131,8 @@ def test_loaded_agents_are_the_trained_ones(train: Train) -> None:
         assert np.array_equal(stored, scores.reshape(2, 5)[s].astype(np.float32))
 
 
-def test_the_best_runs_are_those_with_the_best_last_validation(train: Train) -> None:
-    store = EntryStore(train("runs", [0, 1, 2], 2))
+def test_the_best_runs_are_those_with_the_best_last_validation(kept: Train) -> None:
+    store = EntryStore(kept("runs", [0, 1, 2], 2))
     last = {seed: store.seed(seed).read().curve[-1] for seed in range(3)}
     seeds, scores, runs = evaluation.best_runs(store, 2)
     assert seeds == sorted(last, key=lambda seed: (-last[seed], seed))[:2]
@@ -241,8 +241,8 @@ def test_a_third_partys_policy_is_looked_at(tiny_task: str) -> None:
         evaluation.references(replace(entry, task=task), episodes=3)
 
 
-def test_entries_without_parameters_say_so(train: Train) -> None:
-    store = EntryStore(train("runs", [0, 1], 1))
+def test_entries_without_parameters_say_so(kept: Train) -> None:
+    store = EntryStore(kept("runs", [0, 1], 1))
     path = store.seed(0).path / "final.safetensors"
     whole = path.read_bytes()
     path.unlink()
@@ -263,11 +263,11 @@ def test_entries_without_parameters_say_so(train: Train) -> None:
     ],
 )
 def test_parameters_of_another_model_are_refused(
-    change: Callable[..., object], message: str, train: Train
+    change: Callable[..., object], message: str, kept: Train
 ) -> None:
     from safetensors.numpy import load_file, save_file
 
-    store = EntryStore(train("runs", [0], 1))
+    store = EntryStore(kept("runs", [0], 1))
     path = store.seed(0).path / "final.safetensors"
     save_file(change(load_file(path)), path)  # type: ignore[arg-type]
     with pytest.raises(StoreError, match="does not fit the entry's model") as refused:

@@ -24,8 +24,8 @@ from tests.conftest import Train
 
 
 @pytest.fixture
-def store(train: Train) -> EntryStore:
-    return EntryStore(train("runs", range(3), 4))
+def store(kept: Train) -> EntryStore:
+    return EntryStore(kept("runs", range(3), 4))
 
 
 def change(path: Path, **values: Any) -> None:

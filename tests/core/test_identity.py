@@ -449,8 +449,8 @@ def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
         train("runs", range(4), epochs=2)
 
 
-def test_a_folder_of_two_codes_is_two_entries(train: Train, tmp_path: Path) -> None:
-    folder = train("runs", range(4), epochs=1)
+def test_a_folder_of_two_codes_is_two_entries(kept: Train, tmp_path: Path) -> None:
+    folder = kept("runs", range(4), epochs=1)
     store = EntryStore(folder)
     parts = read_json(folder / "seed-0000" / "run.json")["code"]["parts"]
     other = identity.CodeIdentity((*parts[:2], {**parts[2], "numerics": 2}))
@@ -473,8 +473,8 @@ def test_a_folder_of_two_codes_is_two_entries(train: Train, tmp_path: Path) -> N
         collect.read(store)
 
 
-def test_a_published_entry_of_other_code_is_another_entry(train: Train, tmp_path: Path) -> None:
-    folder = train("runs", range(2), epochs=1)
+def test_a_published_entry_of_other_code_is_another_entry(kept: Train, tmp_path: Path) -> None:
+    folder = kept("runs", range(2), epochs=1)
     entry = collect.read(EntryStore(folder))
     assert entry is not None
     assert entry.codes == ()
@@ -576,8 +576,8 @@ def test_all_entries_are_looked_at_before_one_is_trained(
     "code",
     [{}, "text", {"digest": "0", "parts": []}, {"digest": "0" * 16, "parts": [{"role": 1, "name": "x"}]}],
 )
-def test_a_damaged_identity_is_named(train: Train, tmp_path: Path, code: Any) -> None:
-    folder = train("runs", range(2), epochs=1)
+def test_a_damaged_identity_is_named(kept: Train, tmp_path: Path, code: Any) -> None:
+    folder = kept("runs", range(2), epochs=1)
     edit_json(folder / "seed-0001" / "run.json", code=code)
     with pytest.raises(QrlSuiteError, match=r"seed-0001/run\.json: code is not a code identity"):
         codes.of_seeds(EntryStore(folder))

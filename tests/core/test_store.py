@@ -48,8 +48,8 @@ def test_float32_scores_survive_every_round_trip(tmp_path: Path) -> None:
     assert (np.array(back[0]["scores"], np.float32) == values).all()
 
 
-def test_the_table_is_what_the_lines_were(train: Train) -> None:
-    folder = store.EntryStore(train("runs", [0])).seed(0)
+def test_the_table_is_what_the_lines_were(kept: Train) -> None:
+    folder = store.EntryStore(kept("runs", [0])).seed(0)
     rows = folder.epochs()
     assert not folder.lines.exists()
     assert [row["epoch"] for row in rows] == [1, 2, 3]
@@ -59,8 +59,8 @@ def test_the_table_is_what_the_lines_were(train: Train) -> None:
     assert folder.epochs() == rows[:2]
 
 
-def test_scores_are_read_and_those_that_cannot_be_are_refused(train: Train) -> None:
-    folder = store.EntryStore(train("runs", [0], 1)).seed(0)
+def test_scores_are_read_and_those_that_cannot_be_are_refused(kept: Train) -> None:
+    folder = store.EntryStore(kept("runs", [0], 1)).seed(0)
     assert folder.read().scores.shape == (1, 5)
     (row,) = folder.epochs()
     folder.table.unlink()
@@ -78,8 +78,8 @@ def test_another_format_version_is_refused(train: Train) -> None:
         train("runs", [0])
 
 
-def test_a_missing_epoch_is_an_error(train: Train) -> None:
-    folder = store.EntryStore(train("runs", [0])).seed(0)
+def test_a_missing_epoch_is_an_error(kept: Train) -> None:
+    folder = store.EntryStore(kept("runs", [0])).seed(0)
     rows = folder.epochs()
     folder.table.unlink()
     folder.lines.write_bytes(b"".join(store.json_line(row) for row in (rows[0], rows[2])))
@@ -87,8 +87,8 @@ def test_a_missing_epoch_is_an_error(train: Train) -> None:
         folder.read()
 
 
-def test_a_truncated_table_and_a_damaged_checkpoint_are_named(train: Train) -> None:
-    entry = store.EntryStore(train("runs", [0], 1))
+def test_a_truncated_table_and_a_damaged_checkpoint_are_named(kept: Train) -> None:
+    entry = store.EntryStore(kept("runs", [0], 1))
     folder = entry.seed(0)
     for content in (b"", b"PAR1", b"not parquet at all", b"\0" * 100):
         folder.table.write_bytes(content)
@@ -111,8 +111,8 @@ def test_a_finished_run_without_checkpoint_is_not_started_again(train: Train) ->
     assert entry.seed(0).table.read_bytes() == before
 
 
-def test_two_workers_never_share_a_seed(train: Train) -> None:
-    entry = store.EntryStore(train("runs", [0, 1]))
+def test_two_workers_never_share_a_seed(kept: Train) -> None:
+    entry = store.EntryStore(kept("runs", [0, 1]))
     claim = acquire(entry, [1, 2])
     with pytest.raises(SeedsClaimedError, match=r"1 of these seeds \(from 2\) are being trained by process"):
         acquire(entry, [2, 3])
@@ -165,8 +165,8 @@ def test_format_seeds_is_the_inverse_of_parse_seeds(seeds: set[int]) -> None:
     assert parse_seeds(format_seeds(sorted(seeds))) == sorted(seeds)
 
 
-def test_groups_are_even_and_keep_epochs_apart(train: Train) -> None:
-    entry = store.EntryStore(train("runs", [0, 1], 2))
+def test_groups_are_even_and_keep_epochs_apart(kept: Train) -> None:
+    entry = store.EntryStore(kept("runs", [0, 1], 2))
     groups = plan_groups(entry, range(10), 5, workers=2)
     assert [(g.seeds, g.epoch) for g in groups] == [((2, 3, 4, 5), 0), ((6, 7, 8, 9), 0), ((0, 1), 2)]
     assert plan_groups(entry, [0, 1], 2, workers=2) == []
@@ -215,8 +215,8 @@ def test_means_of_float32_scores_reach_what_the_scores_reach() -> None:
     assert np.asarray(curve).tolist() == [0.95]
 
 
-def test_core_seconds_are_processor_time_where_it_was_recorded(train: Train) -> None:
-    seed = store.EntryStore(train("runs", [0], 2)).seed(0)
+def test_core_seconds_are_processor_time_where_it_was_recorded(kept: Train) -> None:
+    seed = store.EntryStore(kept("runs", [0], 2)).seed(0)
     lines = store.read_lines(seed.timings)
     assert [line["epoch"] for line in lines] == [1, 2]
     assert seed.seconds() == pytest.approx(sum(float(line["cpu"]) for line in lines))
@@ -239,9 +239,9 @@ def test_the_recorded_version_is_that_of_the_code_that_runs(monkeypatch: pytest.
     }
 
 
-def test_the_record_of_a_seed_says_what_was_trained(train: Train) -> None:
+def test_the_record_of_a_seed_says_what_was_trained(kept: Train) -> None:
     """Trackers are given it, and it lies beside the curve for whoever finds the folder."""
-    folder = train("runs", [3], 1)
+    folder = kept("runs", [3], 1)
     entry = store.EntryStore(folder).entry()
     record = json.loads((folder / "seed-0003" / "run.json").read_text())
     expected = {
@@ -264,8 +264,8 @@ def test_the_record_of_a_seed_says_what_was_trained(train: Train) -> None:
     assert record["parameters"] == {"classical": weights, "quantum": 0, "networks": 1}
 
 
-def test_an_entry_shows_once_what_made_all_its_seeds(train: Train) -> None:
-    entry = train("runs", [0, 1, 2], epochs=1)
+def test_an_entry_shows_once_what_made_all_its_seeds(kept: Train) -> None:
+    entry = kept("runs", [0, 1, 2], epochs=1)
     shown = answer("show", entry.name, "--runs", str(entry.parents[1]))
     record = store.EntryStore(entry).record()
     assert (shown["label"], shown["seeds"]) == (record["label"], 3)

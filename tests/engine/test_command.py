@@ -116,16 +116,16 @@ def run(store: EntryStore, template: str, seeds: tuple[int, ...] = (5,)) -> api.
     return CommandEngine(CommandOptions(template)).run([work], lambda snapshot: None)
 
 
-def test_a_command_that_fails_is_named_by_what_it_says(train: Train) -> None:
-    outcome = run(EntryStore(train("runs", [0], 1)), "echo 'no such queue: fast' >&2; exit 7 # {command}")
+def test_a_command_that_fails_is_named_by_what_it_says(kept: Train) -> None:
+    outcome = run(EntryStore(kept("runs", [0], 1)), "echo 'no such queue: fast' >&2; exit 7 # {command}")
     (message,) = outcome.failed.values()
     assert (
         message.splitlines()[0] == "its worker died 3 times (exit code 7 of its command): no such queue: fast"
     )
 
 
-def test_seeds_of_another_worker_are_left_to_it(train: Train) -> None:
-    store = EntryStore(train("runs", [0], 1))
+def test_seeds_of_another_worker_are_left_to_it(kept: Train) -> None:
+    store = EntryStore(kept("runs", [0], 1))
     claim = claims.acquire(store, [5])
     (message,) = run(store, "{command}").taken.values()
     claim.release()
@@ -133,10 +133,10 @@ def test_seeds_of_another_worker_are_left_to_it(train: Train) -> None:
 
 
 def test_a_command_that_never_begins_a_worker_ends_with_ctrl_c(
-    train: Train, caplog: pytest.LogCaptureFixture
+    kept: Train, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One waits for a machine that does not answer, one has handed the worker to a queue."""
-    store = EntryStore(train("runs", [0], 1))
+    store = EntryStore(kept("runs", [0], 1))
 
     def show(snapshot: object) -> None:
         raise KeyboardInterrupt

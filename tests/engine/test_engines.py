@@ -113,8 +113,8 @@ def test_a_worker_started_twice_does_no_harm(train: Train) -> None:
     assert results(train("alone", [2]), 2) == results(entry, 2)
 
 
-def test_a_worker_whose_parent_is_gone_does_not_begin(train: Train) -> None:
-    entry = train("runs", [0], 1)
+def test_a_worker_whose_parent_is_gone_does_not_begin(kept: Train) -> None:
+    entry = kept("runs", [0], 1)
     words = (str(entry), "--seeds", "0:1", "--epochs", "2", "--follow-parent", str(os.getpid()))
     assert start_worker(*words).wait() == 130, "its parent is the process that it was forked from"
     assert EntryStore(entry).finished([0], 2) == set()
@@ -174,8 +174,8 @@ def test_status_reads_our_own_files_only(train: Train, monkeypatch: pytest.Monke
     claim.release()
 
 
-def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(train: Train) -> None:
-    store = EntryStore(train("runs", [0, 1], 1))
+def test_a_seed_that_waits_to_be_trained_further_is_not_interrupted(kept: Train) -> None:
+    store = EntryStore(kept("runs", [0, 1], 1))
     for seed in (0, 1):
         store.seed(seed).write_record({"seed": seed, **store.names, "status": "running", "epochs": 1})
     write_json(store.path / "slurm" / "submitted.json", {"tasks": [{"job": "9", "seeds": [1], "epochs": 3}]})

@@ -109,8 +109,8 @@ def test_two_commands_at_once(words: list[str], tmp_path: Path, hold: Hold) -> N
 
 
 @pytest.fixture
-def entry(train: Train) -> EntryStore:
-    return EntryStore(train("runs", [0], 1))
+def entry(kept: Train) -> EntryStore:
+    return EntryStore(kept("runs", [0], 1))
 
 
 @pytest.fixture
