@@ -508,13 +508,11 @@ def blamed() -> Iterator[None]:
     """
     try:
         yield
-    except OptionError as error:
-        raise PluginError(str(placed(error))) from error
-    except QrlSuiteError:
-        raise
     except Exception as error:
-        if not place(error):
+        if not place(error) or (isinstance(error, QrlSuiteError) and not isinstance(error, OptionError)):
             raise
+        if isinstance(error, OptionError):
+            raise PluginError(str(placed(error))) from error
         raise PluginError(f"{failure(error)}: mend it, and repeat the command") from error
 
 
