@@ -123,21 +123,32 @@ def fitting(among: Sequence[N], name: str) -> list[N]:
 
 
 def _written(among: Sequence[N], text: str) -> list[N]:
-    """Return the entries that a text in the notation of entries means, its options in any order."""
+    """Return the entries that a text in the notation of entries means.
+
+    It is compared with labels, its options in any order, and then read as `run` reads it, with presets of tasks.
+    """
     task, slash, rest = text.partition("/")
     if not slash or "=" in task:
         task, rest = "", text
     try:
         written = notation.parse_entry(rest)
         same_task = [e for e in among if task in ("", e.task)]
-        if written.preset is None:
-            return (
-                [e for e in same_task if _same(written, e.label)] if written.settings or written.start else []
-            )
-        names = {task: resolve(task, written).name for task in {e.task for e in same_task}}
-        return [e for e in same_task if e.name == names[e.task]]
     except QrlSuiteError:
         return []
+    if written.preset is None:
+        same = [e for e in same_task if _same(written, e.label)]
+        if same or written.start or not written.settings:
+            return same if written.settings or written.start else []
+    names = {task: _name(task, written) for task in {e.task for e in same_task}}
+    return [e for e in same_task if e.name == names[e.task]]
+
+
+def _name(task: str, written: notation.Written) -> str | None:
+    """Return the name of the entry that `run` would train on a task; None where it would refuse to."""
+    try:
+        return resolve(task, written).name
+    except QrlSuiteError:
+        return None
 
 
 def _same(written: notation.Written, label: str) -> bool:

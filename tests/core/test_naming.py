@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
+from qrlsuite import notation
 from qrlsuite.errors import UnknownNameError
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.results import lookup
 from qrlsuite.results.store import entries
 from tests.commands import say
@@ -48,6 +50,16 @@ SEVERAL = [
 )
 def test_an_entry_answers_to(name: str, found: int) -> None:
     assert lookup.choose(SEVERAL, name, "runs") is SEVERAL[found]
+
+
+def test_an_entry_answers_to_what_run_was_given() -> None:
+    typed = "mlp lr=0.01"  # its label has the options of CartPole's preset, too
+    entry = resolve("cartpole", notation.parse_entry(typed))
+    assert typed not in entry.label
+    known = [Entry(entry.label, "cartpole", entry.name), *SEVERAL]
+    assert lookup.choose(known, typed, "runs") is known[0]
+    with pytest.raises(UnknownNameError, match="no entry"):
+        lookup.choose(known, "mlp lr=0.02", "runs")
 
 
 SEVERAL_OR_NONE = """
