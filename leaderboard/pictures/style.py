@@ -84,9 +84,13 @@ def relative(entries: Sequence[EntryResults]) -> bool:
 
 
 def score_name(entries: Sequence[EntryResults]) -> str:
-    """Return what an axis of learning curves is called: `validation score`, or the metric's name in its place."""
+    """Return what an axis of learning curves is called: `validation score`, or the metric's name in its place.
+
+    Scores that another program wrote may be of training: no axis with such curves says `validation`.
+    """
     [name] = {entry.task_file.score.called for entry in entries} or {"score"}
-    return f"validation {plain(name)}{' (received / optimal)' if relative(entries) else ''}"
+    validation = "" if any(entry.external for entry in entries) else "validation "
+    return f"{validation}{plain(name)}{' (received / optimal)' if relative(entries) else ''}"
 
 
 def tidy(axes: Axes) -> None:

@@ -282,6 +282,7 @@ def _data(
 ) -> dict[str, Any]:
     """Return what the page's scripts need of a section."""
     reference = ranking.reference
+    external = any(row.entry.curves.external for row in rows)
     level = 1 - reference.epsilon if reference.epsilon is not None else reference.threshold
     words = dict.fromkeys(pair.words(side) for pair in judgement.pairs for side in (pair.first, pair.second))
     numbers = {text: number for number, text in enumerate(words)}  # many pairs share their words
@@ -291,7 +292,8 @@ def _data(
         "entries": [row.entry.index for row in rows],
         "names": [row.name for row in rows],
         "level": level,
-        "score": f"validation {clean(section.score.called)}{' (received / optimal)' * section.score.of_optimum}",
+        "score": f"{'' if external else 'validation '}{clean(section.score.called)}"
+        f"{' (received / optimal)' * section.score.of_optimum}",
         "levelName": symbol(judgement.grid),
         "levels": [f"{float(value):g}" for value in judgement.grid.levels],
         "deltas": [f"{float(delta):g}" for delta in judgement.grid.deltas],

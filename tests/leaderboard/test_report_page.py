@@ -379,3 +379,14 @@ def test_the_legend_names_the_ansatz(opened: Open) -> None:
     assert sorted(picked(tab)) == ["mlp width=16", "vqc-native qubits=4 ansatz=iqp"]
     hostile = dataclasses.replace(entry, identity={"model_options": {"ansatz": boards.HOSTILE[0]}})
     assert boards.HOSTILE[0] not in render(boards.of([hostile]))
+
+
+@pytest.mark.parametrize("external", [False, True])
+def test_two_entries_of_few_seeds_have_a_verdict_and_an_axis(opened: Open, external: bool) -> None:
+    few = [boards.entry(label, 10, speed=speed) for label, speed in (("one", 3), ("other", 1))]
+    tab = opened(boards.of([dataclasses.replace(entry, external=external) for entry in few]))
+    (said,) = tab.locator("#board-0 .verdicts .verdict").all_inner_texts()
+    assert said.startswith("undecided: fewer than 20 seeds (10 seeds each); one")
+    axis = tab.locator("#board-0 .plot svg").first.text_content()
+    assert "score" in axis
+    assert ("validation score" in axis) is not external
