@@ -347,10 +347,12 @@ def _load(
             _registered(thing, module, source, _place(thing)) for thing in shortforms.recognized(module)
         ]
         if not registered:
-            raise PluginError(
-                f"{source.path} registers nothing: write a function (qubits, layers) that returns a Circuit, a "
-                "torch.nn.Module, gymnasium.Env or algorithm class, or call qrlsuite.register(...)"
+            lacking = shortforms.lacking(shortforms.public(module))
+            advice = (
+                "write a function (qubits, layers) that returns a Circuit, a torch.nn.Module, gymnasium.Env or "
+                "algorithm class, or call qrlsuite.register(...)"
             )
+            raise PluginError(f"{source.path} registers nothing: {lacking or advice}")
     _require_unique(known, registered)
     made = Loaded(source, Plugin(source.module, str(source.path), source.name), registered, cell)
     _enter(own, known, made)

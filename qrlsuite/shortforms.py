@@ -22,7 +22,7 @@ import inspect
 import re
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Annotated, Any
 
@@ -67,6 +67,21 @@ def kind_of(thing: Any) -> type[specs.Spec] | None:
     return None
 
 
+def lacking(things: Iterable[Any]) -> str:
+    """Say which methods the first class lacks that trains or acts like an algorithm; empty where there is none."""
+    for thing in things:
+        if not isinstance(thing, type) or kind_of(thing) is not None:
+            continue
+        has = [name for name in _ALGORITHM if callable(getattr(thing, name, None))]
+        if {"train_epoch", "act"} & set(has):
+            lacks = [name for name in _ALGORITHM if name not in has]
+            return (
+                f"class {thing.__name__} has {' and '.join(has)}, and lacks {', '.join(lacks)}: an algorithm needs all "
+                f"{len(_ALGORITHM)} methods"
+            )
+    return ""
+
+
 def _builds_circuits(function: Callable[..., Any]) -> bool:
     """Return whether a function is annotated to return a circuit; or, without such a word, takes qubits and layers."""
     returned = function.__annotations__.get("return", inspect.Parameter.empty)
@@ -76,19 +91,23 @@ def _builds_circuits(function: Callable[..., Any]) -> bool:
     return list(inspect.signature(function).parameters)[:2] == ["qubits", "layers"]
 
 
-def recognized(module: ModuleType) -> list[Any]:
-    """Return the functions and classes in a module that are short forms: public ones that are defined there.
-
-    A `torch.nn.Module` whose `__init__` cannot be that of a model is a part of one, and is left out.
-    """
-    own = [
+def public(module: ModuleType) -> list[Any]:
+    """Return the public functions and classes that are defined in a module."""
+    return [
         thing
         for name, thing in vars(module).items()
         if not name.startswith("_")
         and getattr(thing, "__module__", "").partition(".")[0] == module.__name__
         and getattr(thing, "__name__", None) == name
     ]
-    found = [(thing, kind_of(thing)) for thing in own]
+
+
+def recognized(module: ModuleType) -> list[Any]:
+    """Return the functions and classes in a module that are short forms: public ones that are defined there.
+
+    A `torch.nn.Module` whose `__init__` cannot be that of a model is a part of one, and is left out.
+    """
+    found = [(thing, kind_of(thing)) for thing in public(module)]
     return [
         thing
         for thing, kind in found
@@ -130,7 +149,7 @@ def spec_of(thing: Any, module: ModuleType, origin: str) -> specs.Spec:
     """
     kind = kind_of(thing)
     if kind is None:
-        raise PluginError(f"{_title(thing)} cannot be registered: {_REFUSED}")
+        raise PluginError(f"{_title(thing)} cannot be registered: {lacking([thing]) or _REFUSED}")
     name = kebab(thing.__name__)
     if not specs.NAME.fullmatch(name):
         raise PluginError(

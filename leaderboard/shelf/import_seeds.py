@@ -28,7 +28,7 @@ from qrlsuite.experiment.preset import TUNING_SEEDS
 from qrlsuite.leaderboard.shelf import published
 from qrlsuite.leaderboard.shelf.curves import require_scores
 from qrlsuite.leaderboard.shelf.published import PublishedEntry
-from qrlsuite.results import checkpoint, codes, provenance
+from qrlsuite.results import checkpoint, codes, provenance, run_files
 from qrlsuite.results.claims import acquire, living
 from qrlsuite.results.seeds import LARGEST_GROUP, format_seeds
 from qrlsuite.results.store import (
@@ -94,7 +94,8 @@ def sources(folder: Path) -> list[EntryStore]:
     stores = entries(folder) if folder.is_dir() else []
     if not stores:
         raise StoreError(
-            f"{folder} holds no entry: give a results folder, a folder that `qrlsuite export` wrote, or one entry's "
+            run_files.below(folder)
+            or f"{folder} holds no entry: give a results folder, a folder that `qrlsuite export` wrote, or one entry's "
             "folder in it (the one with entry.json)"
         )
     return stores

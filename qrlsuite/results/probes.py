@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from qrlsuite import own, registry, specs
 from qrlsuite.errors import PluginError, StoreError
 from qrlsuite.results.provenance import PACKAGES
 from qrlsuite.results.store import EntryStore
@@ -66,12 +68,19 @@ def require_independent(store: EntryStore) -> None:
 def refusal(store: EntryStore, probe: Mapping[str, Any]) -> DependentSeedsError:
     """Return the error that says how the seeds of an entry depend on each other, why that may be, and what to type."""
     identity = store.record()["identity"]
+    kind = specs.AlgorithmSpec if identity["model"] == specs.NO_MODEL else specs.ModelSpec
+    name = str(identity[kind.kind])
+    known = registry.load().of(kind)
+    loaded = own.of_distribution(known[name].distribution) if name in known else None
+    plugin = (
+        f" --plugin {shlex.quote(str(loaded.source.path))}" if loaded is not None and not loaded.cell else ""
+    )
     return DependentSeedsError(
         f"seed {probe['seed']} depends on its company: trained alone in a fresh process, it differs from the same seed "
         f"in a group in {probe.get('difference')}. So no seed is what it says, and boards leave the entry out. Likely "
         "causes: something that all agents of a process share (a global variable, a class attribute, a closure, a "
         "cache), a global random generator, the time, or functions that torch rounds by the place in a stack (sigmoid, "
         "silu, softplus, elu, gelu: take tanh or relu). `qrlsuite check "
-        f"model:{identity['model']}` looks for them, and for those of an environment or algorithm likewise. What was "
+        f"{kind.kind}:{name}{plugin}` looks for them, and for those of an environment or algorithm likewise. What was "
         f"trained is kept in {store.path}; correct the code, and repeat the command with --fresh"
     )

@@ -8,13 +8,15 @@ from __future__ import annotations
 import csv
 import importlib.util
 import io
+import itertools
 import json
 import math
 import os
+import shlex
 import subprocess
 import sys
 import zipfile
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,8 +42,27 @@ WINDOW = 100
 _LONGEST_LINE = 1_000_000
 _NOT_FINITE = ("NaN", "Infinity", "-Infinity")
 
+_CURVES = "evaluations.npz", "*monitor.csv", "*.tfevents.*", "*.wandb", "*.csv"
+_MOST_PATHS = 100_000
+
 Curve = Iterable[tuple[int, float]]
 """Environment steps and scores, in order."""
+
+
+def below(folder: Path) -> str:
+    """Say how to import the curves of other programs below a folder; empty where there are none."""
+    paths = [path.relative_to(folder) for path in itertools.islice(folder.rglob("*"), _MOST_PATHS)]
+    shown = [path for path in paths if not any(part.startswith(".") for part in path.parts)]
+    for name in _CURVES:
+        depths = Counter(len(path.parts) for path in shown if path.match(name) and (folder / path).is_file())
+        if depths:
+            [(depth, count)] = depths.most_common(1)
+            files = "/".join([shlex.quote(str(folder)), *["*"] * (depth - 1), name])
+            return (
+                f"{folder} holds {count} {name}: qrlsuite import {files} maximum=500, where 500 stands for the best "
+                "possible score"
+            )
+    return ""
 
 
 def holds_one_run(path: Path) -> bool:
@@ -55,8 +76,9 @@ def holds_one_run(path: Path) -> bool:
     try:
         if path.is_dir():
             raise FileError(
-                f"{path} holds no entry of this suite; to import curves that other programs wrote, name their files, "
-                f"such as {path}/*/*/evaluations.npz"
+                below(path)
+                or f"{path} holds no entry of this suite; to import curves that other programs wrote, name their "
+                f"files, such as {path}/*/*/evaluations.npz"
             )
         size = path.stat().st_size
     except OSError as error:

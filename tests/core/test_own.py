@@ -17,6 +17,8 @@ from qrlsuite.errors import EnvironmentFailure, FileError, OptionError, PluginEr
 from qrlsuite.experiment import identity, task
 from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.shelf import published_studies
+from qrlsuite.results import probes
+from qrlsuite.results.store import EntryStore
 from qrlsuite.studies import study
 from qrlsuite.studies.looks import FILE, FOLDER
 from qrlsuite.studies.outcome import in_folder
@@ -277,6 +279,7 @@ import no_such_module\n => /bad.py:1: ModuleNotFoundError: No module named 'no_s
 def f(:\n => /bad.py:1: SyntaxError:
 import sys\nsys.exit('bye')\n => /bad.py:2: SystemExit: bye
 x = 1\n => /bad.py registers nothing: write a function (qubits, layers)
+class A:\n    def act(self): ...\n => registers nothing: class A has act, and lacks start, train_epoch, state_dict
 def ring(qubits, layers, depth): ...\n => /bad.py:1: 'ring': parameter 'depth' needs a default, for example
 def ring(qubits, layers, d=None): ...\n => /bad.py:1: 'ring': parameter 'd' needs a type, for example d: int
 def ring(qubits, layers, d: 'Nothing' = 1): ...\n => 'ring': its annotations cannot be read: NameError
@@ -684,3 +687,15 @@ def test_a_new_study_names_the_plugins_of_its_entries() -> None:
     assert Path("studies/ring.toml").read_text().startswith('plugins = ["../ring.py"]\n')
     assert study.load("studies/ring.toml").file.looks is not None
     assert names() == {"ansatz": ["ring"]}
+
+
+@pytest.mark.parametrize(("entry", "expected"), [("idle none", "algorithm:idle"), ("net", "model:net")])
+def test_whoever_is_to_check_dependent_seeds_is_told_what_and_by_which_plugin(
+    entry: str, expected: str
+) -> None:
+    own.load(write("a b/mistakes.py", MISTAKES))
+    store = EntryStore.create(Path("runs"), resolve("beam6g", entry))
+    said = str(probes.refusal(store, {"seed": 6}))
+    assert (
+        f"`qrlsuite check {expected} --plugin '{Path('a b/mistakes.py').absolute()}'` looks for them" in said
+    )

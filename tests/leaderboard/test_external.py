@@ -415,3 +415,18 @@ def test_files_and_folders_are_told_apart(qrlsuite: Callable[..., Any], csv: Pat
         ((csv, "thresholds=high"), "thresholds=high: write numbers"),
     ):
         assert message in refused("import", *words), words
+
+
+@pytest.mark.parametrize("options", [(), ("maximum=500",)])
+def test_a_folder_of_other_programs_is_answered_with_what_to_type(
+    tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    logs = tmp_path / "my logs"
+    for name in ("a/seed-0", "a/seed-1", "b/seed-0", ".old/seed-0"):
+        (logs / name).mkdir(parents=True)
+        (logs / name / "evaluations.npz").touch()
+        (logs / name / "progress.csv").touch()
+    said = (
+        f"{logs} holds 3 evaluations.npz: qrlsuite import '{logs}'/*/*/evaluations.npz maximum=500, where 500"
+    )
+    assert said in refused("import", logs, *options)

@@ -15,7 +15,9 @@ from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
 from qrlsuite.leaderboard.shelf import import_curves, import_seeds, published_studies
 from qrlsuite.leaderboard.shelf.import_seeds import Imported
+from qrlsuite.results import run_files
 from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.store import entries
 from qrlsuite.results.text import counted
 
 
@@ -58,7 +60,8 @@ def import_entries(
         raise OptionError("import folders and files by commands of their own")
     if not files and given:
         raise OptionError(
-            f"{given[0]} is for files with curves; a folder of this suite says it itself: leave it out"
+            next((hint for path in paths if not entries(path) and (hint := run_files.below(path))), "")
+            or f"{given[0]} is for files with curves; a folder of this suite says it itself: leave it out"
         )
     taken = api.import_curves(files, task=task, runs=runs, **options) if files else None
     done = []
