@@ -72,9 +72,8 @@ def third_party(monkeypatch: pytest.MonkeyPatch) -> Callable[[type], Any]:
 
         module.register_rules = register_rules  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, "acme_rules", module)
-        found = registry.create(
-            points=lambda: [("acme", metadata.EntryPoint("rules", "acme_rules", "qrlsuite"))]
-        )
+        own = ("acme", metadata.EntryPoint("rules", "acme_rules", "qrlsuite"))
+        found = registry.create(points=lambda: [*registry._entry_points(), own])
         monkeypatch.setattr(registry, "load", lambda: found)
         return rules.load("half")
 

@@ -171,7 +171,9 @@ def test_other_environment_options_make_another_task(tmp_path: Path) -> None:
 
 
 def test_tasks_that_extend_beam6g_are_those_they_were_when_their_files_were_whole() -> None:
-    names = [name for name in registry.load().names(specs.TaskSpec) if name.startswith("beam6g-")]
+    later = {"beam6g-angle", "beam6g-stack"}  # they never had whole files
+    known = registry.load().names(specs.TaskSpec)
+    names = [name for name in known if name.startswith("beam6g-") and name not in later]
     assert len(names) == 24
     assert task.digest({name: task.load(name).hash for name in names}) == "9ceffffafc875806"
 
