@@ -134,7 +134,7 @@ def test_every_command_in_the_documentation_exists_with_its_options(page: str, l
     for flag, kind in (("--task", "tasks"), ("--model", "models")):
         if (
             flag in named
-            and not named[flag].startswith(("gym:", "my-"))
+            and not named[flag].startswith(("gym:", "my-", "external"))
             and not named[flag].endswith(".toml")
             and not ("--published" in words and (PUBLISHED / named[flag]).is_dir())
         ):

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from qrlsuite.algorithm import Algorithm
 from tests.commands import qrlsuite
 from tests.conftest import Train
 
@@ -91,10 +92,25 @@ def test_the_readmes_plugin_is_what_its_summary_says_and_conforms(tmp_path: Path
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
-def test_the_plugins_by_path_conform(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "registers"), [("mine", "ansatz chain, model hybrid"), ("agent", "algorithm watkins")]
+)
+def test_the_plugins_by_path_conform(name: str, registers: str, tmp_path: Path) -> None:
     text = (ROOT / "docs" / "plugins.md").read_text()
-    (code,) = re.findall(r"```python\n# mine.py\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "mine.py").write_text(code)
-    checked = qrlsuite("check", "mine.py", "--plugin", "mine.py", cwd=tmp_path)
+    (code,) = re.findall(rf"```python\n# {name}.py\n(.*?)```", text, re.DOTALL)
+    (tmp_path / f"{name}.py").write_text(code)
+    checked = qrlsuite("check", f"{name}.py", "--plugin", f"{name}.py", cwd=tmp_path)
     assert checked.returncode == 0, checked.stdout + checked.stderr
-    assert checked.stderr == "mine.py: ansatz chain, model hybrid\n"
+    assert checked.stderr == f"{name}.py: {registers}\n"
+
+
+def test_the_methods_on_the_page_are_those_of_an_algorithm() -> None:
+    table = (
+        (ROOT / "docs" / "plugins.md")
+        .read_text()
+        .partition("| Method | What it does |\n")[2]
+        .partition("\n\n")[0]
+    )
+    assert sorted(re.findall(r"^\| `(\w+)\(", table, re.MULTILINE)) == sorted(
+        name for name in vars(Algorithm) if not name.startswith("_")
+    )

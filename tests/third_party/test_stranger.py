@@ -172,8 +172,10 @@ def test_the_commands_of_the_page_run(installed: Installation, ranked: Path) -> 
     """docs/plugins.md, in its order; `new` and installing have tests of their own."""
     shutil.copytree(ranked, installed.folder / "runs")
     page = (ROOT / "docs" / "plugins.md").read_text()
-    (code,) = re.findall(r"```python\n# mine.py\n(.*?)```", page, re.DOTALL)
-    (installed.folder / "mine.py").write_text(code)
+    files = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", page, re.DOTALL))
+    assert set(files) == {"mine.py", "agent.py"}
+    for name, code in files.items():
+        (installed.folder / name).write_text(code)
     blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     lines = [shlex.split(line) for line in "".join(blocks).splitlines()]
     outputs = {}
