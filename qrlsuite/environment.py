@@ -14,6 +14,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from qrlsuite.errors import StoreError
+
 State = dict[str, NDArray[Any]]
 """A checkpointed state: arrays whose first axis is the lane, without random streams (the core keeps those)."""
 
@@ -79,6 +81,23 @@ def batched_spaces(
     env.single_action_space = action
     env.observation_space = gymnasium.vector.utils.batch_space(observation, lanes)
     env.action_space = gymnasium.vector.utils.batch_space(action, lanes)
+
+
+def require_state(
+    owner: str, state: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Refuse a state that lanes cannot continue from; `owner` is the environment's name.
+
+    Raises
+    ------
+    qrlsuite.errors.StoreError
+        If an array is missing, is one too many, or has another shape.
+    """
+    if set(state) != set(shapes):
+        raise StoreError(f"{owner}: a state has {', '.join(sorted(shapes))}, not {', '.join(sorted(state))}")
+    for name, shape in shapes.items():
+        if state[name].shape != shape:
+            raise StoreError(f"{owner}: '{name}' has the shape {state[name].shape}, not {shape}")
 
 
 def endings(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from qrlsuite import actions as action_spaces
 from qrlsuite import registry, specs
 from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.environment import LaneEnv, State, batched_spaces, require_state
 from qrlsuite.errors import EnvironmentFailure, OptionError, StoreError
 from qrlsuite.normalization import Kind, Normalization
 
@@ -198,16 +198,7 @@ class GymLanes(LaneEnv):
             If an array is missing or has another shape, or an environment does not do again what it did.
         """
         shapes = {"seed": (self.num_envs,), "actions": self._actions.shape, "observation": self._raw.shape}
-        if set(state) != set(shapes):
-            raise StoreError(
-                f"environment '{self.env_id}': a state has {', '.join(sorted(shapes))}, "
-                f"not {', '.join(sorted(state))}"
-            )
-        for name, shape in shapes.items():
-            if state[name].shape != shape:
-                raise StoreError(
-                    f"environment '{self.env_id}': '{name}' has the shape {state[name].shape}, not {shape}"
-                )
+        require_state(f"environment '{self.env_id}'", state, shapes)
         for lane in range(self.num_envs):
             try:
                 self._replay(lane, int(state["seed"][lane]), state["actions"][lane])

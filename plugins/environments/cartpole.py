@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.environment import LaneEnv, State, batched_spaces, require_state
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.normalization import KIND, Kind, Normalization
 
@@ -297,13 +297,7 @@ class CartPoleLanes(LaneEnv):
             If an array is missing or has another shape; nothing is changed then.
         """
         shapes = {"state": (self.num_envs, 4), "step": (self.num_envs,), "ended": (self.num_envs,)}
-        if set(state) != set(shapes):
-            raise StoreError(
-                f"cartpole: a state has {', '.join(sorted(shapes))}, not {', '.join(sorted(state))}"
-            )
-        for name, shape in shapes.items():
-            if state[name].shape != shape:
-                raise StoreError(f"cartpole: '{name}' has the shape {state[name].shape}, not {shape}")
+        require_state("cartpole", state, shapes)
         if state["step"].min() < 0 or state["step"].max() > self.options.steps:
             raise StoreError(f"cartpole: 'step' must lie in 0..{self.options.steps}")
         self.state = np.array(state["state"].T, dtype=np.float64, order="C")

@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings
+from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings, require_state
 from qrlsuite.errors import StoreError
 
 ID = "qrlsuite/Room-v1"
@@ -222,11 +222,7 @@ class RoomLanes(LaneEnv):
             If an array is missing, has another shape, or stands outside the room; nothing is changed then.
         """
         known = self._state()
-        if set(state) != set(known):
-            raise StoreError(f"room: a state has {', '.join(sorted(known))}, not {', '.join(sorted(state))}")
-        for name, value in known.items():
-            if state[name].shape != value.shape:
-                raise StoreError(f"room: '{name}' has the shape {state[name].shape}, not {value.shape}")
+        require_state("room", state, {name: value.shape for name, value in known.items()})
         places = np.concatenate([state["agent"][:, :2], state["goal"]])
         if (
             places.min() < 1

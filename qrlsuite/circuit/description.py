@@ -90,6 +90,8 @@ class Element:
     index: int
 
 
+_NUMBER = int, float, np.integer, np.floating
+
 Product = tuple[int | None, int | None, float]
 """A product of inputs: the first (None for 1), the second (None for 1), and a number."""
 
@@ -115,7 +117,7 @@ class Angle:
 
     def __mul__(self, other: Angle | float) -> Angle:
         """Multiply inputs, a trainable scale and numbers (in any order); nothing else may be multiplied."""
-        if isinstance(other, int | float | np.integer | np.floating):
+        if isinstance(other, _NUMBER):
             return self._multiple(float(other))
         for a, b in ((self, other), (other, self)) if isinstance(other, Angle) else ():
             times = a.times * b.times
@@ -151,7 +153,7 @@ class Angle:
 
     def __add__(self, other: Angle | float) -> Angle:
         """Add two angles: at most one input term and one weight may remain."""
-        if isinstance(other, (int, float)):
+        if isinstance(other, _NUMBER):
             return replace(self, constant=self.constant + float(other))
         if not isinstance(other, Angle):
             return NotImplemented

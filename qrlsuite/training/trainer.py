@@ -151,7 +151,9 @@ def _forgets(entry: Entry) -> OptionError:
         if asks_for_more(getattr(specs.resolve(registry.get(specs.AlgorithmSpec, name).factory), "act", len))
     ]
     advice = (
-        f"take one of {', '.join(found)}: qrlsuite run '{found[0]} {model}'" if found else "none does not"
+        f"take one of {', '.join(found)}: qrlsuite run '{found[0]} {model}'"
+        if found
+        else "no algorithm here trains it"
     )
     return OptionError(
         f"model '{model}' remembers what it saw in an episode, and algorithm '{entry.algorithm.name}' would make it "

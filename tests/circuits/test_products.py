@@ -207,3 +207,11 @@ def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
     for read in (AngleTable, NativeBackend(product).simulator):
         with pytest.raises(CircuitError, match="written as inputs by `create_backend`"):
             read(product) if read is AngleTable else read()
+
+
+@pytest.mark.parametrize("number", [2, 2.0, np.float32(2), np.int64(2)])
+def test_numbers_of_numpy_are_numbers(number):
+    x = Circuit(1).input(0)
+    assert number * x == x * 2.0
+    assert x + number == x + 2.0
+    assert x - number == x + -2.0

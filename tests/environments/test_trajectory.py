@@ -9,7 +9,10 @@ import pytest
 from scipy.integrate import quad
 from scipy.interpolate import UnivariateSpline, make_interp_spline
 
+from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import compiled, trajectory
+from qrlsuite.plugins.environments.beam6g.options import BeamOptions
+from qrlsuite.plugins.environments.beam6g.vector import BeamLanes
 from tests.conftest import golden
 
 EPISODES = golden("beam6g")
@@ -209,3 +212,26 @@ def test_bits_do_not_depend_on_the_batch(degree, size, offset):
     some_x, some_y = trajectory.positions(support[part], 40)
     assert some_x.tobytes() == x[part].tobytes()
     assert some_y.tobytes() == y[part].tobytes()
+
+
+@pytest.mark.parametrize("value", [2.0, np.nan])
+def test_points_that_make_no_path_are_written_nowhere_else(value, monkeypatch):
+    """A path of no length, or of no numbers, as Python runs the loops: compiled, they do not look where they write."""
+    monkeypatch.setattr(compiled, "walk", compiled.walk.py_func)
+    monkeypatch.setattr(trajectory, "PANELS", 10)
+    monkeypatch.setattr(trajectory, "FINE_PANELS", 20)
+    with np.errstate(all="ignore"):
+        x, y = trajectory.positions(np.full((1, 3, 2), value), 20)
+    assert x.shape == y.shape == (1, 21)
+    assert np.isnan(x).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e-9, 6.1])
+def test_saved_points_outside_of_the_field_are_refused(value):
+    lanes = BeamLanes(BeamOptions(), 2)
+    lanes.reset(seed=0)
+    state = lanes.state_dict()
+    state["support_points"][1, 1, 1] = value
+    with pytest.raises(StoreError, match=r"beam6g: 'support_points' must lie in the field, 0\.\.6"):
+        lanes.load_state_dict(state)
+    assert lanes.support_points.max() <= 6

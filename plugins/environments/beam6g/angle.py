@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings
+from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings, require_state
 from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.options import checked
@@ -239,16 +239,11 @@ class AngleLanes(LaneEnv):
         Raises
         ------
         qrlsuite.errors.StoreError
-            If an array is missing or has another shape; nothing is changed then.
+            If an array is missing, has another shape, or holds what cannot be; nothing is changed then.
         """
         known = self._state()
-        if set(state) != set(known):
-            raise StoreError(
-                f"beam-angle: a state has {', '.join(sorted(known))}, not {', '.join(sorted(state))}"
-            )
-        for name, value in known.items():
-            if state[name].shape != value.shape:
-                raise StoreError(f"beam-angle: '{name}' has the shape {state[name].shape}, not {value.shape}")
+        require_state("beam-angle", state, {name: value.shape for name, value in known.items()})
+        trajectory.require_inside("beam-angle", state["support_points"])
         if state["step"].min() < 0 or state["step"].max() > self.options.steps:
             raise StoreError(f"beam-angle: 'step' must lie in 0..{self.options.steps}")
         for name, value in known.items():

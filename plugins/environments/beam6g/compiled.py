@@ -94,7 +94,8 @@ def walk(
         counts[:] = 0
         pace = steps / total
         for p in range(1, panels):
-            counts[int(np.ceil(before[p] * pace))] += 1
+            place = before[p] * pace  # not a number where a path has no length, or points that are none
+            counts[int(np.ceil(place)) if 0.0 <= place <= steps else steps + 1] += 1
         now = 0
         for k in range(steps + 1):
             now += counts[k]

@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g.physics import FIELD, FloatArray
 
 Rejection = Literal["tolerant", "released"]
@@ -172,6 +173,18 @@ def sample(
             missing[g] -= len(taken)
         growth *= 2
     return np.concatenate([block for blocks in accepted for block in blocks])
+
+
+def require_inside(owner: str, support: FloatArray) -> None:
+    """Refuse saved support points (B, n, 2) that are none of the field; `owner` is the environment's name.
+
+    Raises
+    ------
+    qrlsuite.errors.StoreError
+        If a coordinate is outside, or not a number.
+    """
+    if not ((support >= 0.0) & (support <= FIELD)).all():
+        raise StoreError(f"{owner}: 'support_points' must lie in the field, 0..{FIELD:g}")
 
 
 def positions(support: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 from numpy.typing import NDArray
 
-from qrlsuite.environment import LaneEnv, State, batched_spaces
+from qrlsuite.environment import LaneEnv, State, batched_spaces, require_state
 from qrlsuite.errors import StoreError
+from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.episodes import EpisodeGenerator, Tables, reset_options
 from qrlsuite.plugins.environments.beam6g.options import BeamOptions, parse
 
@@ -133,7 +134,7 @@ class BeamLanes(LaneEnv):
         Raises
         ------
         qrlsuite.errors.StoreError
-            If an array is missing or has another shape; nothing is changed then.
+            If an array is missing, has another shape, or holds what cannot be; nothing is changed then.
         """
         shapes = {
             "support_points": (self.num_envs, self.options.degree, 2),
@@ -141,13 +142,8 @@ class BeamLanes(LaneEnv):
             "received": (self.num_envs,),
             "observations": self._observations.shape,
         }
-        if set(state) != set(shapes):
-            raise StoreError(
-                f"beam6g: a state has {', '.join(sorted(shapes))}, not {', '.join(sorted(state))}"
-            )
-        for name, shape in shapes.items():
-            if state[name].shape != shape:
-                raise StoreError(f"beam6g: '{name}' has the shape {state[name].shape}, not {shape}")
+        require_state("beam6g", state, shapes)
+        trajectory.require_inside("beam6g", state["support_points"])
         if state["step"].min() < 0 or state["step"].max() >= self.options.steps:
             raise StoreError(f"beam6g: 'step' must lie in 0..{self.options.steps - 1}")
         self._support = np.array(state["support_points"], dtype=np.float64)
