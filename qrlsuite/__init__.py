@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from qrlsuite.api import table as table
     from qrlsuite.api import train as train
     from qrlsuite.api import tune as tune
+    from qrlsuite.circuit import Circuit as Circuit
     from qrlsuite.circuit.layer import layer as layer
     from qrlsuite.hookspecs import hookimpl as hookimpl
     from qrlsuite.registry import Registry
@@ -38,11 +39,19 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load", "new_study",
-    "play", "plot", "read_study", "register", "register_environments", "run_study", "table", "train", "tune",
+    "Circuit", "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load",
+    "new_study", "play", "plot", "read_study", "register", "register_environments", "run_study", "table", "train",
+    "tune",
 ]  # fmt: skip
 
-_FROM_API = frozenset(__all__) - {"__version__", "api", "hookimpl", "layer", "register_environments"}
+_FROM_API = frozenset(__all__) - {
+    "Circuit",
+    "__version__",
+    "api",
+    "hookimpl",
+    "layer",
+    "register_environments",
+}
 """Functions of `qrlsuite.api` that are attributes here too: no submodule may have one of these names."""
 
 # Python started in a checkout finds this folder before an installed package, and without the folders that an
@@ -60,6 +69,10 @@ def __getattr__(name: str) -> object:
         from qrlsuite.hookspecs import hookimpl
 
         return hookimpl
+    if name == "Circuit":
+        from qrlsuite.circuit import Circuit
+
+        return Circuit
     if name == "layer":
         from qrlsuite.circuit.layer import layer
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +20,18 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
         return [name for name in registry.load().names(specs.kind(kind)) if name.startswith(incomplete)]
 
     return complete
+
+
+def entries_here(context: typer.Context, incomplete: str) -> list[str]:
+    """Complete the beginning of an entry's name, or of TASK/NAME: entries of the results folder, and published ones."""
+    from qrlsuite.leaderboard.shelf.published import PUBLISHED
+    from qrlsuite.results.store import entries
+
+    folders = [Path(context.params.get("runs") or os.environ.get("QRLSUITE_RUNS") or "runs")]
+    folders += [PUBLISHED] if any(option.name == "published" for option in context.command.params) else []
+    paths = [store.path for folder in folders if folder.is_dir() for store in entries(folder)]
+    names = {f"{path.parent.name}/{path.name}" if "/" in incomplete else path.name for path in paths}
+    return sorted(name for name in names if name.startswith(incomplete) and name.isprintable())
 
 
 def split_settings(words: Sequence[str] | None) -> tuple[list[str], dict[str, Any]]:
@@ -50,6 +63,7 @@ EntryOption = Annotated[
         "--entry",
         metavar="ENTRY",
         help="Only this entry: its name or label, or the beginning of one, after [TASK/]. Repeatable.",
+        autocompletion=entries_here,
     ),
 ]
 HorizonOption = Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape as escape_html
 from typing import Any
 
@@ -212,6 +212,12 @@ class Bar:
         return {"text/html": f"{bar} {escape_html(text)}", "text/plain": text}
 
 
+def _range(numbers: Collection[int]) -> str:
+    """Return the least and the greatest: `3`, or `3 to 10`."""
+    least, greatest = min(numbers), max(numbers)
+    return f"{least}" if least == greatest else f"{least} to {greatest}"
+
+
 class RunDisplay:
     """Shows the training of one entry: a live bar on a terminal or in a notebook, lines elsewhere, nothing when quiet.
 
@@ -282,12 +288,12 @@ class RunDisplay:
         if not todo:
             return
         resumed = sum(len(group.seeds) for group in self.groups if group.epoch)
+        begun = {group.epoch for group in self.groups if group.epoch}
         complete = len(self.missing.seeds) - len(busy) - todo
         places = f"task{'s' * (self.workers > 1)}" if submits else f"process{'es' * (self.workers > 1)}"
         parts = [f"{counted(todo, 'seed')} to epoch {self.epochs}, {self.workers} {places}"]
-        parts += [f"{counted(complete, 'seed')} already there"] * bool(complete) + [
-            f"{resumed} resume"
-        ] * bool(resumed)
+        parts += [f"{counted(complete, 'seed')} already there"] if complete else []
+        parts += [f"{resumed} resume{'s' * (resumed == 1)} at epoch {_range(begun)}"] if resumed else []
         end = "" if submits else f" Ctrl-C saves; the same {self.again} continues."
         self.console.print("; ".join(parts) + "." + end)
         if self.expected is not None:
@@ -326,7 +332,7 @@ class RunDisplay:
             diverged += sum(state.get("seed_diverged") or [])
         parts = [
             f"seeds {completed}/{sum(len(g.seeds) for g in self.groups)}",
-            f"epoch {min(epochs)}/{self.epochs}",
+            f"epoch {_range(epochs)}/{self.epochs}",
         ]
         parts += [f"median score {statistics.median(scores):.3f}"] if scores else []
         parts += [f"{diverged} diverged"] if diverged else []
@@ -390,8 +396,7 @@ class RunDisplay:
     def out_of_time(self, budget: str) -> None:
         """Say that training stopped as it was asked to, how far it is, and how to go on."""
         self.close()
-        reached = [int(state.get("epoch") or 0) for state in self._last.values()] or [0]
-        epochs = f"{min(reached)}" if min(reached) == max(reached) else f"{min(reached)} to {max(reached)}"
+        epochs = _range([int(state.get("epoch") or 0) for state in self._last.values()] or [0])
         limit = "--budget" if self.again == "command" else "`budget`"
         self.console.print(
             f"stopped after {budget}, at epoch {epochs} of {self.epochs}; every finished epoch is saved. The "

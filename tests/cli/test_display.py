@@ -121,6 +121,17 @@ def test_phases_before_the_first_measure_have_names(
     assert f"  {said}" in capsys.readouterr().err
 
 
+def test_resumed_groups_say_where_they_stand(entry, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("qrlsuite.engine.display.PLAIN_SECONDS", 0.0)
+    groups = [SeedGroup((0, 1, 2), 10), SeedGroup((3, 4), 3), SeedGroup((5,), 0)]
+    display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(6), 20, groups=groups), 1)
+    display.begin()
+    display.update({})
+    said = " ".join(capsys.readouterr().err.split())
+    assert "6 seeds to epoch 20, 1 process; 5 resume at epoch 3 to 10." in said
+    assert "epoch 0 to 10/20" in said
+
+
 def test_learning_after_the_last_round_is_no_slow_round(entry, tmp_path, capsys, clock) -> None:
     """PPO plays all rounds in a second and learns for the rest of the epoch, which tells nothing of a round."""
     display = RunDisplay(Missing(tmp_path, entry, EntryStore(tmp_path), range(3), 500, groups=PAIR[:1]), 1)

@@ -252,6 +252,7 @@ def test_the_demo_ends_with_a_sentence_for_each_pair(
         ("qrlsuite lea", "leaderboard"),
         ("qrlsuite run --model four", "fourier"),
         ("qrlsuite run --mod", "--model"),
+        ("qrlsuite compare beam6g/ddqn-mlp-90", "beam6g/ddqn-mlp-90e7f8d4"),
     ],
 )
 def test_shells_complete_commands_options_and_names(line: str, expected: str) -> None:

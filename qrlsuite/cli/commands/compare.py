@@ -10,17 +10,29 @@ import typer
 from rich.console import Console
 
 from qrlsuite import api
-from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RuleOption, RunsOption
+from qrlsuite.cli.arguments import (
+    AmongOption,
+    JsonOption,
+    PublishedOption,
+    RuleOption,
+    RunsOption,
+    entries_here,
+)
 
 
 def compare(
     first: Annotated[
         str,
         typer.Argument(
-            metavar="ENTRY", help="An entry: its name or label, or the beginning of one, after [TASK/]."
+            metavar="ENTRY",
+            help="An entry: its name or label, or the beginning of one, after [TASK/].",
+            autocompletion=entries_here,
         ),
     ],
-    second: Annotated[str, typer.Argument(metavar="ENTRY", help="Another entry of the same task.")],
+    second: Annotated[
+        str,
+        typer.Argument(metavar="ENTRY", help="Another entry of the same task.", autocompletion=entries_here),
+    ],
     task: AmongOption = None,
     rule: RuleOption = None,
     published: PublishedOption = False,

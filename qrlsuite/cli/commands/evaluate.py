@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api import evaluation
-from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, names_of
+from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, entries_here, names_of
 from qrlsuite.engine.terminal import table_console
 from qrlsuite.leaderboard import pictures
 from qrlsuite.results.store import write_atomically
@@ -21,6 +21,7 @@ def evaluate(
         typer.Argument(
             metavar="ENTRY...",
             help="Entries of one task: name or label, [TASK/] before it, the beginning, or folder.",
+            autocompletion=entries_here,
         ),
     ],
     task: Annotated[

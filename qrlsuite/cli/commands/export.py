@@ -10,7 +10,7 @@ import typer
 
 from qrlsuite.api.publishing import export as export_each
 from qrlsuite.api.publishing import export_rliable
-from qrlsuite.cli.arguments import JsonOption, RunsOption, TasksOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TasksOption, entries_here
 from qrlsuite.engine.terminal import command
 from qrlsuite.results.text import counted
 
@@ -22,6 +22,7 @@ def export(
             metavar="[ENTRY]...",
             help="Its name or label, or the beginning of one, after [TASK/]; or a study, by its name or file; or `all` "
             "complete entries of the folder.",
+            autocompletion=entries_here,
         ),
     ] = None,
     task: TasksOption = None,

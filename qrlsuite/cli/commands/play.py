@@ -8,14 +8,16 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api import episode as episodes
-from qrlsuite.cli.arguments import PublishedOption, RunsOption, names_of
+from qrlsuite.cli.arguments import PublishedOption, RunsOption, entries_here, names_of
 
 
 def play(
     entry: Annotated[
         str,
         typer.Argument(
-            metavar="ENTRY", help="Its name or label, [TASK/] before it, the beginning, or folder."
+            metavar="ENTRY",
+            help="Its name or label, [TASK/] before it, the beginning, or folder.",
+            autocompletion=entries_here,
         ),
     ],
     task: Annotated[

@@ -9,17 +9,26 @@ from typing import Annotated
 import typer
 
 from qrlsuite.api.needs import seeds_needed
-from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption
+from qrlsuite.cli.arguments import AmongOption, JsonOption, PublishedOption, RunsOption, entries_here
 from qrlsuite.engine.terminal import table_console
 
 
 def power(
     first: Annotated[
         str,
-        typer.Argument(metavar="ENTRY", help="An entry like those to compare, with two seeds or more."),
+        typer.Argument(
+            metavar="ENTRY",
+            help="An entry like those to compare, with two seeds or more.",
+            autocompletion=entries_here,
+        ),
     ],
     second: Annotated[
-        str | None, typer.Argument(metavar="[ENTRY]", help="Another one, to be told apart from the first.")
+        str | None,
+        typer.Argument(
+            metavar="[ENTRY]",
+            help="Another one, to be told apart from the first.",
+            autocompletion=entries_here,
+        ),
     ] = None,
     task: AmongOption = None,
     draws: Annotated[

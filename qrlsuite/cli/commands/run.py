@@ -11,7 +11,7 @@ import typer
 from qrlsuite import options, registry, specs
 from qrlsuite.api.arguments import where_of
 from qrlsuite.api.training import resolve_entry, train_entry
-from qrlsuite.cli.arguments import JsonOption, RunsOption, names_of, split_settings
+from qrlsuite.cli.arguments import JsonOption, RunsOption, entries_here, names_of, split_settings
 from qrlsuite.cli.training import (
     BudgetOption,
     DeviceOption,
@@ -81,6 +81,7 @@ def run(
             "--from",
             metavar="ENTRY",
             help="Begin with the trained agents of this entry, seed k with that of seed k; [TASK/]ENTRY, or a folder.",
+            autocompletion=entries_here,
         ),
     ] = None,
     budget: BudgetOption = None,

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from qrlsuite.api.tables import progress_table
-from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption
+from qrlsuite.cli.arguments import JsonOption, RunsOption, TaskOption, entries_here
 from qrlsuite.engine.sheet import csv_rows
 from qrlsuite.engine.status import EntryStatus, choose, delete_each, survey
 from qrlsuite.engine.terminal import printable, table_console
@@ -117,7 +117,11 @@ def collect_garbage(
 def delete_entries(
     names: Annotated[
         list[str],
-        typer.Argument(metavar="ENTRY...", help="Its name or label, or the beginning of one, after [TASK/]."),
+        typer.Argument(
+            metavar="ENTRY...",
+            help="Its name or label, or the beginning of one, after [TASK/].",
+            autocompletion=entries_here,
+        ),
     ],
     task: TaskOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
