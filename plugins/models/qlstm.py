@@ -102,7 +102,7 @@ class Remembering(vqc._Hybrid):
         """Return expectation values; every agent executes a number of circuits, and their gradients."""
         values = self._runner.backend(inputs, parameters, seeds)
         executions = self._runner.executions
-        executions.forward += circuits
+        executions.count_forward(circuits)
         if values.requires_grad:
             values.register_hook(lambda grad: executions.count_backward(circuits))  # type: ignore[no-untyped-call]
         return ACTIVATIONS[self._runner.options.activation_out](values)

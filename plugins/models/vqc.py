@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ExecutionCounter, ansatz, create_backend, options_on
-from qrlsuite.circuit.description import mean_field_refusal
+from qrlsuite.circuit.description import in_bases, mean_field_refusal
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
@@ -169,7 +169,9 @@ class _Runner:
         self.options = options
         self.circuit = build_circuit(options)
         shots: int | None = getattr(options, "shots", None)
-        self.executions = ExecutionCounter(shots, shift_evaluations(self.circuit), self.circuit.mean_field)
+        self.executions = ExecutionCounter(
+            shots, shift_evaluations(self.circuit), self.circuit.mean_field, len(in_bases(self.circuit))
+        )
         self._backend: CircuitBackend | None = None
 
     @property
@@ -291,7 +293,7 @@ class _Hybrid(nn.Module):
         parameters = {name: state[f"circuit.{name}"] for name in runner.circuit.parameters}
         values = runner.backend(inner, parameters, self._shot_seeds())
         executions, inputs = runner.executions, x.shape[1]
-        executions.forward += inputs
+        executions.count_forward(inputs)
         if values.requires_grad:
             values.register_hook(lambda grad: executions.count_backward(inputs))  # type: ignore[no-untyped-call]
         values = ACTIVATIONS[options.activation_out](values)

@@ -34,6 +34,8 @@ class AngleTable:
         for name, parameter in circuit.parameters.items():
             offsets[name] = total
             total += parameter.size
+        if not circuit.measures_z:
+            raise CircuitError("observables of other Paulis are measured as Pauli Z by `create_backend`")
         self.rows: list[tuple[int | float, ...]] = []
         self.controlled: list[bool] = []
         feature: list[int] = []

@@ -20,7 +20,14 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import numpy as np
 
-from qrlsuite.circuit.description import MAX_QUBITS, Circuit, Product, mean_field_refusal, without_products
+from qrlsuite.circuit.description import (
+    MAX_QUBITS,
+    Circuit,
+    Product,
+    in_bases,
+    mean_field_refusal,
+    without_products,
+)
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, nearest
 
 if TYPE_CHECKING:
@@ -204,16 +211,28 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
     return _make(specs.resolve(spec.factory), circuit, chosen)
 
 
-class _WithProducts:
-    """A backend of a circuit whose angles have products of inputs, which the backend gets as further inputs."""
+class _Whole:
+    """A backend made of those of a circuit's measurement bases; products of inputs are further inputs of theirs."""
 
-    def __init__(self, backend: CircuitBackend, products: tuple[Product, ...]) -> None:
-        self.backend = backend
+    def __init__(
+        self, parts: Sequence[CircuitBackend], places: Sequence[int], products: Sequence[Product]
+    ) -> None:
+        self.parts = parts
+        self.places = places
         self.products = products
-        self.shots = backend.shots
-        for name in ("draws", "gradient_circuits", "simulator", "compile_for"):
-            if hasattr(backend, name):
-                setattr(self, name, getattr(backend, name))
+        first = parts[0]
+        self.shots = first.shots
+        for name in ("draws", "simulator"):
+            if hasattr(first, name):
+                setattr(self, name, getattr(first, name))
+        if hasattr(first, "gradient_circuits"):
+            self.gradient_circuits = sum(cast(Any, part).gradient_circuits for part in parts)
+        if hasattr(first, "compile_for"):
+            self.compile_for = self._compile_for
+
+    def _compile_for(self, like: torch.Tensor) -> None:
+        for part in self.parts:
+            cast(Any, part).compile_for(like)
 
     def __call__(
         self,
@@ -222,7 +241,21 @@ class _WithProducts:
         seeds: Sequence[int] | None = None,
     ) -> torch.Tensor:
         """Return expectation values, see `CircuitBackend`."""
-        return self.backend(extended(inputs, self.products), parameters, seeds)
+        x = extended(inputs, self.products)
+        if len(self.parts) == 1:
+            return self.parts[0](x, parameters, seeds)
+        import torch
+
+        values = [
+            part(x, parameters, seeds if seeds is None else [_basis_seed(seed, k) for seed in seeds])
+            for k, part in enumerate(self.parts)
+        ]
+        return torch.cat(values, dim=-1)[..., list(self.places)]
+
+
+def _basis_seed(seed: int, basis: int) -> int:
+    """Return the seed of what is sampled in one basis: independent of the others'."""
+    return int(np.random.SeedSequence((seed, basis)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
@@ -245,8 +278,12 @@ def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
 def _make(factory: Any, circuit: Circuit, chosen: Any) -> CircuitBackend:
     """Return the backend of a circuit."""
     plain, products = without_products(circuit)
-    backend: CircuitBackend = factory(plain, chosen)
-    return _WithProducts(backend, products) if products else backend
+    parts = in_bases(plain)
+    backends: list[CircuitBackend] = [factory(part, chosen) for part, _ in parts]
+    if len(parts) == 1 and not products:
+        return backends[0]
+    order = [place for _, places in parts for place in places]
+    return _Whole(backends, np.argsort(order).tolist(), products)
 
 
 def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[CircuitBackendSpec, Any]:
@@ -258,10 +295,10 @@ def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[C
     if circuit.mean_field and not spec.mean_field:
         raise OptionError(mean_field_refusal(name))
     if circuit.measures_products and not spec.products:
-        raise OptionError(f"backend '{name}' measures Pauli Z of single qubits, and not products of them")
+        raise OptionError(f"backend '{name}' measures Paulis of single qubits, and not products of them")
     if circuit.measures_products and circuit.mean_field:
         raise OptionError(
-            "a mean-field approximation has no correlations, and so no products of Pauli Z to measure"
+            "a mean-field approximation has no correlations, and so no products of Paulis to measure"
         )
     return spec, option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
 

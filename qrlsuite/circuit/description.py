@@ -7,7 +7,7 @@ A `Circuit` is a list of operations on qubits 0..n-1. Every rotation angle is af
 where `scale` and `weight` are elements of named trainable parameters (either may be absent; an absent scale with an
 input present counts as 1), and `input` may be a product of two inputs, a multiple, or a number. Reading order is
 application order. Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured
-observables are Pauli Z on chosen qubits (default: every), or products of them.
+observables are Pauli Z on chosen qubits (default: every), or products of Pauli X, Y and Z.
 
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
@@ -30,6 +30,7 @@ Only numpy is imported here.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -91,6 +92,11 @@ class Element:
 
 
 _NUMBER = int, float, np.integer, np.floating
+
+Observable = int | tuple[int, ...] | str
+"""A qubit for its Pauli Z, qubits for the product of theirs, or a product of other Paulis: `X0 Y2`."""
+
+_FACTOR = re.compile(r"\s*([XYZ])(\d+)\s*")
 
 Product = tuple[int | None, int | None, float]
 """A product of inputs: the first (None for 1), the second (None for 1), and a number."""
@@ -269,7 +275,7 @@ class Circuit:
         self.mean_field = mean_field
         self.parameters: dict[str, Parameter] = {}
         self._operations: list[Operation] = []
-        self._observables: tuple[int | tuple[int, ...], ...] = tuple(range(qubits))
+        self._observables: tuple[Observable, ...] = tuple(range(qubits))
 
     @property
     def operations(self) -> tuple[Operation, ...]:
@@ -277,50 +283,63 @@ class Circuit:
         return tuple(self._operations)
 
     @property
-    def observables(self) -> tuple[int | tuple[int, ...], ...]:
-        """What is measured, in output order: the qubit of a Pauli Z, or the qubits of a product of several."""
+    def observables(self) -> tuple[Observable, ...]:
+        """What is measured, in output order, as `measure` takes it."""
         return self._observables
 
     @property
     def measured(self) -> tuple[tuple[int, ...], ...]:
-        """The qubits of every observable, in output order: it is the product of their Pauli Z."""
-        return tuple((o,) if isinstance(o, int) else o for o in self._observables)
+        """The qubits of every observable, in output order: it is the product of their Paulis, see `axes`."""
+        return tuple(tuple(qubit for _, qubit in _factors(o)) for o in self._observables)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The Paulis of every observable, in the order of its qubits in `measured`: `Z`, or `XY`."""
+        return tuple("".join(axis for axis, _ in _factors(o)) for o in self._observables)
 
     @property
     def measures_products(self) -> bool:
         """Whether some observable is a product."""
-        return any(not isinstance(o, int) for o in self._observables)
+        return any(len(qubits) > 1 for qubits in self.measured)
 
-    def measure(self, wires: Sequence[int | Sequence[int]]) -> None:
+    @property
+    def measures_z(self) -> bool:
+        """Whether every observable is a Pauli Z, or a product of them: what a backend is given."""
+        return all(set(axes) == {"Z"} for axes in self.axes)
+
+    def measure(self, observables: Sequence[int | Sequence[int] | str]) -> None:
         """Measure these observables, in this order, instead of Pauli Z on every qubit.
 
         Parameters
         ----------
-        wires:
-            A qubit stands for its Pauli Z, several qubits for the product of theirs: `measure([0, (1, 2)])` measures
-            Z_0 and Z_1 Z_2.
+        observables:
+            A qubit stands for its Pauli Z, several qubits for the product of theirs, and a text for any product of
+            Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. What no common basis measures is
+            executed apart, see `in_bases`.
 
         Raises
         ------
         CircuitError
-            If these are no qubits or groups of them, or one is there twice.
+            If these are no qubits, groups of them or products, or one is there twice.
         """
-        given: Any = wires  # whatever a program hands over
-        listed = [] if isinstance(given, str) else list(given)
-        groups: list[tuple[Any, ...]] = [
-            tuple(w) if isinstance(w, Iterable) and not isinstance(w, str) else (w,) for w in listed
-        ]
+        given: Any = observables  # whatever a program hands over
+        try:
+            listed = [] if isinstance(given, str) else [_factors(each) for each in given]
+        except TypeError:
+            listed = []
         if (
-            not groups
-            or not all(isinstance(w, int | np.integer) for g in groups for w in g)
-            or len(set(map(frozenset, groups))) != len(groups)
-            or any(not g or len(set(g)) != len(g) or not all(0 <= w < self.qubits for w in g) for g in groups)
+            not listed
+            or len(set(map(frozenset, listed))) != len(listed)
+            or any(
+                not word or len({q for _, q in word}) != len(word) or any(q >= self.qubits for _, q in word)
+                for word in listed
+            )
         ):
             raise CircuitError(
-                f"observables {wires!r}: distinct qubits 0..{self.qubits - 1}, or distinct groups of them, are "
-                "needed"
+                f"observables {observables!r}: distinct qubits 0..{self.qubits - 1}, distinct groups of them, or "
+                'products like "X0 Y1" are needed'
             )
-        self._observables = tuple(int(g[0]) if len(g) == 1 else tuple(map(int, g)) for g in groups)
+        self._observables = tuple(map(_observable, listed))
 
     def input(self, index: int) -> Angle:
         """Return input feature `index` as an angle (radians)."""
@@ -477,6 +496,66 @@ class Circuit:
         return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count}{kind})"
 
 
+def _factors(observable: Any) -> tuple[tuple[str, int], ...]:
+    """Return the Paulis of an observable and their qubits; none for what is no observable."""
+    if isinstance(observable, str):
+        found = [_FACTOR.fullmatch(part) for part in re.split(r"[*@]|(?<=\d)\s+(?=[XYZ])", observable)]
+        return tuple((each[1], int(each[2])) for each in found if each) if all(found) else ()
+    qubits = tuple(observable) if isinstance(observable, Iterable) else (observable,)
+    if not all(isinstance(q, int | np.integer) and q >= 0 for q in qubits):
+        return ()
+    return tuple(("Z", int(q)) for q in qubits)
+
+
+def _observable(word: tuple[tuple[str, int], ...]) -> Observable:
+    """Return an observable as `Circuit.observables` has it."""
+    if any(axis != "Z" for axis, _ in word):
+        return " ".join(f"{axis}{qubit}" for axis, qubit in word)
+    return word[0][1] if len(word) == 1 else tuple(qubit for _, qubit in word)
+
+
+_TURNS: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
+    "X": (("H", ()),),
+    "Y": (("RX", (math.pi / 2,)),),
+    "Z": (),
+}
+"""The gates after which Pauli Z is what this Pauli was before."""
+
+
+def in_bases(circuit: Circuit) -> list[tuple[Circuit, tuple[int, ...]]]:
+    """Divide a circuit by measurement basis: every part measures products of Pauli Z alone, behind the gates it needs.
+
+    Each observable joins the first part that measures the same Pauli on every qubit that both have.
+
+    Returns
+    -------
+    list
+        Circuits, and the places of their observables among the circuit's. One that measures Pauli Z alone is the only
+        part of itself.
+    """
+    if circuit.measures_z:
+        return [(circuit, tuple(range(len(circuit.observables))))]
+    parts: list[tuple[dict[int, str], list[int]]] = []
+    for place, (qubits, axes) in enumerate(zip(circuit.measured, circuit.axes)):
+        word = dict(zip(qubits, axes))
+        fitting = (part for part in parts if all(part[0].get(q, axis) == axis for q, axis in word.items()))
+        basis, places = next(fitting, ({}, []))
+        if not places:
+            parts.append((basis, places))
+        basis.update(word)
+        places.append(place)
+    divided = []
+    for basis, places in parts:
+        part = Circuit(circuit.qubits, circuit.inputs, circuit.mean_field)
+        part.parameters, part._operations = dict(circuit.parameters), list(circuit.operations)
+        for qubit in sorted(basis):
+            for gate, angles in _TURNS[basis[qubit]]:
+                part.append(gate, qubit, *angles)
+        part.measure([circuit.measured[place] for place in places])
+        divided.append((part, tuple(places)))
+    return divided
+
+
 def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Product, ...]]:
     """Write products and multiples of inputs, and numbers before a parameter, as inputs behind the others.
 
@@ -522,7 +601,10 @@ def canonical(circuit: Circuit) -> str:
         control = "" if operation.control is None else f" control {operation.control}"
         angles = "".join(f" {_written(angle)}" for angle in operation.angles)
         lines.append(f"{operation.gate} {' '.join(map(str, operation.wires))}{control}{angles}")
-    measured = " ".join("*".join(map(str, qubits)) for qubits in circuit.measured)
+    measured = " ".join(
+        "*".join(f"{'' if axis == 'Z' else axis}{qubit}" for axis, qubit in _factors(o))
+        for o in circuit.observables
+    )
     return "\n".join([*lines, f"measure {measured}", ""])
 
 

@@ -13,7 +13,7 @@ class ExecutionCounter:
     shots:
         Repetitions of each circuit; None where expectation values are exact.
     forward:
-        Circuits executed in forward passes: one per input.
+        Circuits executed in forward passes: one per input and measurement basis.
     gradient:
         Circuits executed for gradients, where shots or noise are simulated. Exact simulators differentiate otherwise;
         so that entries can be compared, theirs are the circuits that the parameter-shift rule would need for the
@@ -23,10 +23,15 @@ class ExecutionCounter:
         The number of these circuits for the gradient at one input.
     mean_field:
         Whether the model is a mean-field approximation, which is no circuit and executes none.
+    bases:
+        Measurement bases of the circuit.
     """
 
-    def __init__(self, shots: int | None, per_gradient: int, mean_field: bool = False) -> None:
+    def __init__(
+        self, shots: int | None, per_gradient: int, mean_field: bool = False, bases: int = 1
+    ) -> None:
         self.mean_field = mean_field
+        self.bases = bases
         self.shots = shots
         self.per_gradient = per_gradient
         self.forward = 0
@@ -43,6 +48,10 @@ class ExecutionCounter:
         if self.shots is not None:
             counts["shots"] = self.shots * (self.forward + self.gradient)
         return counts
+
+    def count_forward(self, inputs: int) -> None:
+        """Count a forward pass at a number of inputs."""
+        self.forward += inputs * self.bases
 
     def count_backward(self, inputs: int) -> None:
         """Count a backward pass at a number of inputs."""

@@ -89,8 +89,8 @@ def _qiskit(circuit: Circuit) -> str:
                 f"circuit.{controlled}{name}({a}, {wires})" for name, a in _rotations(operation, angles)
             ]
     lines += ["", "observables = ["]
-    for qubits in circuit.measured:
-        term = f'("{"Z" * len(qubits)}", {list(qubits)}, 1.0)'
+    for qubits, axes in zip(circuit.measured, circuit.axes):
+        term = f'("{axes}", {list(qubits)}, 1.0)'
         lines.append(f"    SparsePauliOp.from_sparse_list([{term}], {circuit.qubits}),")
     return "\n".join([*lines, "]"]) + "\n"
 
@@ -121,7 +121,10 @@ def _pennylane(circuit: Circuit) -> str:
         if operation.control is not None:
             gate = f"qml.ctrl({gate}, control={operation.control})"
         lines.append(f"    {gate}({arguments})")
-    values = [" @ ".join(f"qml.Z({q})" for q in qubits) for qubits in circuit.measured]
+    values = [
+        " @ ".join(f"qml.{axis}({q})" for axis, q in zip(axes, qubits))
+        for axes, qubits in zip(circuit.axes, circuit.measured)
+    ]
     lines.append(f"    return [{', '.join(f'qml.expval({value})' for value in values)}]")
     return "\n".join(lines) + "\n"
 
@@ -136,7 +139,10 @@ def _qasm3(circuit: Circuit) -> str:
     names = [f"x_{i}" for i in range(circuit.inputs)]
     for name, parameter in circuit.parameters.items():
         names += [element(Element(name, i)) for i in range(parameter.size)]
-    products = ["*".join(f"Z_{q}" for q in qubits) for qubits in circuit.measured]
+    products = [
+        "*".join(f"{axis}_{q}" for axis, q in zip(axes, qubits))
+        for axes, qubits in zip(circuit.axes, circuit.measured)
+    ]
     lines = [
         "OPENQASM 3.0;",
         'include "stdgates.inc";',

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from qrlsuite.circuit.description import Circuit, Operation
+from qrlsuite.circuit.description import Circuit, Operation, in_bases
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Resources:
         Gates on the longest path through the circuit.
     shift_evaluations:
         Circuit executions that the parameter-shift rule takes for the gradient at one input: two for every
-        variable angle of an uncontrolled rotation, four for one of a controlled rotation.
+        variable angle of an uncontrolled rotation, four for one of a controlled rotation, in each measurement basis.
     """
 
     qubits: int
@@ -59,9 +59,9 @@ def shift_evaluations(circuit: Circuit) -> int:
     """Return how many circuit executions the parameter-shift rule takes for the gradient at one input.
 
     Two per variable angle of an uncontrolled rotation, four of a controlled one (Wierichs et al. 2022, Quantum 6,
-    677), none for constants.
+    677), none for constants; each in every measurement basis.
     """
-    return sum(
+    return len(in_bases(circuit)) * sum(
         4 if operation.control is not None else 2
         for operation in circuit
         for angle in operation.angles

@@ -14,6 +14,7 @@ Matrix = NDArray[np.complex128]
 _X: Matrix = np.array([[0, 1], [1, 0]], dtype=np.complex128)
 _Y: Matrix = np.array([[0, -1j], [1j, 0]])
 _Z: Matrix = np.diag([1, -1]).astype(np.complex128)
+_PAULIS = {"X": _X, "Y": _Y, "Z": _Z}
 _FIXED: dict[str, Matrix] = {
     "H": (_X + _Z) / np.sqrt(2),
     "X": _X,
@@ -42,13 +43,12 @@ def expectation_values(
         k = len(wires)
         state = np.tensordot(matrix.reshape((2,) * (2 * k)), state, axes=(range(k, 2 * k), wires))
         state = np.moveaxis(state, range(k), wires)
-    probabilities = np.abs(state) ** 2
     values = []
-    for qubits in circuit.measured:
-        signs = np.ones((2,) * n)
-        for q in qubits:
-            signs = signs * np.array([1.0, -1.0]).reshape([2 if axis == q else 1 for axis in range(n)])
-        values.append(float((signs * probabilities).sum()))
+    for qubits, axes in zip(circuit.measured, circuit.axes):
+        turned = state
+        for q, axis in zip(qubits, axes):
+            turned = np.moveaxis(np.tensordot(_PAULIS[axis], turned, axes=(1, q)), 0, q)
+        values.append(float(np.vdot(state, turned).real))
     return np.array(values)
 
 
@@ -67,7 +67,8 @@ def _mean_field_values(
         together = (matrix @ np.kron(states[a], states[b]) @ matrix.conj().T).reshape(2, 2, 2, 2)
         together /= np.einsum("ijij", together)  # else the rounding of the trace grows with every gate
         states[a], states[b] = np.einsum("ikjk->ij", together), np.einsum("kikj->ij", together)
-    return np.array([float(np.trace(_Z @ states[q]).real) for (q,) in circuit.measured])
+    single = zip(circuit.measured, circuit.axes)
+    return np.array([float(np.trace(_PAULIS[axis] @ states[q]).real) for (q,), axis in single])
 
 
 def _angle(angle: Angle, inputs: NDArray[np.float64], parameters: Mapping[str, NDArray[np.float64]]) -> float:

@@ -11,10 +11,10 @@ from qrlsuite.circuit import Circuit, ansatz, expectations
 from qrlsuite.circuit.export import FORMATS, export
 from qrlsuite.errors import OptionError
 from qrlsuite.testing.circuits import every_gate
-from tests.circuits.test_products import rich
+from tests.circuits.test_products import rich, words
 from tests.commands import say
 
-CIRCUITS = [every_gate, rich, lambda: ansatz("iqp", 3, 1), lambda: ansatz("iqp", 2, 1, gate="u3")]
+CIRCUITS = [every_gate, rich, words, lambda: ansatz("iqp", 3, 1), lambda: ansatz("iqp", 2, 1, gate="u3")]
 
 
 def numbers(circuit: Circuit) -> tuple[Any, dict[str, Any], list[float]]:
@@ -70,7 +70,9 @@ def test_the_qasm3_text(make: Any) -> None:
     for name, array in parameters.items():
         given |= {"_".join([name, *map(str, index)]): array[index] for index in np.ndindex(array.shape)}
     flat = {parameter: given[parameter.name] for parameter in read.parameters}
-    words = ([("Z" * len(qubits), qubits, 1.0)] for qubits in circuit.measured)
+    said = text.partition("// observables: ")[2].partition("\n")[0].split(", ")
+    factors = ([factor.split("_") for factor in word.split("*")] for word in said)
+    words = [[("".join(a for a, _ in word), [int(q) for _, q in word], 1.0)] for word in factors]
     observables = [SparsePauliOp.from_sparse_list(word, circuit.qubits) for word in words]
     np.testing.assert_allclose(values(read.assign_parameters(flat), observables), expected, atol=1e-12)
 

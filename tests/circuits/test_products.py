@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, create_backend, expectations
 from qrlsuite.circuit.angles import AngleTable
-from qrlsuite.circuit.description import canonical, without_products
+from qrlsuite.circuit.description import canonical, in_bases, without_products
 from qrlsuite.circuit.drawing import angle_text, draw_text
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import CircuitError, OptionError
@@ -49,6 +49,13 @@ def multiples():
     return circuit
 
 
+def words():
+    """Return the first circuit with products of other Paulis: four bases, and an order that is none of theirs."""
+    circuit = rich()
+    circuit.measure(["X1", (0, 1), "Y0 X2", 3, "X0 Y3 Z2", "Y2", "X1 X3"])
+    return circuit
+
+
 @pytest.mark.parametrize("gate", ["RXX", "RYY", "RZZ"])
 def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
     circuit = Circuit(2, inputs=1)
@@ -72,7 +79,7 @@ def test_a_rotation_of_two_qubits_is_the_exponential_of_its_paulis(gate):
     assert shift_evaluations(circuit) == 2
 
 
-@pytest.mark.parametrize("make", [rich, multiples])
+@pytest.mark.parametrize("make", [rich, multiples, words])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_values_and_gradients_on_every_backend(backend, make):
     circuit = make()
@@ -173,9 +180,14 @@ def test_products_are_drawn():
         (lambda c: c.append("RX", 0, c.input(0) * float("inf")), "numbers must be finite"),
         (lambda c: c.append("RZZ", 0, 0.1), "RZZ takes 2 wires, 1 angle and no control"),
         (lambda c: c.append("RXY", (0, 1), 0.1), "unknown gate 'RXY'; did you mean"),
-        (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, are needed"),
+        (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, or products"),
         (lambda c: c.measure([(0, 0)]), "are needed"),
-        (lambda c: c.measure(["X0"]), r"observables \['X0'\]: distinct qubits 0\.\."),
+        (lambda c: c.measure(["X0", "X9"]), r"observables \['X0', 'X9'\]: distinct qubits 0\.\."),
+        (lambda c: c.measure(["A0"]), "are needed"),
+        (lambda c: c.measure(["X0 Y0"]), "are needed"),
+        (lambda c: c.measure(["X0 Z1", "Z1 X0"]), "are needed"),
+        (lambda c: c.measure([0, "Z0"]), "are needed"),
+        (lambda c: c.measure([-1]), "are needed"),
         (lambda c: c.measure("01"), "observables '01': distinct qubits"),
         (lambda c: c.measure([0, None]), r"observables \[0, None\]: distinct qubits"),
         (lambda c: c.measure([()]), "are needed"),
@@ -195,7 +207,7 @@ def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
 
     single = dataclasses.replace(spec, products=False)
     monkeypatch.setattr(registry, "get", lambda kind, name: single)
-    with pytest.raises(OptionError, match="'pennylane' measures Pauli Z of single qubits"):
+    with pytest.raises(OptionError, match="'pennylane' measures Paulis of single qubits"):
         create_backend("pennylane", circuit)
     monkeypatch.undo()
     classical = Circuit(2, mean_field=True)
@@ -207,6 +219,53 @@ def test_who_cannot_measure_products_is_asked_for_none(monkeypatch):
     for read in (AngleTable, NativeBackend(product).simulator):
         with pytest.raises(CircuitError, match="written as inputs by `create_backend`"):
             read(product) if read is AngleTable else read()
+    for read in (AngleTable, NativeBackend):
+        with pytest.raises(CircuitError, match="measured as Pauli Z by `create_backend`"):
+            read(words())
+
+
+def test_paulis_are_those_of_matrices():
+    circuit = words()
+    inputs, parameters, _ = draw(circuit, 1, 1)
+    state = dense.states(circuit, inputs, parameters["w"])[0, 0].numpy()
+    values = expectations(circuit, inputs[0], {"w": parameters["w"][0]})[0]
+    for qubits, axes, value in zip(circuit.measured, circuit.axes, values):
+        factors = dict(zip(qubits, axes))
+        matrix = np.eye(1)
+        for q in range(4):
+            matrix = np.kron(matrix, PAULI[factors[q]] if q in factors else np.eye(2))
+        assert float(value) == pytest.approx(np.vdot(state, matrix @ state).real, abs=1e-12)
+    assert canonical(circuit).endswith("measure X1 0*1 Y0*X2 3 X0*Y3*2 Y2 X1*X3\n")
+
+
+def test_every_basis_is_executed_and_sampled_by_itself():
+    circuit = words()
+    parts = in_bases(circuit)
+    assert [places for _, places in parts] == [(0, 2, 3), (1, 5), (4,), (6,)]
+    assert all(part.measures_z for part, _ in parts)
+    assert in_bases(rich())[0][0].observables == rich().observables
+    assert shift_evaluations(circuit) == 4 * shift_evaluations(rich())
+    inputs, parameters, _ = draw(circuit, 1, 1)
+    backend = create_backend("native", circuit, shots=1)
+    assert backend.gradient_circuits == 4 * create_backend("native", rich(), shots=1).gradient_circuits
+    drawn = torch.cat([backend(inputs, parameters, [seed]) for seed in range(400)])
+    exact = create_backend("native", circuit)(inputs, parameters)
+    assert torch.allclose(drawn.mean(0), exact[0], atol=0.2)
+    assert torch.equal(drawn[7:8], backend(inputs, parameters, [7]))
+    flat = Circuit(2)  # X0 and Z0 are coins: draws of one seed in two bases are not the same
+    flat.append("RY", 0, np.pi / 4)
+    flat.measure([0, "X0"])
+    bits = create_backend("native", flat, shots=1)(torch.zeros(1, 200, 2, dtype=torch.float64), {}, [1])[0]
+    assert 0.2 < float((bits[:, 0] == bits[:, 1]).double().mean()) < 0.95
+
+
+def test_a_mean_field_approximation_measures_any_pauli_of_one_qubit():
+    circuit = Circuit(2, mean_field=True)
+    circuit.append("RY", 0, circuit.input(0))
+    circuit.append("RX", 1, circuit.input(1))
+    circuit.measure(["X0", "Y1", 0])
+    got = expectations(circuit, [[0.3, 0.4]], {})[0].numpy()
+    np.testing.assert_allclose(got, [np.sin(0.3), -np.sin(0.4), np.cos(0.3)], atol=1e-12)
 
 
 @pytest.mark.parametrize("number", [2, 2.0, np.float32(2), np.int64(2)])

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import CircuitError, OptionError
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.plugins.circuits.native.program import Program, compile_circuit
 from qrlsuite.plugins.circuits.options import NativeOptions
@@ -57,6 +57,8 @@ class NativeBackend:
 
     def __init__(self, circuit: Circuit, options: NativeOptions | None = None) -> None:
         circuit.require_simulable()
+        if not circuit.measures_z:
+            raise CircuitError("observables of other Paulis are measured as Pauli Z by `create_backend`")
         self.options = NativeOptions() if options is None else options
         _check(self.options, circuit)
         self.shots = self.options.shots

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.circuit.description import Circuit
+from qrlsuite.circuit.description import Circuit, Observable
 from qrlsuite.circuit.elementary import Elementary
 
 Bits = NDArray[np.uint8]
@@ -73,7 +73,7 @@ class PauliNoise:
             self._gates.append(gate)
         self.rotations = elementary.rotations + len(self.constants)
 
-    def circuit(self, observables: Sequence[int | tuple[int, ...]]) -> Circuit:
+    def circuit(self, observables: Sequence[Observable]) -> Circuit:
         """Return the circuit that every trajectory runs: an input for each rotation's angle."""
         executed = Circuit(self.qubits, inputs=max(1, self.rotations))
         for name, wires, rotation in self._gates:
