@@ -61,6 +61,9 @@ class CircuitBackend(Protocol):
         counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
     simulator (bool):
         False where circuits run on a device, whose executions may cost money; by default true.
+    states (callable):
+        Of a simulator: `states(inputs, parameters)` returns the final states (S, B, 2^n), up to a global phase, without
+        shots and noise; qubit 0 is the highest bit of a basis state's index.
     compile_for (callable):
         Of a simulator: `compile_for(like)` compiles what the first passes on tensors of the dtype and device of
         `like` would compile. It is called before training, so that no epoch's time holds it.
@@ -229,10 +232,15 @@ class _Whole:
             self.gradient_circuits = sum(cast(Any, part).gradient_circuits for part in parts)
         if hasattr(first, "compile_for"):
             self.compile_for = self._compile_for
+        if hasattr(first, "states") and len(parts) == 1:  # other bases turn the state
+            self.states = self._states
 
     def _compile_for(self, like: torch.Tensor) -> None:
         for part in self.parts:
             cast(Any, part).compile_for(like)
+
+    def _states(self, inputs: torch.Tensor, parameters: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        return cast(Any, self.parts[0]).states(extended(inputs, self.products), parameters)
 
     def __call__(
         self,

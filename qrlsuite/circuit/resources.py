@@ -96,28 +96,18 @@ def jacobian_rank(circuit: Circuit, seed: int = 0) -> int | None:
         return 0
     import torch
 
-    from qrlsuite.circuit.api import create_backend
+    from qrlsuite.circuit.jacobian import jacobians
 
-    outputs = len(circuit.observables)
-    points = -(-2 * circuit.parameter_count // outputs) + 8
+    points = -(-2 * circuit.parameter_count // len(circuit.observables)) + 8
     source = torch.Generator().manual_seed(seed)
     x = torch.randn(points, 1, circuit.inputs, generator=source, dtype=torch.float64)
-    leaves = {}
+    parameters = {}
     for name, parameter in circuit.parameters.items():
         drawn = torch.rand(parameter.shape, generator=source, dtype=torch.float64)
         drawn = parameter.low + (parameter.high - parameter.low) * drawn
-        # every point is a seed of its own, so that one backward pass gives all points' gradients
-        leaves[name] = drawn.expand(points, *parameter.shape).clone().requires_grad_()
-    values = create_backend("native", circuit)(x, leaves)
-    if not values.requires_grad:
-        return 0
-    rows = []
-    for output in range(outputs):
-        gradients = torch.autograd.grad(
-            values[..., output].sum(), list(leaves.values()), retain_graph=True, materialize_grads=True
-        )
-        rows.append(torch.cat([gradient.reshape(points, -1) for gradient in gradients], dim=1))
-    return int(torch.linalg.matrix_rank(torch.cat(rows), rtol=RANK_TOLERANCE))
+        parameters[name] = drawn.expand(points, *parameter.shape).numpy()
+    rows = torch.from_numpy(jacobians(circuit, x[:, 0].numpy(), parameters)).flatten(0, 1)
+    return int(torch.linalg.matrix_rank(rows, rtol=RANK_TOLERANCE))
 
 
 RANK_TOLERANCE = 1e-10

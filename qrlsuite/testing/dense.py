@@ -8,24 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.circuit import Angle, Circuit, Operation
+from qrlsuite.circuit.matrices import FIXED, Matrix, X, Y, Z
 
-Matrix = NDArray[np.complex128]
-
-_X: Matrix = np.array([[0, 1], [1, 0]], dtype=np.complex128)
-_Y: Matrix = np.array([[0, -1j], [1j, 0]])
-_Z: Matrix = np.diag([1, -1]).astype(np.complex128)
-_PAULIS = {"X": _X, "Y": _Y, "Z": _Z}
-_FIXED: dict[str, Matrix] = {
-    "H": (_X + _Z) / np.sqrt(2),
-    "X": _X,
-    "Y": _Y,
-    "Z": _Z,
-    "S": np.diag([1, 1j]),
-    "T": np.diag([1, np.exp(0.25j * np.pi)]),
-    "CNOT": np.eye(4, dtype=np.complex128)[[0, 1, 3, 2]],
-    "CZ": np.diag([1, 1, 1, -1]).astype(np.complex128),
-    "SWAP": np.eye(4, dtype=np.complex128)[[0, 2, 1, 3]],
-}
+_PAULIS = {"X": X, "Y": Y, "Z": Z}
 
 
 def expectation_values(
@@ -91,9 +76,9 @@ def _matrix(operation: Operation, angles: list[float]) -> Matrix:
     """Return the matrix of an operation on (control, wires): 2 x 2 or 4 x 4."""
     gate = operation.gate
     if gate in ("RX", "RY", "RZ"):
-        matrix = _rotation({"RX": _X, "RY": _Y, "RZ": _Z}[gate], angles[0])
+        matrix = _rotation({"RX": X, "RY": Y, "RZ": Z}[gate], angles[0])
     elif gate == "Rot":
-        matrix = _rotation(_Z, angles[2]) @ _rotation(_Y, angles[1]) @ _rotation(_Z, angles[0])
+        matrix = _rotation(Z, angles[2]) @ _rotation(Y, angles[1]) @ _rotation(Z, angles[0])
     elif gate == "U3":
         t, p, d = angles
         matrix = np.array(
@@ -103,7 +88,7 @@ def _matrix(operation: Operation, angles: list[float]) -> Matrix:
             ]
         )
     else:
-        matrix = _FIXED[gate]
+        matrix = FIXED[gate]
     if operation.control is None:
         return matrix
     controlled = np.eye(4, dtype=np.complex128)

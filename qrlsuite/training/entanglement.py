@@ -1,10 +1,6 @@
 """How entangled a circuit's states are along the episodes of trained agents, beside their initial parameters.
 
-Two measures of a pure state of n qubits:
-
-- Meyer & Wallach (2002), in the form of Brennen (2003): Q = 2 (1 - mean over qubits of Tr rho_q^2), from 0 for products
-  to 1 where every qubit is maximally entangled with the rest;
-- the half-cut entropy: the von Neumann entropy, in bits, of the first n // 2 qubits, from 0 to n // 2.
+The measures are those of `qrlsuite.diagnostics.states`.
 
 Trained agents play; what their networks are given at every step is kept, and the states that circuit and linear layer
 make of it are compared with those that the same agents' initial parameters make of the same observations.
@@ -12,7 +8,6 @@ make of it are compared with those that the same agents' initial parameters make
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from qrlsuite.circuit import CircuitModel
+from qrlsuite.diagnostics.states import half_cut_entropy, meyer_wallach
 from qrlsuite.errors import OptionError
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.experiment.task import Task
@@ -78,26 +74,6 @@ class Entanglement:
         }
 
 
-def meyer_wallach(states: Tensor) -> Tensor:
-    """Return the measure of Meyer and Wallach (...) of states (..., 2^n)."""
-    n = states.shape[-1].bit_length() - 1
-    purities = []
-    for q in range(n):
-        parts = states.reshape(*states.shape[:-1], 1 << q, 2, -1).movedim(-2, -3).flatten(-2)
-        rho = parts @ parts.conj().transpose(-1, -2)
-        purities.append(rho.abs().square().sum((-2, -1)))
-    return 2.0 * (1.0 - torch.stack(purities).mean(0))
-
-
-def half_cut_entropy(states: Tensor) -> Tensor:
-    """Return the entropy, in bits, (...) of the first n // 2 qubits of states (..., 2^n)."""
-    n = states.shape[-1].bit_length() - 1
-    matrix = states.reshape(*states.shape[:-1], 1 << (n // 2), -1)
-    weights = torch.linalg.svdvals(matrix).square()
-    bits: Tensor = torch.special.entr(weights).sum(-1) / math.log(2.0)
-    return bits
-
-
 def along_episodes(
     store: EntryStore,
     best: int = 10,
@@ -136,11 +112,11 @@ def along_episodes(
     for which, network in networks.items():
         rows = []
         for step in steps.tolist():
-            states = states_of(network, entry, inputs[step])
+            states = states_of(network, entry, inputs[step]).cpu().numpy()
             qubits = states.shape[-1].bit_length() - 1
             rows.append([meyer_wallach(states), half_cut_entropy(states)])
         for measure, per_step in zip(MEASURES, zip(*rows)):
-            array = torch.stack(list(per_step), dim=-1).double().cpu().numpy()
+            array = np.stack(per_step, axis=-1)
             values[measure][which] = np.where(steps < lengths[..., None], array, np.nan)
     return Entanglement(evaluation.policy_name(store, on), qubits, tuple(seeds), steps, values)
 

@@ -28,6 +28,7 @@ ROOMS = (
     ("statistics", "compiled"),
     ("contracts",),  # the modules of TOP
     ("circuit",),
+    ("diagnostics",),
     ("experiment",),
     ("results",),
     ("training",),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -16,35 +15,10 @@ from qrlsuite.cli.app import build
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.circuits.native import dense
 from qrlsuite.results.store import EntryStore
-from qrlsuite.training.entanglement import EPISODES, along_episodes, half_cut_entropy, meyer_wallach
+from qrlsuite.training.entanglement import EPISODES, along_episodes
 from tests.conftest import POLE, Train
 
 SMALL = ("qubits=2", "layers=2")
-
-
-def state(qubits: int, *members: int) -> torch.Tensor:
-    """Equal parts of some basis states."""
-    made = torch.zeros(1 << qubits, dtype=torch.complex128)
-    made[list(members)] = 1 / math.sqrt(len(members))
-    return made
-
-
-@pytest.mark.parametrize(
-    ("of", "global_", "entropy"),
-    [
-        (state(3, 5), 0.0, 0.0),
-        (state(3, 0, 7), 1.0, 1.0),  # GHZ
-        (state(3, 1, 2, 4), 8 / 9, math.log2(3) - 2 / 3),  # W: the first qubit is 1 with probability 1/3
-        (state(2, 0, 1), 0.0, 0.0),
-        (state(4, 0b0000, 0b0101, 0b1010, 0b1111), 1.0, 2.0),  # two pairs across the cut
-        (state(4, 0b0000, 0b0011, 0b1100, 0b1111), 1.0, 0.0),  # two pairs beside it
-        (state(1, 0, 1), 0.0, 0.0),
-    ],
-)
-def test_measures_by_hand(of: torch.Tensor, global_: float, entropy: float) -> None:
-    together = torch.stack([of, state(of.shape[0].bit_length() - 1, 0)])[None]
-    np.testing.assert_allclose(meyer_wallach(together)[0], [global_, 0.0], atol=1e-12)
-    np.testing.assert_allclose(half_cut_entropy(together)[0], [entropy, 0.0], atol=1e-12)
 
 
 def test_states_are_those_of_the_circuit_also_where_qubits_are_apart() -> None:

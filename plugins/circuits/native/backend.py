@@ -100,15 +100,31 @@ class NativeBackend:
             if not all(bool(torch.isfinite(v.detach().sum())) for v in (inputs, *there.values())):
                 raise OptionError(NOT_FINITE)
             return self._sampler(inputs.cpu(), there, seeds).to(inputs)
-        size = inputs.shape[0]
-        if self.shapes:
-            flat = torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
-        else:
-            flat = inputs.new_zeros((size, 0))
+        flat = self._flat(inputs, parameters)
         result = self._run(inputs, flat)
         if not bool(torch.isfinite(result.detach().sum())):
             raise OptionError(_cause(inputs, flat))
         return result
+
+    def states(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the final states (S, B, 2^n), see `qrlsuite.circuit.CircuitBackend`.
+
+        Raises
+        ------
+        OptionError
+            For wrong shapes or dtypes, missing parameters, or a mean-field approximation, which has no state.
+        """
+        if self.circuit.mean_field:
+            raise OptionError("the mean-field approximation of a circuit has no state of all qubits")
+        self._check(inputs, parameters)
+        return dense.states(self.circuit, inputs, self._flat(inputs, parameters))
+
+    def _flat(self, inputs: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return all parameters of every seed in a row (S, P)."""
+        size = inputs.shape[0]
+        if not self.shapes:
+            return inputs.new_zeros((size, 0))
+        return torch.cat([parameters[name].reshape(size, -1) for name in self.shapes], dim=1)
 
     def compile_for(self, like: Tensor) -> None:
         """Compile the kernels, or load them, by a pass there and back of one sample of that dtype and device."""
