@@ -240,7 +240,8 @@ class _Whole:
             cast(Any, part).compile_for(like)
 
     def _states(self, inputs: torch.Tensor, parameters: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        return cast(Any, self.parts[0]).states(extended(inputs, self.products), parameters)
+        found: torch.Tensor = cast(Any, self.parts[0]).states(extended(inputs, self.products), parameters)
+        return found
 
     def __call__(
         self,

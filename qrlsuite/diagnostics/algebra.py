@@ -100,7 +100,7 @@ def _independent(vectors: NDArray[np.float64], basis: NDArray[np.float64]) -> ND
     return np.asarray(new, np.float64)
 
 
-def _on(matrix: Matrix, wires: tuple[int, ...], n: int) -> Matrix:
+def _on(matrix: NDArray[np.complexfloating], wires: tuple[int, ...], n: int) -> Matrix:
     """Return a gate's matrix on all n qubits; qubit 0 is the highest bit."""
     k = len(wires)
     whole = np.eye(1 << n, dtype=np.complex128).reshape((2,) * n + (1 << n,))

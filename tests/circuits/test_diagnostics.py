@@ -282,3 +282,13 @@ def test_gradients_of_both_readouts() -> None:
     assert np.abs(found["local"][:, others]).max() < 1e-15
     assert np.abs(found["global"][:, others]).max() > 0.0
     assert list(circuits.gradients(ansatz("cz", 3, 1, entangled="mean-field"), draws=2)) == ["local"]
+
+
+def test_states_are_those_before_the_measurement() -> None:
+    circuit = Circuit(2, inputs=1)
+    circuit.append("RX", 0, circuit.parameter("w", (1,), 0.3, 0.3)[0])
+    circuit.append("RX", 1, circuit.input(0) * circuit.input(0))
+    circuit.measure(["X0", "Y1"])
+    found = circuits.final_states(circuit, circuits.Points(np.array([[2.0]]), {"w": np.array([[0.3]])}))
+    expected = np.kron([np.cos(0.15) ** 2, np.sin(0.15) ** 2], [np.cos(2.0) ** 2, np.sin(2.0) ** 2])
+    np.testing.assert_allclose(np.abs(found[0]) ** 2, expected, atol=1e-6)
