@@ -55,16 +55,51 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         if inputs % 4 and misplaced:
             x, weight = (functional.pad(each, (0, -inputs % 4)) for each in (x, weight))
         return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
-    return fixed_order_linear(x, weight, bias)
-
-
-def fixed_order_linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Apply S independent linear layers as `linear` does, summed in a fixed order whatever their shape.
-
-    For numbers of features such as 68 or 102, a matrix product rounds by where in memory a slice begins. The price is
-    memory of S x B x in x out.
-    """
     return (x[..., None] * weight.transpose(1, 2)[:, None]).sum(2) + bias[:, None]
+
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "tanh": torch.tanh,
+    "sin": torch.sin,
+    "none": lambda x: x,
+}
+
+
+def layers(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str = "none"
+) -> Tensor:
+    """Apply the layers of S networks, with an activation after each but the last.
+
+    On the CPU and in float32 the products are compiled sweeps: one through all layers, or with `tanh` one a layer.
+    Elsewhere layers are `linear`. Both are bitwise independent of a seed's place in the population; they round
+    differently.
+
+    Parameters
+    ----------
+    x:
+        (S, B, in).
+    weights, biases:
+        Of every layer (S, out, in) and (S, out).
+    activation:
+        One of `ACTIVATIONS`.
+
+    Returns
+    -------
+    Tensor
+        (S, B, out); of a compiled sweep, it can be differentiated once.
+    """
+    compiled = x.device.type == "cpu" and x.dtype == torch.float32
+    if compiled:
+        from qrlsuite.compiled.perceptron import perceptron
+
+        if activation in ("none", "relu", "sin"):
+            return perceptron(x, weights, biases, activation)
+    for i, (weight, bias) in enumerate(zip(weights, biases)):
+        x = perceptron(x, [weight], [bias]) if compiled else linear(x, weight, bias)
+        if i < len(weights) - 1:
+            x = ACTIVATIONS[activation](x)
+    return x
 
 
 def quantum_parameters(module: nn.Module) -> set[str]:
@@ -393,6 +428,7 @@ class Adam:
                 self._lr[name] = self._lr[name] * factor
         self.betas = betas
         self.eps = eps
+        self._compiled = bool(getattr(population, "compiled", False))
         first = self._named[0][1]
         self.steps = torch.zeros(first.shape[0], dtype=torch.int64)
         self.mean = {name: torch.zeros_like(p) for name, p in self._named}
@@ -411,6 +447,11 @@ class Adam:
         count = self.steps.clamp(min=1).to(torch.float64)
         scale = 1.0 / (1.0 - beta1**count)
         root = 1.0 / torch.sqrt(1.0 - beta2**count)
+        if self._compiled and all(
+            p.device.type == "cpu" and p.dtype == torch.float32 for _, p in self._named
+        ):
+            self._move(scale, root, active)
+            return
         for name, parameter in self._named:
             if parameter.grad is None:
                 continue
@@ -430,6 +471,26 @@ class Adam:
             parameter.copy_(torch.where(mask, parameter - change, parameter))
             mean.copy_(torch.where(mask, new_mean, mean))
             square.copy_(torch.where(mask, new_square, square))
+
+    def _move(self, scale: Tensor, root: Tensor, active: Tensor | None) -> None:
+        """Make the step in one compiled pass over each parameter; scale and root (S,) correct the moments' bias."""
+        from qrlsuite.compiled.networks import adam
+
+        size, (beta1, beta2) = len(scale), self.betas
+        roots = root.to(torch.float32).numpy()
+        moved = np.ones(size, np.bool_) if active is None else active.cpu().numpy()
+        constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
+        rates: dict[Any, Any] = {}
+        for name, parameter in self._named:
+            if parameter.grad is None:
+                continue
+            lr = self._lr[name]
+            if id(lr) not in rates:
+                rates[id(lr)] = (lr * scale).to(torch.float32).numpy()
+            tensors = parameter.detach(), parameter.grad.contiguous(), self.mean[name], self.square[name]
+            adam(
+                *(each.numpy().reshape(size, -1) for each in tensors), rates[id(lr)], roots, moved, *constants
+            )
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return step counts (S,) and both moments of every parameter (S, ...)."""

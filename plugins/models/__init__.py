@@ -19,6 +19,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.mlp:MLPOptions",
             build="qrlsuite.plugins.models.mlp:build",
             population="qrlsuite.plugins.models.mlp:population",
+            numerics=2,
             memory="qrlsuite.plugins.models.mlp:memory",
         )
     )
@@ -30,6 +31,7 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             options="qrlsuite.plugins.models.fourier:FourierOptions",
             build="qrlsuite.plugins.models.fourier:build",
             population="qrlsuite.plugins.models.fourier:population",
+            numerics=2,
             memory="qrlsuite.plugins.models.fourier:memory",
         )
     )

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from qrlsuite.options import Tuned
 from qrlsuite.plugins.models.mlp import initial_layer
-from qrlsuite.population import fixed_order_linear
+from qrlsuite.population import layers
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -66,11 +66,17 @@ class Fourier(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, in) to (B, out)."""
-        return _forward(x[None], {name: p[None] for name, p in self.named_parameters()})[0]
+        angles = nn.functional.linear(x, self.frequencies)
+        return nn.functional.linear(torch.cat([angles.cos(), angles.sin()], dim=1), self.weight, self.bias)
 
 
 class FourierPopulation(nn.Module):
     """S modules; (S, B, in) -> (S, B, out); parameters as in `Fourier` with a leading axis S."""
+
+    compiled = True
+    frequencies: Tensor
+    weight: Tensor
+    bias: Tensor
 
     def __init__(self, modules: Sequence[Fourier]) -> None:
         super().__init__()
@@ -80,14 +86,8 @@ class FourierPopulation(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        return _forward(x, dict(self.named_parameters()))
-
-
-def _forward(x: Tensor, state: dict[str, Tensor]) -> Tensor:
-    frequencies = state["frequencies"]
-    angles = fixed_order_linear(x, frequencies, frequencies.new_zeros(frequencies.shape[:2]))
-    features = torch.cat([angles.cos(), angles.sin()], dim=2)
-    return fixed_order_linear(features, state["weight"], state["bias"])
+        angles = layers(x, [self.frequencies], [self.frequencies.new_zeros(self.frequencies.shape[:2])])
+        return layers(torch.cat([angles.cos(), angles.sin()], dim=2), [self.weight], [self.bias])
 
 
 def build(obs_dim: int, out_dim: int, options: FourierOptions, generator: torch.Generator) -> Fourier:
@@ -101,5 +101,5 @@ def population(modules: Sequence[Fourier], options: FourierOptions) -> FourierPo
 
 
 def memory(options: FourierOptions, agents: int, batch: int, copies: int) -> int:
-    """Return the bytes of every sample's 2 D features and their products with the weights of two outputs or more."""
-    return 4 * agents * batch * options.frequencies * (2 + 2 * 2)
+    """Return the bytes of every sample's D angles and 2 D features, and of as many gradients."""
+    return 4 * agents * batch * options.frequencies * 2 * 3

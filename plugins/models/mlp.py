@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal, cast
 
 import torch
@@ -18,14 +18,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import linear
-
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": torch.relu,
-    "tanh": torch.tanh,
-    "sin": torch.sin,
-    "none": lambda x: x,
-}
+from qrlsuite.population import ACTIVATIONS, layers
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -69,9 +62,14 @@ class MLP(nn.Module):
             self.register_parameter(f"b{i}", nn.Parameter(bias))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, in) to (B, out)."""
-        state = {name: p[None] for name, p in self.named_parameters()}
-        return _forward(x[None], state, self.layers, self.options, self.options.input_scale)[0]
+        """Map (B, in) to (B, out), by torch's own operations."""
+        activation = ACTIVATIONS[self.options.activation]
+        x = x * self.options.input_scale
+        for i in range(self.layers):
+            x = nn.functional.linear(x, self.get_parameter(f"w{i}"), self.get_parameter(f"b{i}"))
+            if i < self.layers - 1:
+                x = activation(x)
+        return x
 
 
 class MLPPopulation(nn.Module):
@@ -81,6 +79,7 @@ class MLPPopulation(nn.Module):
     parameters, and is no state, for the options hold it.
     """
 
+    compiled = True
     input_scale: float | Tensor
 
     def __init__(self, modules: Sequence[MLP], options: MLPOptions) -> None:
@@ -98,7 +97,12 @@ class MLPPopulation(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out)."""
-        return _forward(x, dict(self.named_parameters()), self.layers, self.options, self.input_scale)
+        if isinstance(self.input_scale, Tensor) or self.input_scale != 1.0:
+            x = x * self.input_scale
+        parameters = cast(
+            "list[Tensor]", [*self._parameters.values()]
+        )  # in the order of their names in `MLP`
+        return layers(x, parameters[::2], parameters[1::2], self.options.activation)
 
 
 def initial_layer(
@@ -117,19 +121,6 @@ def initial_layer(
     weight = (torch.rand((fan_out, fan_in), generator=generator) * 2.0 - 1.0) * width
     bias = (torch.rand(fan_out, generator=generator) * 2.0 - 1.0) * bound
     return weight, bias
-
-
-def _forward(
-    x: Tensor, state: dict[str, Tensor], layers: int, options: MLPOptions, input_scale: float | Tensor
-) -> Tensor:
-    function = ACTIVATIONS[options.activation]
-    if isinstance(input_scale, Tensor) or input_scale != 1.0:
-        x = x * input_scale
-    for i in range(layers):
-        x = linear(x, state[f"w{i}"], state[f"b{i}"])
-        if i < layers - 1:
-            x = function(x)
-    return x
 
 
 def build(obs_dim: int, out_dim: int, options: MLPOptions, generator: torch.Generator) -> MLP:

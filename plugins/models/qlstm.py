@@ -39,10 +39,10 @@ from torch import Tensor, nn
 
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
-from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
+from qrlsuite.plugins.models.mlp import initial_layer
 from qrlsuite.plugins.models.recurrent import lstm_step
 from qrlsuite.plugins.models.vqc import VQCOptions
-from qrlsuite.population import linear
+from qrlsuite.population import ACTIVATIONS, linear
 
 GATES = 4
 

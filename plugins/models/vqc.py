@@ -38,8 +38,8 @@ from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
 from qrlsuite.plugins.models import mlp
-from qrlsuite.plugins.models.mlp import ACTIVATIONS, initial_layer
-from qrlsuite.population import linear
+from qrlsuite.plugins.models.mlp import initial_layer
+from qrlsuite.population import ACTIVATIONS, linear
 
 NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
 """Bytes of circuit states that the two simulators keep at most, except that PennyLane takes at least one seed."""

@@ -1,1 +1,1 @@
-"""Loops that numba compiles: vectors of lanes, and the cache of compiled code."""
+"""Compiled loops (numba): vectors of lanes, the cache of compiled code, and the layers of networks."""

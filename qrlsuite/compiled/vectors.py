@@ -178,6 +178,18 @@ def splat(typing_context: Any, array: Any, scalar: Any) -> Any:
 
 
 @intrinsic
+def spread(typing_context: Any, array: Any, place: Any) -> Any:
+    """Return a vector with the number at `place` of an array, counted in C order, in every lane."""
+    vector = VECTORS[array.dtype]
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return _broadcast(builder, vector, builder.load(builder.gep(data, [arguments[1]])))
+
+    return vector(array, types.intp), generate
+
+
+@intrinsic
 def constant(typing_context: Any, like: Any, scalar: Any) -> Any:
     """Return a vector with one number in every lane, of the type of another vector."""
 
@@ -216,6 +228,63 @@ nearest = _function("nearbyint", 1)
 floor = _function("floor", 1)
 fma = _function("fmuladd", 3)
 """`fma(a, b, c)` is a * b + c, rounded once where the processor has such an instruction, else twice."""
+
+
+def _zero(vector: Vector) -> ir.Constant:
+    return ir.Constant(vector.llvm, [0.0] * LANES[vector.element])
+
+
+@intrinsic
+def positive(typing_context: Any, a: Any) -> Any:
+    """Return max(a, 0); NaN stays NaN."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", arguments[0], _zero(a)), _zero(a), arguments[0])
+
+    return a(a), generate
+
+
+@intrinsic
+def where_positive(typing_context: Any, a: Any, b: Any) -> Any:
+    """Return b where a > 0, else 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", arguments[0], _zero(a)), arguments[1], _zero(a))
+
+    return a(a, b), generate
+
+
+@intrinsic
+def transpose(
+    typing_context: Any, source: Any, first: Any, stride: Any, target: Any, begin: Any, step: Any
+) -> Any:
+    """Transpose a square of V x V numbers: target[begin + c step + r] = source[first + r stride + c], in C order."""
+    vector, lanes = VECTORS[source.dtype], LANES[source.dtype]
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def pointers(which: int) -> Any:
+            data = context.make_array(signature.args[which])(context, builder, arguments[which]).data
+            place = arguments[which + 1]
+            for _ in range(lanes):
+                yield builder.bitcast(builder.gep(data, [place]), vector.llvm.as_pointer())
+                place = builder.add(place, arguments[which + 2])
+
+        rows = [builder.load(pointer, align=4) for pointer in pointers(0)]
+        kind, half = ir.VectorType(ir.IntType(32), lanes), lanes // 2
+        while half:  # rows r and r + half exchange their squares of `half` numbers
+            low = [c if c // half % 2 == 0 else lanes + c - half for c in range(lanes)]
+            high = [c + half if c // half % 2 == 0 else lanes + c for c in range(lanes)]
+            for r in range(lanes):
+                if r // half % 2 == 0:
+                    upper, lower = rows[r], rows[r + half]
+                    rows[r] = builder.shuffle_vector(upper, lower, ir.Constant(kind, low))
+                    rows[r + half] = builder.shuffle_vector(upper, lower, ir.Constant(kind, high))
+            half //= 2
+        for row, pointer in zip(rows, pointers(3)):
+            builder.store(row, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.intp, types.intp, target, types.intp, types.intp), generate
 
 
 @intrinsic

@@ -1,0 +1,128 @@
+"""Layers of networks as one compiled sweep: torch's numbers, and the same bits in any company."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from qrlsuite.compiled import networks, perceptron, vectors
+from qrlsuite.population import ACTIVATIONS, Adam, layers
+
+SIZES = [(3, 16, 16, 3), (3, 10, 1), (5, 7), (1, 1, 1), (2, 33, 18, 64, 4), (40, 8, 2)]
+
+
+def network(sizes: tuple[int, ...], seeds: int, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    g = torch.Generator().manual_seed(1)
+    pairs = list(itertools.pairwise(sizes))
+    shapes = [(seeds, o, i) for i, o in pairs] + [(seeds, o) for _, o in pairs]
+    return [(torch.randn(shape, generator=g) / 2).to(dtype).requires_grad_(True) for shape in shapes]
+
+
+def passes(parameters: list[Tensor], x: Tensor, cotangents: Tensor, activation: str) -> list[Tensor]:
+    """Return values and all gradients."""
+    x = x.detach().requires_grad_(True)
+    half = len(parameters) // 2
+    values = layers(x, parameters[:half], parameters[half:], activation)
+    return [values.detach(), *torch.autograd.grad(values, [x, *parameters], cotangents)]
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("sizes", SIZES)
+@pytest.mark.parametrize("batch", [1, 10, 31, 64, 100])
+def test_numbers_are_those_of_torch_in_double_precision(
+    sizes: tuple[int, ...], batch: int, activation: str
+) -> None:
+    g = torch.Generator().manual_seed(batch)
+    x, cotangents = (
+        torch.randn(3, batch, sizes[0], generator=g),
+        torch.randn(3, batch, sizes[-1], generator=g),
+    )
+    ours = passes(network(sizes, 3), x, cotangents, activation)
+    theirs = passes(network(sizes, 3, torch.float64), x.double(), cotangents.double(), activation)
+    for mine, exact in zip(ours, theirs):
+        largest = max(float(exact.abs().max()), 1.0)
+        torch.testing.assert_close(mine.double(), exact, rtol=0, atol=3e-6 * largest)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("sizes", SIZES)
+def test_a_seed_has_the_same_bits_alone_and_at_any_place(sizes: tuple[int, ...], activation: str) -> None:
+    g = torch.Generator().manual_seed(0)
+    x, cotangents = torch.randn(17, 45, sizes[0], generator=g), torch.randn(17, 45, sizes[-1], generator=g)
+    parameters = network(sizes, 17)
+    together = passes(parameters, x, cotangents, activation)
+    for part in (slice(0, 1), slice(5, 7), slice(16, 17)):
+        own = [p.detach()[part].clone().requires_grad_(True) for p in parameters]
+        apart = passes(own, x[part], cotangents[part], activation)
+        assert all(torch.equal(alone, all_[part]) for alone, all_ in zip(apart, together))
+
+
+def test_a_pass_without_gradients_has_the_same_bits_and_keeps_nothing() -> None:
+    parameters, x = network((3, 16, 3), 2), torch.randn(2, 70, 3)
+    with torch.no_grad():
+        values = layers(x, parameters[:2], parameters[2:], "relu")
+    assert not values.requires_grad
+    assert torch.equal(values, layers(x, parameters[:2], parameters[2:], "relu").detach())
+
+
+def test_two_passes_before_their_gradients_do_not_share_memory() -> None:
+    parameters = network((3, 16, 3), 2)
+    first, second = torch.randn(2, 64, 3), torch.randn(2, 64, 3)
+    expected = [
+        torch.autograd.grad(layers(x, parameters[:2], parameters[2:], "relu").sum(), parameters)
+        for x in (first, second)
+    ]
+    values = [layers(x, parameters[:2], parameters[2:], "relu").sum() for x in (first, second)]
+    for value, gradients in zip(values, expected):
+        found = torch.autograd.grad(value, parameters)
+        assert all(torch.equal(a, b) for a, b in zip(found, gradients))
+
+
+def test_what_is_not_finite_stays_with_its_seed() -> None:
+    parameters, x = network((3, 16, 3), 3), torch.randn(3, 10, 3)
+    x[1, 4, 0] = torch.nan
+    values, *gradients = passes(parameters, x, torch.ones(3, 10, 3), "relu")
+    assert values[1, 4].isnan().all()
+    assert values.isfinite().sum() == values.numel() - 3
+    assert all(g[[0, 2]].isfinite().all() for g in gradients)
+
+
+def test_adam_is_torchs_and_leaves_agents_that_rest_alone() -> None:
+    population = torch.nn.Module()
+    population.w = torch.nn.Parameter(torch.randn(3, 5, 7))
+    population.compiled = True
+    other = population.w.detach().clone().requires_grad_(True)
+    ours, theirs = Adam(population, 0.01, 0.01), torch.optim.Adam([other], 0.01)
+    for _ in range(5):
+        gradient = torch.randn(3, 5, 7)
+        population.w.grad, other.grad = gradient, gradient.clone()
+        ours.step()
+        theirs.step()
+    torch.testing.assert_close(population.w.detach(), other.detach(), rtol=1e-5, atol=1e-6)
+    before = {name: value.clone() for name, value in ours.state_dict().items()} | {
+        "w": population.w.detach().clone()
+    }
+    ours.step(torch.tensor([True, False, True]))
+    after = ours.state_dict() | {"w": population.w.detach()}
+    assert all(torch.equal(before[name][1], after[name][1]) for name in before)
+    assert all((before[name][[0, 2]] != after[name][[0, 2]]).any() for name in before)
+
+
+def test_records_are_used_again() -> None:
+    parameters, x = network((3, 24, 3), 2), torch.randn(2, 64, 3)
+    passes(parameters, x, torch.ones(2, 64, 3), "relu")
+    kept = {key: array.ctypes.data for key, array in perceptron._spare.items()}
+    passes(parameters, x, torch.ones(2, 64, 3), "relu")
+    assert {key: array.ctypes.data for key, array in perceptron._spare.items()} == kept
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_squares_are_transposed(dtype: type) -> None:
+    v = vectors.lanes(dtype)
+    source, target = np.arange(2.0 * v * v, dtype=dtype).reshape(v, 2 * v), np.zeros(2 * v * v, dtype)
+    networks._turn(source, 0, v, 1, 2 * v, target)
+    np.testing.assert_array_equal(target.reshape(2 * v, v), source.T)
