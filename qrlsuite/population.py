@@ -72,8 +72,8 @@ def layers(
     """Apply the layers of S networks, with an activation after each but the last.
 
     On the CPU and in float32 the products are compiled sweeps: one through all layers, or with `tanh` one a layer.
-    Elsewhere layers are `linear`. Both are bitwise independent of a seed's place in the population; they round
-    differently.
+    Elsewhere, and within a transform of `torch.func`, layers are `linear`. Both are bitwise independent of a seed's
+    place in the population; they round differently.
 
     Parameters
     ----------
@@ -88,8 +88,15 @@ def layers(
     -------
     Tensor
         (S, B, out); of a compiled sweep, it can be differentiated once.
+
+    Raises
+    ------
+    ValueError
+        If the shapes of a compiled sweep do not fit.
     """
-    compiled = x.device.type == "cpu" and x.dtype == torch.float32
+    compiled = (
+        all(map(_compilable, (x, *weights, *biases))) and not torch._C._are_functorch_transforms_active()
+    )
     if compiled:
         from qrlsuite.compiled.perceptron import perceptron
 
@@ -100,6 +107,10 @@ def layers(
         if i < len(weights) - 1:
             x = ACTIVATIONS[activation](x)
     return x
+
+
+def _compilable(tensor: Tensor) -> bool:
+    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
 
 
 def quantum_parameters(module: nn.Module) -> set[str]:
@@ -397,7 +408,8 @@ class Adam:
     Equal to `torch.optim.Adam` (Kingma & Ba 2015, no weight decay) for every agent that takes part in every
     step. An agent that is masked out of a step keeps its parameters, moments and step count, as if the step
     had not been. Plain elementwise operations only: fused optimizers round differently at the end of a
-    tensor, so that an agent would depend on its place in the stack.
+    tensor, so that an agent would depend on its place in the stack. For a population with an attribute `compiled =
+    True` the step is a compiled loop, which rounds differently; on the CPU and in float32.
 
     Parameters
     ----------
@@ -428,7 +440,7 @@ class Adam:
                 self._lr[name] = self._lr[name] * factor
         self.betas = betas
         self.eps = eps
-        self._compiled = bool(getattr(population, "compiled", False))
+        self._compiled = getattr(population, "compiled", False) is True
         first = self._named[0][1]
         self.steps = torch.zeros(first.shape[0], dtype=torch.int64)
         self.mean = {name: torch.zeros_like(p) for name, p in self._named}
@@ -447,9 +459,7 @@ class Adam:
         count = self.steps.clamp(min=1).to(torch.float64)
         scale = 1.0 / (1.0 - beta1**count)
         root = 1.0 / torch.sqrt(1.0 - beta2**count)
-        if self._compiled and all(
-            p.device.type == "cpu" and p.dtype == torch.float32 for _, p in self._named
-        ):
+        if self._compiled and all(_compilable(p) and p.is_contiguous() for _, p in self._named):
             self._move(scale, root, active)
             return
         for name, parameter in self._named:

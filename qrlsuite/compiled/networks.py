@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from qrlsuite.compiled.cache import inlined, kernel
+from qrlsuite.compiled.cache import inlined, kernel, rounded
 from qrlsuite.compiled.trigonometry import sine_cosine
 from qrlsuite.compiled.vectors import (
     fma,
@@ -294,12 +294,12 @@ def backward(
             at += min(i, o) * columns
 
 
-@kernel
+@rounded
 def adam(
     parameter: Any, gradient: Any, mean: Any, square: Any, rate: Any, root: Any, active: Any,
     share1: Any, keep2: Any, share2: Any, eps: Any,
 ) -> None:  # fmt: skip
-    """Move the numbers (S, N) of every active agent along their gradients, in place.
+    """Move the numbers (S, N) of every active agent along their gradients, in place; every operation is rounded.
 
     rate and root (S,) correct the moments' bias; share1 is 1 - beta1, keep2 beta2, share2 1 - beta2, all of one dtype.
     """

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 SPARE_BYTES = 64 << 20
 """Records up to this size are kept from one pass to the next: fresh pages cost more time than a small network."""
@@ -32,12 +31,33 @@ def perceptron(
     -------
     Tensor
         (S, B, out), differentiable once. A seed's numbers have the same bits in any population.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit: compiled loops would read what is beside an array.
     """
     parameters = (*weights, *biases)
+    _require_fitting(x, weights, biases)
     if torch.is_grad_enabled() and any(each.requires_grad for each in (x, *parameters)):
         result: Tensor = _Perceptron.apply(x, activation, *parameters)  # type: ignore[no-untyped-call]
         return result
     return _outputs(x, _arrays(parameters), activation, False)[0]
+
+
+def _require_fitting(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
+    shape = tuple(x.shape)
+    fits = len(shape) == 3 and len(weights) == len(biases) > 0
+    for weight, bias in zip(weights, biases):
+        outputs = weight.shape[1] if weight.dim() == 3 else 0
+        fits = fits and weight.shape == (shape[0], outputs, shape[2]) and bias.shape == (shape[0], outputs)
+        shape = (*shape[:2], outputs)
+    if not fits:
+        weight_shapes, bias_shapes = ([tuple(each.shape) for each in part] for part in (weights, biases))
+        raise ValueError(
+            f"layers of S seeds take x (S, B, in), weights (S, out, in) and biases (S, out); x is {tuple(x.shape)}, "
+            f"weights are {weight_shapes}, biases {bias_shapes}"
+        )
 
 
 def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
@@ -77,9 +97,9 @@ class _Records:
             room = aligned((chunks, rows, wide), np.float32)
         self.array = room
 
-    def __del__(self) -> None:
-        if self.array.nbytes <= SPARE_BYTES:
-            _spare[self.key] = self.array
+    def __del__(self, spare: dict[tuple[int, int], Any] = _spare, most: int = SPARE_BYTES) -> None:
+        if self.array.nbytes <= most:  # names of the module may be gone when the interpreter ends
+            spare[self.key] = self.array
 
 
 class _Perceptron(torch.autograd.Function):
@@ -93,10 +113,14 @@ class _Perceptron(torch.autograd.Function):
         return values
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         from qrlsuite.compiled import networks, vectors
 
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "compiled layers of a network are differentiated once: leave out create_graph=True, or compute in "
+                "float64, which torch differentiates any number of times"
+            )
         held = _arrays(ctx.saved_tensors)
         weights, biases = tuple(held[: len(held) // 2]), tuple(held[len(held) // 2 :])
         cotangent = cotangents[0].contiguous()

@@ -326,22 +326,25 @@ PROCESSORS = {"haswell": 32, "x86-64": 16}
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="runs code for processors of this architecture")
 @pytest.mark.parametrize(
-    ("processor", "chosen"),
+    ("processor", "file", "chosen"),
     [
-        ("x86-64", ""),
+        ("x86-64", __file__, ""),
         *(
-            pytest.param(
-                processor,
-                "numbers and kernels or company or finite_differences or linear_algebra or connects",
-                marks=pytest.mark.long,
-            )
+            pytest.param(processor, file, chosen, marks=pytest.mark.long)
             for processor in PROCESSORS
+            for file, chosen in (
+                (
+                    __file__,
+                    "numbers and kernels or company or finite_differences or linear_algebra or connects",
+                ),
+                (str(Path(__file__).parents[1] / "core/test_layers.py"), "test"),
+            )
         ),
     ],
-    ids=["x86-64", *(f"{processor}-all" for processor in PROCESSORS)],
+    ids=["x86-64", *(f"{processor}-{part}" for processor in PROCESSORS for part in ("all", "layers"))],
 )
-def test_other_processors(processor: str, chosen: str, tmp_path: Path) -> None:
-    """The released code's numbers, seeds in company and any circuit, compiled for a processor with less.
+def test_other_processors(processor: str, file: str, chosen: str, tmp_path: Path) -> None:
+    """The released code's numbers, seeds in company, any circuit and layers, compiled for a processor with less.
 
     Compiling takes long; without a choice of tests only the width of the vectors is looked at.
     """
@@ -355,7 +358,7 @@ def test_other_processors(processor: str, chosen: str, tmp_path: Path) -> None:
     )
     target = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "QRLSUITE_CACHE": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", program, str(PROCESSORS[processor]), __file__, chosen],
+        [sys.executable, "-c", program, str(PROCESSORS[processor]), file, chosen],
         env={**os.environ, **target},
         cwd=Path(__file__).parents[2],
         capture_output=True,

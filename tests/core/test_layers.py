@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -110,6 +111,93 @@ def test_adam_is_torchs_and_leaves_agents_that_rest_alone() -> None:
     after = ours.state_dict() | {"w": population.w.detach()}
     assert all(torch.equal(before[name][1], after[name][1]) for name in before)
     assert all((before[name][[0, 2]] != after[name][[0, 2]]).any() for name in before)
+
+
+def test_an_agent_makes_the_same_step_alone_and_at_any_place() -> None:
+    def step(agents: slice) -> list[Tensor]:
+        population = torch.nn.Module()
+        population.compiled = True
+        for i, p in enumerate(network((3, 33, 5), 7)):
+            population.register_parameter(f"p{i}", torch.nn.Parameter(p.detach()[agents].clone()))
+        adam, g = Adam(population, 0.01, 0.01), torch.Generator().manual_seed(2)
+        for _ in range(3):
+            for p in population.parameters():
+                p.grad = torch.randn((7, *p.shape[1:]), generator=g)[agents]
+            adam.step()
+        return [*population.parameters(), *adam.state_dict().values()]
+
+    together = step(slice(0, 7))
+    assert all(torch.equal(alone, all_[3:4]) for alone, all_ in zip(step(slice(3, 4)), together))
+
+
+@pytest.mark.parametrize(("seeds", "batch"), [(2, 0), (1, 1)])
+def test_an_empty_batch_has_gradients_of_zero(seeds: int, batch: int) -> None:
+    x, cotangents = torch.zeros(seeds, batch, 3), torch.ones(seeds, batch, 2)
+    values, x_gradient, *gradients = passes(network((3, 5, 2), seeds), x, cotangents, "relu")
+    assert values.shape == (seeds, batch, 2)
+    assert x_gradient.shape == x.shape
+    assert all(bool((g != 0).any()) == bool(batch) for g in gradients[2:])
+
+
+def test_inputs_and_weights_may_lie_in_any_order_in_memory() -> None:
+    parameters, x, cotangents = network((3, 7, 2), 4), torch.randn(4, 9, 3), torch.randn(4, 9, 2)
+    expected = passes(parameters, x, cotangents, "sin")
+
+    def turned(each: Tensor) -> Tensor:
+        return each.detach().transpose(0, -1).contiguous().transpose(0, -1)
+
+    other = [turned(p).requires_grad_(True) for p in parameters]
+    assert not other[0].is_contiguous()
+    found = passes(other, turned(x), turned(cotangents), "sin")
+    assert all(torch.equal(a, b) for a, b in zip(found, expected))
+    x = turned(x)[:, ::2]
+    assert torch.equal(layers(x, parameters[:2], parameters[2:]), layers(x.clone(), other[:2], other[2:]))
+
+
+@pytest.mark.parametrize("wrong", range(6))
+def test_shapes_that_do_not_fit_are_refused(wrong: int) -> None:
+    w0, w1, b0, b1 = (p.detach() for p in network((3, 7, 2), 4))
+    x, weights, biases = [
+        (torch.zeros(4, 9, 2), [w0, w1], [b0, b1]),
+        (torch.zeros(3, 9, 3), [w0, w1], [b0, b1]),
+        (torch.zeros(9, 3), [w0, w1], [b0, b1]),
+        (torch.zeros(4, 9, 3), [w0, w1[:, :, :5]], [b0, b1]),
+        (torch.zeros(4, 9, 3), [w0, w1], [b0, b1[:, :1]]),
+        (torch.zeros(4, 9, 3), [w0, w1], [b0]),
+    ][wrong]
+    with pytest.raises(ValueError, match="layers of S seeds take x"):
+        layers(x, weights, biases, "relu")
+
+
+def test_transforms_and_other_numbers_are_left_to_torch_and_a_second_derivative_is_refused() -> None:
+    parameters, x = [p.detach() for p in network((3, 7, 2), 4)], torch.randn(4, 9, 3)
+    plain = layers(x, parameters[:2], parameters[2:], "sin")
+
+    def one(scale: Tensor) -> Tensor:
+        return layers(x * scale, parameters[:2], parameters[2:], "sin")
+
+    many = torch.vmap(one)(torch.tensor([1.0, 2.0]))
+    torch.testing.assert_close(many[0], plain)
+    second = torch.func.grad(torch.func.grad(lambda scale: one(scale).sum()))(torch.tensor(1.0))
+    assert second.isfinite()
+    assert second != 0
+    assert layers(x.double(), parameters[:2], parameters[2:], "relu").dtype == torch.float64
+    x.requires_grad_(True)
+    values = layers(x, parameters[:2], parameters[2:], "sin")
+    with pytest.raises(RuntimeError, match="leave out create_graph=True"):
+        torch.autograd.grad(values.sum(), x, create_graph=True)
+
+
+def test_threads_do_not_share_records() -> None:
+    inputs = [torch.randn(2, 100, 3, generator=torch.Generator().manual_seed(i)) for i in range(8)]
+
+    def work(x: Tensor) -> list[Tensor]:
+        return [passes(network((3, 24, 3), 2), x, torch.ones(2, 100, 3), "relu") for _ in range(20)][-1]
+
+    expected = [work(x) for x in inputs]
+    with ThreadPoolExecutor(4) as pool:
+        for found, own in zip(pool.map(work, inputs), expected):
+            assert all(torch.equal(a, b) for a, b in zip(found, own))
 
 
 def test_records_are_used_again() -> None:

@@ -1,13 +1,14 @@
 """Writes `tests/golden/v<version>/`: what every later version must find unchanged.
 
-    python -m tests.golden.make
+    python -m tests.golden.make [VERSION]
 
     hashes.json             hashes of all tasks, of the entries that plain commands name, and the published entries
     interrupted/TASK/ENTRY  runs that were stopped in the middle of an epoch, with their checkpoint
     finished/TASK/ENTRY     the epochs' lines and the trained agents with which they end
     machine.json            what made them: their bits are those of one kind of processor and of some versions
 
-Run once per release; a folder that is there is never written again. `tests/core/test_earlier_versions.py` reads it.
+Run once per release, or with the next VERSION as soon as bits change; a folder that is there is never written again.
+`tests/core/test_earlier_versions.py` reads it.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def write(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    target = GOLDEN / f"v{qrlsuite.__version__}"
+    target = GOLDEN / f"v{next(iter(sys.argv[1:]), qrlsuite.__version__)}"
     if target.exists():
         sys.exit(f"{target} is there, and its files are never changed: raise the version first")
     write(target)
