@@ -268,11 +268,14 @@ def _train_again(
 
 
 def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
-    """Say in what the installed code differs from that which made an entry; None where that is unknown or nothing."""
+    """Say in what the installed code differs from that which made an entry; None where that is unknown or nothing.
+
+    Other `numerics` are the same code with other bits, see `_elsewhere`.
+    """
     made_with = codes.read(entry.record, entry.folder / "entry.json")
     if made_with is None:
         return None
-    changed = identity.differences(made_with.parts, identity.of(made_by).parts)
+    changed = identity.differences(made_with.parts, identity.of(made_by).parts, numerics=False)
     return f"its seeds cannot be trained again by this code: {listed(changed)}" if changed else None
 
 

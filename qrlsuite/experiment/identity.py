@@ -245,8 +245,10 @@ def _texts(name: str, value: Any) -> Iterator[tuple[str, str]]:
             yield from _texts(f"{name}.{number}", inner)
 
 
-def differences(before: Sequence[Part], now: Sequence[Part]) -> list[str]:
-    """Say in words what differs between the parts of two identities."""
+def differences(before: Sequence[Part], now: Sequence[Part], numerics: bool = True) -> list[str]:
+    """Say in words what differs between the parts of two identities; without `numerics`, other bits are no difference."""
+    if not numerics:
+        before, now = ([{**part, "numerics": 1} for part in parts] for parts in (before, now))
     old, new = ({(part["role"], part["name"]): part for part in parts} for parts in (before, now))
     changes: list[str] = []
     for key in dict.fromkeys([*old, *new]):

@@ -238,9 +238,7 @@ def require_installed(store: EntryStore, seeds: Collection[int], current: CodeId
     """
     for group in others(store, current):
         for code in filter(None, group.codes.values() if set(group.seeds) & set(seeds) else ()):
-            changed = identity.differences(
-                *([{**part, "numerics": 1} for part in each.parts] for each in (code, current))
-            )
+            changed = identity.differences(code.parts, current.parts, numerics=False)
             if changed:
                 raise ChangedCodeError(
                     f"{store.path}: seeds {format_seeds(group.seeds)} were trained by another code than is installed: "

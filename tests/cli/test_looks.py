@@ -223,10 +223,10 @@ def test_a_study_goes_on_with_the_code_that_began_it(
     assert say("study", "run", "widths.toml", "--engine", "scripted").exit_code == 130
     Scripted.interrupt_at = -1
     known = registry.load().entries[specs.ModelSpec]
-    changed = replace(known["mlp"].spec, numerics=2)  # type: ignore[call-arg]
+    changed = replace(known["mlp"].spec, numerics=3)  # type: ignore[call-arg]
     monkeypatch.setitem(known, "mlp", replace(known["mlp"], spec=changed))
     message = refused("study", "run", "widths.toml", "--engine", "scripted")
-    assert "model 'mlp' has numerics 2, and had 1" in message
+    assert "model 'mlp' has numerics 3, and had 2" in message
     assert "Restore that code, or write another study" in message
     assert run("widths.toml", "--same", "no bit of a score")["pairs"] == straight["pairs"]
 

@@ -431,6 +431,7 @@ def with_numerics(monkeypatch: pytest.MonkeyPatch, kind: str, name: str, number:
 def test_seeds_of_the_suites_own_parts_go_on_until_their_bits_change(
     train: Train, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with_numerics(monkeypatch, "models", "mlp", 1)
     folder = train("runs", range(2), epochs=1)
     record = read_json(folder / "seed-0000" / "run.json")
     assert record["provenance"][0]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
@@ -453,7 +454,7 @@ def test_a_folder_of_two_codes_is_two_entries(kept: Train, tmp_path: Path) -> No
     folder = kept("runs", range(4), epochs=1)
     store = EntryStore(folder)
     parts = read_json(folder / "seed-0000" / "run.json")["code"]["parts"]
-    other = identity.CodeIdentity((*parts[:2], {**parts[2], "numerics": 2}))
+    other = identity.CodeIdentity((*parts[:2], {**parts[2], "numerics": 3}))
     for seed in (1, 3):
         edit_json(store.seed(seed).path / "run.json", code=other.record())
     found, refused = collect.collect(tmp_path / "runs")
@@ -477,7 +478,8 @@ def test_a_published_entry_of_other_code_is_another_entry(kept: Train, tmp_path:
     folder = kept("runs", range(2), epochs=1)
     entry = collect.read(EntryStore(folder))
     assert entry is not None
-    assert entry.codes == ()
+    assert entry.codes == (identity.of(resolve("beam6g", "mlp width=16")).digest,)
+    entry = replace(entry, codes=())  # as what is published from before codes were recorded
     copies = [entry, replace(entry, codes=("1a2b3c4d5e6f7a8b",)), replace(entry, source="published")]
     assert [[copy.label for copy in same] for same in collect.told_apart(copies)] == [
         ["ddqn mlp width=16 @00000000"] * 2,
@@ -490,7 +492,7 @@ def test_seeds_are_set_aside_only_where_nobody_has_them(
 ) -> None:
     folder = train("runs", range(2), epochs=1)
     store, entry = EntryStore(folder), resolve(tiny_task, "mlp width=16")
-    with_numerics(monkeypatch, "models", "mlp", 2)
+    with_numerics(monkeypatch, "models", "mlp", 3)
     now, runs = identity.of(entry), tmp_path / "runs"
     claim = acquire(store, [0])
     with pytest.raises(StoreError, match="are being trained by process"):
@@ -535,7 +537,7 @@ def test_a_worker_without_a_shared_folder_refuses_other_code(tiny_task: str) -> 
     assert answer["refused"].endswith("has other code: environment 'beam6g' has numerics 1, and had 2")
     answer, _ = unpack(work_on(pack({**task, "code": parts}, {})))
     assert answer["refused"] is None
-    assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 1}
+    assert answer["provenance"]["numerics"] == {"environment": 1, "algorithm": 1, "model": 2}
 
 
 def test_what_somebody_trains_is_not_begun_with_other_code(
@@ -545,11 +547,11 @@ def test_what_somebody_trains_is_not_begun_with_other_code(
     store = EntryStore.create(runs, entry)
     codes.prepare(store, identity.of(entry))
     claim = acquire(store, [0])  # of a seed that is being built, and has no record yet
-    with_numerics(monkeypatch, "models", "mlp", 2)
+    with_numerics(monkeypatch, "models", "mlp", 3)
     here = Where.create(workers=1)
     work = missing.find(runs, entry, here, [0, 1], 1)
     with pytest.raises(
-        StoreError, match="than the machine that started it: model 'mlp' has numerics 2, and had 1"
+        StoreError, match="than the machine that started it: model 'mlp' has numerics 3, and had 2"
     ):
         missing.train(work, here, RunDisplay(work, 1, quiet=True))
     claim.release()
@@ -564,9 +566,9 @@ def test_all_entries_are_looked_at_before_one_is_trained(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     train("runs", range(2), epochs=1)
-    with_numerics(monkeypatch, "models", "mlp", 2)
+    with_numerics(monkeypatch, "models", "mlp", 3)
     entries = [resolve(tiny_task, "mlp width=8"), resolve(tiny_task, "mlp width=16")]
-    with pytest.raises(StoreError, match="model 'mlp' has numerics 2, and had 1"):
+    with pytest.raises(StoreError, match="model 'mlp' has numerics 3, and had 2"):
         missing.require_same_code(tmp_path / "runs", entries, Where.create())
     missing.require_same_code(tmp_path / "runs", entries, replace(Where.create(), fresh=True))
     assert capsys.readouterr().err.count("the seeds of another code are now in") == 1

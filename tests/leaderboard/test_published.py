@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from qrlsuite import api, registry, specs
 from qrlsuite.errors import QrlSuiteError, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.task import digest
 from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.boards import board, costs
@@ -320,6 +321,25 @@ def test_records_from_before_devices_and_plugins_were_recorded_keep_their_bits(f
     verdict = verify.verify(folder, rerun=1)
     assert (verdict.ok, verdict.check) == (True, "verified"), verdict.message
     assert not collect.collect(folder.parent.parent)[0][0].mixed_versions
+
+
+def test_curves_of_other_numerics_are_those_of_another_version(folder: Path) -> None:
+    """Whether the record has a code identity, as later versions write it, or only lacks numerics."""
+
+    def older(record: dict[str, Any]) -> None:
+        for made in record["published"]["provenance"]:
+            made.pop("numerics")
+        for part in record["code"]["parts"]:
+            part["numerics"] = 1
+        record["code"]["digest"] = identity.CodeIdentity(tuple(record["code"]["parts"])).digest
+
+    edit(folder, older)
+    rewrite(folder / "curves.parquet", part)
+    for _ in range(2):
+        verdict = verify.verify(folder, rerun=1)
+        assert (verdict.ok, verdict.check) == (True, "plausible"), verdict.message
+        assert "(numerics 2 of the model here, 1 there)" in verdict.message
+        edit(folder, lambda record: record.pop("code", None))
 
 
 @pytest.mark.parametrize("cpu", [0, 2], ids=["all", "first"])
