@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -454,14 +455,14 @@ class Adam:
     @torch.no_grad()
     def step(self, active: Tensor | None = None) -> None:
         """Move every agent, or those where `active` (S,) bool is true, along its gradient."""
-        beta1, beta2 = self.betas
         self.steps += 1 if active is None else active.to(torch.int64)
+        if self._compiled and all(_compilable(p) and p.is_contiguous() for _, p in self._named):
+            self._move(active)
+            return
+        beta1, beta2 = self.betas
         count = self.steps.clamp(min=1).to(torch.float64)
         scale = 1.0 / (1.0 - beta1**count)
         root = 1.0 / torch.sqrt(1.0 - beta2**count)
-        if self._compiled and all(_compilable(p) and p.is_contiguous() for _, p in self._named):
-            self._move(scale, root, active)
-            return
         for name, parameter in self._named:
             if parameter.grad is None:
                 continue
@@ -482,12 +483,14 @@ class Adam:
             mean.copy_(torch.where(mask, new_mean, mean))
             square.copy_(torch.where(mask, new_square, square))
 
-    def _move(self, scale: Tensor, root: Tensor, active: Tensor | None) -> None:
-        """Make the step in one compiled pass over each parameter; scale and root (S,) correct the moments' bias."""
+    def _move(self, active: Tensor | None) -> None:
+        """Make the step in one compiled pass over each parameter."""
         from qrlsuite.compiled.networks import adam
 
-        size, (beta1, beta2) = len(scale), self.betas
-        roots = root.to(torch.float32).numpy()
+        size, (beta1, beta2) = len(self.steps), self.betas
+        corrections = [_corrections(beta1, beta2, max(count, 1)) for count in self.steps.tolist()]
+        scale, roots = np.array(corrections).T
+        roots = roots.astype(np.float32)
         moved = np.ones(size, np.bool_) if active is None else active.cpu().numpy()
         constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
         rates: dict[Any, Any] = {}
@@ -496,7 +499,8 @@ class Adam:
                 continue
             lr = self._lr[name]
             if id(lr) not in rates:
-                rates[id(lr)] = (lr * scale).to(torch.float32).numpy()
+                rate = (lr.numpy() if isinstance(lr, Tensor) else lr) * scale
+                rates[id(lr)] = rate.astype(np.float32)
             tensors = parameter.detach(), parameter.grad.contiguous(), self.mean[name], self.square[name]
             adam(
                 *(each.numpy().reshape(size, -1) for each in tensors), rates[id(lr)], roots, moved, *constants
@@ -515,6 +519,12 @@ class Adam:
         for name in self.mean:
             self.mean[name].copy_(state[f"mean.{name}"])
             self.square[name].copy_(state[f"square.{name}"])
+
+
+@functools.lru_cache(4)
+def _corrections(beta1: float, beta2: float, count: int) -> tuple[float, float]:
+    """Return by what Adam's moments are multiplied after some steps, as they begin at 0: the first, and the root."""
+    return 1.0 / (1.0 - beta1**count), 1.0 / math.sqrt(1.0 - beta2**count)
 
 
 def gradients(loss: Tensor, population: nn.Module) -> None:

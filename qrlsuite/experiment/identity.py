@@ -246,7 +246,7 @@ def _texts(name: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def differences(before: Sequence[Part], now: Sequence[Part], numerics: bool = True) -> list[str]:
-    """Say in words what differs between the parts of two identities; without `numerics`, other bits are no difference."""
+    """Say in words what differs between the parts of two identities; without `numerics`, bits may differ."""
     if not numerics:
         before, now = ([{**part, "numerics": 1} for part in parts] for parts in (before, now))
     old, new = ({(part["role"], part["name"]): part for part in parts} for parts in (before, now))
