@@ -135,7 +135,7 @@ def test_garbage_is_named_first_then_removed_and_its_seeds_cannot_be_extended(tr
     entry = train("runs", [0, 1], 2)
     train("runs", [2], 1)
     store = EntryStore(entry)
-    store.seed(2).write_record({"seed": 2, **store.names, "status": "running", "epochs": 1, "parameters": {}})
+    store.seed(2).write_record({**(store.seed(2).record() or {}), "status": "running", "epochs": 1})
     runs = ("--runs", str(entry.parent.parent))
 
     def collect(*words: str) -> str:
