@@ -430,6 +430,16 @@ def _supported(
     return action, observation, spaces.Box(limits[0], limits[1], dtype=np.float32)
 
 
+QUICK_DDQN: dict[str, Any] = {
+    "gamma": 0.99,
+    "lr": 2.5e-4,
+    "buffer": 10_000,
+    "batch": 128,
+    "target_steps": 50,
+}
+"""Settings of CleanRL's dqn.py (commit 020cf0e), whose target is copied every 500 steps: 50 gradient steps here."""
+
+
 def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     """Return the content of a task file for a quick look at a Gymnasium environment, `--task gym:ID`.
 
@@ -438,7 +448,7 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
     T - |T|/2, T - |T|/4 and T, the last one shown first. Where Gymnasium knows none, the one threshold is 0:
     a task file is needed to say what a good return is. A threshold that random actions reach in each of 10 episodes
     tells nothing apart, and is left out; where none is left, the highest of these returns is the threshold. The
-    summary says so. Without a time limit, episodes are cut at 1000 steps.
+    summary says so. Without a time limit, episodes are cut at 1000 steps. DDQN has `QUICK_DDQN`.
 
     Parameters
     ----------
@@ -499,6 +509,7 @@ def quick_task(env_id: str, name: str | None = None) -> dict[str, Any]:
             "reference": {"threshold": thresholds[-1], "delta": 0.5},
             "horizons": [100_000],
         },
+        **({"presets": {"default": {"ddqn": {"all": QUICK_DDQN}}}} if kind == "discrete" else {}),
     }
 
 

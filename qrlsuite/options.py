@@ -354,7 +354,9 @@ def assign(settings: Sequence[Setting], sides: Mapping[str, type[Any]]) -> dict[
             bare = {name.partition(".")[2] for name in every}
             raise OptionError(f"{setting.written}: no option of that name{nearest(setting.name, bare)}")
         if len(owners) > 1:
-            choices = " or ".join(f"{setting.prefix}{side}.{setting.name}=..." for side in owners)
-            raise OptionError(f"{setting.written}: several have that option; write {choices}")
+            choices = " or ".join(f"{side}.{setting.name}=..." for side in owners)
+            raise OptionError(
+                f"{setting.written} is an option of {' and '.join(owners)}: write {choices} in its place"
+            )
         result[owners[0]][setting.name] = setting.value
     return result

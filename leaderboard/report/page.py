@@ -30,7 +30,7 @@ LONGEST_REASON = 600
 
 def render(
     board: Leaderboard,
-    title: str = "Sample complexity leaderboard",
+    title: str = "Leaderboard",
     studies: Sequence[StudyOutcome] = (),
     beside: Leaderboard | None = None,
     live: bool = False,

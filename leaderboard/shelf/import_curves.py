@@ -373,9 +373,10 @@ def _scores(
             if best is None
             else f"{best:g}, the maximum"
         )
+        levels = "thresholds=" + ",".join(f"{part * (best or high):g}" for part in (0.6, 0.75, 0.9))
         raise FileError(
-            f"{source}: '{run[0]}', seed {run[1]}: scores from {low:g} to {high:g} are not between 0 and {of_best}; "
-            "a new task with thresholds alone takes any"
+            f"{source}: '{run[0]}', seed {run[1]}: scores from {low:g} to {high:g} are not between 0 and {of_best}: "
+            f"give a new --task thresholds in place of the maximum, which takes any scores: {levels}"
         ) from None
     return scores
 

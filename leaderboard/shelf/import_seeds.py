@@ -322,7 +322,10 @@ def differences(seeds: Sequence[int]) -> list[str]:
     """Say of which seeds other curves are here."""
     if not seeds:
         return []
-    return [f"seeds {format_seeds(seeds)} have other curves there than here: those here stay"]
+    return [
+        f"seeds {format_seeds(seeds)} have other curves there than here: those here stay, until `qrlsuite runs rm` "
+        "removes the entry"
+    ]
 
 
 def _other_versions(made_with: Sequence[Any], entry: Entry) -> list[str]:

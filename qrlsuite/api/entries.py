@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qrlsuite.api.arguments import Seeds, several
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.leaderboard import rules, studies
 from qrlsuite.leaderboard.boards import across
 from qrlsuite.leaderboard.boards import board as boards
@@ -261,10 +261,24 @@ def compare(
     >>> found.verdict
     'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 57%, 100 seeds each, p < .0001)'
     """
-    left, other = (
-        entry if isinstance(entry, EntryResults) else load(entry, task=task, runs=runs, published=published)
-        for entry in (first, second)
-    )
+
+    def find(entry: str | EntryResults, beside: str | EntryResults) -> EntryResults:
+        if isinstance(entry, EntryResults):
+            return entry
+        try:
+            return load(entry, task=task, runs=runs, published=published)
+        except UnknownNameError as error:  # it may be one of several, of which one is on the other's task
+            try:
+                known = (
+                    beside
+                    if isinstance(beside, EntryResults)
+                    else load(beside, task=task, runs=runs, published=published)
+                )
+                return load(entry, task=known.task, runs=runs, published=published)
+            except UnknownNameError:
+                raise error from None
+
+    left, other = find(first, second), find(second, first)
     compared = compare_entries(left, other, rules.load(rule) if rule else None)
     if isinstance(first, EntryResults) and isinstance(second, EntryResults):
         return compared

@@ -14,6 +14,7 @@ from qrlsuite.circuit.description import canonical
 from qrlsuite.circuit.resources import LARGEST_RANK, jacobian_rank
 from qrlsuite.errors import OptionError, UnknownNameError, nearest
 from qrlsuite.experiment import catalog, identity
+from qrlsuite.experiment.task import is_quick
 from qrlsuite.leaderboard import pictures, rules
 from qrlsuite.leaderboard.pictures import compose
 from qrlsuite.leaderboard.shelf import collect, published_studies
@@ -55,7 +56,8 @@ def describe(
     code:
         Describe the code identity, and what it is taken of.
     out, format:
-        Of an ansatz: a file for its drawing; the language of a program (`qasm3`, `qiskit`, `pennylane`).
+        Of an ansatz: a file for its drawing; the language of a program (`qasm3`, `qiskit`, `pennylane`). Of a task, the
+        format may be `toml`: its file, to be saved and changed.
     runs, published:
         As for `load`.
 
@@ -78,7 +80,9 @@ def describe(
         among = [specs.StudySpec]
     known = registry.load()
     found = [each for each in among if name in known.of(each)]
-    if name.startswith("gym:") and specs.TaskSpec in among:
+    if (among == [specs.TaskSpec] and is_quick(name)) or (
+        name.startswith("gym:") and specs.TaskSpec in among
+    ):
         found = [specs.TaskSpec]
     if specs.StudySpec in (*found[:1], *among[:1]) and len(found) < 2:
         from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
@@ -96,6 +100,8 @@ def describe(
     if len(found) > 1:
         singulars = " or ".join(f"`show {each.kind} {name}`" for each in found)
         raise UnknownNameError(f"'{name}' is several things; write {singulars}")
+    if found == [specs.TaskSpec] and format == "toml" and not (settings or out):
+        return {"format": format, "text": catalog.task_file(name)}
     if of_ansatz and found != [specs.AnsatzSpec]:
         raise OptionError(
             f"{specs.title(found[0], name)}: NAME=VALUE, --out and --format draw an ansatz; options are changed where "

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from qrlsuite import options, registry, specs
-from qrlsuite.experiment.task import load
+from qrlsuite.experiment.task import is_quick, load
 
 
 def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
     """Return a registered thing's options, protocol or file, as plain values."""
-    if kind is specs.TaskSpec and name.startswith("gym:"):
-        return {"kind": "task", "name": name, "distribution": "gymnasium"} | _task(name)
+    if kind is specs.TaskSpec and is_quick(name):
+        source = "gymnasium" if name.startswith("gym:") else _source(name)
+        return {"kind": "task", "name": name, "distribution": source} | _task(name)
     registered = registry.load().get(kind, name)
     spec = registered.spec
     content: dict[str, Any] = {
@@ -29,6 +33,18 @@ def describe(kind: type[specs.Spec], name: str) -> dict[str, Any]:
         content["options"] = options.describe(specs.resolve(reference))
         content["set_with"] = _set_with(spec)
     return content
+
+
+def task_file(name: str) -> str:
+    """Return a task as the text of its file; of one that no file has, as one that may be saved and changed."""
+    if not is_quick(name):
+        return Path(registry.get(specs.TaskSpec, name).path).read_text(encoding="utf-8")
+    return tomli_w.dumps(load(name).file.model_dump(mode="json", exclude_unset=True))
+
+
+def _source(environment: str) -> str:
+    """Return the distribution of a registered environment."""
+    return registry.load().get(specs.EnvironmentSpec, environment).distribution
 
 
 def _task(name: str) -> dict[str, Any]:

@@ -248,7 +248,9 @@ class TaskFile(options.Table):
     score: ScoreSection = ScoreSection()
     ranking: RankingSection
     default_algorithm: str = "ddqn"
-    default_preset: str | None = None
+    default_preset: Annotated[
+        str | None, Field(description="the preset where none is chosen; left out: `default`, if there is one")
+    ] = None
     presets: Annotated[
         dict[str, dict[str, dict[Family, dict[str, Any]]]],
         Field(
@@ -284,6 +286,8 @@ class TaskFile(options.Table):
                 if algorithm not in self.presets[name]:
                     known = nearest(algorithm, self.presets[name])
                     raise ValueError(f"tuning.{name}: the preset says nothing of '{algorithm}'{known}")
+        if self.default_preset is None and "default" in self.presets:
+            object.__setattr__(self, "default_preset", "default")
         if self.default_preset is not None and self.default_preset not in self.presets:
             raise ValueError(
                 f"default_preset '{self.default_preset}'{nearest(self.default_preset, self.presets)}"
@@ -504,6 +508,14 @@ def _environment_problems(section: Any) -> list[str]:
     return []
 
 
+def is_quick(name: str) -> bool:
+    """Whether a name stands for a task that no file has: `gym:ID`, or an environment without lanes of its own."""
+    known = registry.load()
+    environment = known.of(specs.EnvironmentSpec).get(name)
+    own = environment is not None and environment.spec.vector is None
+    return name.startswith("gym:") or (own and name not in known.of(specs.TaskSpec))
+
+
 def load(name: str) -> Task:
     """Load a registered task by name, a task file by path (anything that ends in `.toml`), or `gym:ID`.
 
@@ -519,18 +531,13 @@ def load(name: str) -> Task:
     OptionError
         If Gymnasium knows no such environment, or the algorithms cannot act or observe in it.
     """
-    environment, known = (
-        registry.load().of(specs.EnvironmentSpec).get(name),
-        registry.load().of(specs.TaskSpec),
-    )
-    if name.startswith("gym:"):
+    if is_quick(name):
         from qrlsuite.gymlanes import quick_task
 
-        return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
-    if name not in known and environment is not None and environment.spec.vector is None:
-        from qrlsuite.gymlanes import quick_task
-
+        if name.startswith("gym:"):
+            return Task(TaskFile.model_validate(quick_task(name.removeprefix("gym:"))), name)
         qrlsuite.register_environments()
-        return Task(TaskFile.model_validate(quick_task(environment.spec.gymnasium_id, name)), name)
+        gymnasium_id = registry.get(specs.EnvironmentSpec, name).gymnasium_id
+        return Task(TaskFile.model_validate(quick_task(gymnasium_id, name)), name)
     path = Path(name) if name.endswith(".toml") else Path(registry.get(specs.TaskSpec, name).path)
     return parse(files.read(path, "task file"), path.name, path.parent)

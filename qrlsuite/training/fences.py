@@ -107,7 +107,8 @@ class Fence:
         if moved := _moved(before, _other_threads() if self.alone is None else not self.alone):
             raise PluginError(
                 f"{call}: it moved {' and '.join(moved)}, which all seeds of a process share, so that no seed would be "
-                "what it is alone; draw from the generator or the streams that are handed to the plugin"
+                "what it is alone; draw from the generator or the streams that are handed to the plugin; leave out "
+                "layers that draw, such as Dropout"
             )
 
     def watch(self, module: torch.nn.Module, call: str) -> None:

@@ -142,6 +142,8 @@ def test_a_task_narrows_the_search(
         say(*words)
     for task in ("tiny", "other"):
         assert say(*words, "--task", task).exit_code == 0
+    if words[0] == "compare":  # the task of one says which the other is
+        assert say("compare", "mlp width=8", "other/mlp width=16").exit_code == 0
     with pytest.raises(UnknownNameError, match="did you mean 'tiny'"):
         say(*words, "--task", "tny")
     with pytest.raises(UnknownNameError, match="no entry 'ddqn vqc' in runs, task tiny"):

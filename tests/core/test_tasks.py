@@ -103,6 +103,10 @@ def test_a_preset_that_says_nothing_of_an_algorithm_is_not_its_preset() -> None:
     assert read.preset(None, "ppo", "quantum") == ("tuned", {"lr": 0.1})
     assert read.preset(None, "ppo", "classical") == (None, {})
     assert read.preset(None, "mine", "classical") == (None, {})
+    named = task.parse(TINY + presets.replace("tuned", "default"), "t.toml")
+    assert named.preset(None, "ddqn", "classical") == ("default", {"lr": 0.2}), (
+        "chosen where the file names none"
+    )
     with pytest.raises(
         FileError, match=r"'tuned' says nothing about algorithm 'mine', only about ppo, ddqn: leave"
     ):

@@ -14,7 +14,7 @@ import pytest
 
 from qrlsuite import options, registry, specs
 from qrlsuite.errors import EnvironmentFailure, OptionError, QrlSuiteError
-from qrlsuite.experiment import task
+from qrlsuite.experiment import catalog, task
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.gymlanes import GymLanes, quick_name
 from qrlsuite.hookspecs import hookimpl
@@ -115,6 +115,9 @@ def test_a_task_without_a_file(env_id: str, thresholds: list[float]) -> None:
     unlimited = env_id.startswith("CliffWalking")
     assert quick.environment_options.max_episode_steps == (1000 if unlimited else None)
     assert quick.hash == task.load(f"gym:{env_id}").hash
+    saved = task.parse(catalog.task_file(f"gym:{env_id}"), "saved.toml")
+    assert (saved.hash, saved.file) == (quick.hash, quick.file)
+    assert quick.preset(None, "ddqn", "classical")[1]["target_steps"] == 50
 
 
 def test_thresholds_that_random_actions_always_reach_are_left_out() -> None:

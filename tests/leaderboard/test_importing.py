@@ -163,7 +163,9 @@ def test_a_seed_that_differs_stays_as_it_is_here(copied: EntryStore, elsewhere: 
     rows[0]["scores"] = [0.5] * len(rows[0]["scores"])
     folder.table.write_bytes(table_bytes(rows))
     done = import_seeds.import_seeds(copied, tmp_path / "runs")
-    assert done.notes == ("seeds 1:2 have other curves there than here: those here stay",)
+    assert done.notes == (
+        "seeds 1:2 have other curves there than here: those here stay, until `qrlsuite runs rm` removes the entry",
+    )
 
 
 def test_seeds_in_training_are_left_there(copied: EntryStore, task: str, tmp_path: Path) -> None:

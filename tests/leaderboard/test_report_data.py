@@ -165,5 +165,5 @@ def test_the_command_writes_a_page(tmp_path: Path, train: Train) -> None:
     folder = train("runs", [0], epochs=1).parents[1]
     result = say("leaderboard", "--runs", str(folder), "--format", "html")
     assert result.stdout == f"wrote {folder / 'leaderboard.html'}\n"
-    assert "<h1>Sample complexity leaderboard</h1>" in (folder / "leaderboard.html").read_text()
+    assert "<h1>Leaderboard</h1>" in (folder / "leaderboard.html").read_text()
     assert "--format html" in boards.refused("leaderboard", "--runs", folder, "--out", "page.html")

@@ -257,7 +257,7 @@ def test_hostile_names_stay_text(opened: Open) -> None:
         said = tab.locator("#board-0 .verdicts").inner_text() + tab.locator("#board-0-pair").inner_text()
         assert sum(name in said for name in seen) == 2
     assert tab.locator("main img, main script, body > img").count() == 0
-    assert tab.title() == "Sample complexity leaderboard"
+    assert tab.title() == "Leaderboard"
 
 
 def test_without_javascript_everything_is_there_and_printed(opened: Open, page: str) -> None:
@@ -344,7 +344,7 @@ def test_the_policy_forbids_foreign_scripts(opened: Open, page: str) -> None:
     other = tab.context.pages[-1]
     other.on("console", lambda message: blocked.append(message.text))
     other.set_content(foreign)
-    assert other.title() == "Sample complexity leaderboard"
+    assert other.title() == "Leaderboard"
     assert any("Content Security Policy" in text for text in blocked)
 
 

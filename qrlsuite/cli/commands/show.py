@@ -35,7 +35,8 @@ def show(
         str | None,
         typer.Option(
             "--format",
-            help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane.",
+            help="For an ansatz: print the circuit for others: qasm3, or a program with qiskit or pennylane. For a "
+            "task: toml, its file.",
         ),
     ] = None,
     code: Annotated[
