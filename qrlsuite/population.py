@@ -13,7 +13,7 @@ import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from torch.nn import functional
 
 from qrlsuite.errors import PluginError
 from qrlsuite.options import per_agent
+
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
 
 NARROW = 16
 """Layers below this width on both sides multiply in a fixed order, see `linear`."""
@@ -95,9 +98,7 @@ def layers(
     ValueError
         If the shapes of a compiled sweep do not fit.
     """
-    compiled = (
-        all(map(_compilable, (x, *weights, *biases))) and not torch._C._are_functorch_transforms_active()
-    )
+    compiled = compilable(x, *weights, *biases)
     if compiled:
         from qrlsuite.compiled.perceptron import perceptron
 
@@ -110,8 +111,77 @@ def layers(
     return x
 
 
-def _compilable(tensor: Tensor) -> bool:
-    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
+def sweep(population: nn.Module, parameters: Sequence[Tensor], activation: str) -> Sweep | None:
+    """Return a population of layers as one compiled sweep, kept in it; None where `layers` is several, or torch's.
+
+    The population's method `sweep` returns it, so that `chosen_errors` need not go through autograd.
+
+    Parameters
+    ----------
+    parameters:
+        Of every layer the weights and the biases. They are moved in memory, so that they lie one behind the other.
+    """
+    kept: Sweep | None = population.__dict__.get("_sweep")
+    if kept is not None and kept.places == [each.data_ptr() for each in parameters]:
+        return kept
+    if activation == "tanh" or not compilable(*parameters):
+        return None
+    from qrlsuite.compiled.perceptron import Sweep, in_one_block
+
+    in_one_block(parameters)
+    kept = population.__dict__["_sweep"] = Sweep(parameters[::2], parameters[1::2], activation)
+    return kept
+
+
+def _sweep_of(population: nn.Module, x: Tensor) -> Sweep | None:
+    """Return the sweep of a population that does nothing else to x."""
+    if population._forward_hooks or population._forward_pre_hooks or not compilable(x):
+        return None
+    found: Callable[[], Sweep | None] | None = getattr(population, "sweep", None)
+    return None if found is None else found()
+
+
+def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor) -> Tensor:
+    """Set the gradients of a mean squared error, summed over the agents, in a population's parameters.
+
+    Of a population that is one compiled sweep, autograd is left out; the bits are the same.
+
+    Parameters
+    ----------
+    x:
+        (S, B, in).
+    chosen:
+        Of each sample, the output that should be its aim (S, B).
+    aims:
+        (S, B).
+
+    Returns
+    -------
+    Tensor
+        (S, B): the chosen outputs minus the aims.
+    """
+    compiled = _sweep_of(population, x)
+    if compiled is None:
+        errors = population(x).gather(2, chosen[..., None]).squeeze(2) - aims
+        gradients(errors.square().mean(1).sum(), population)
+        return errors.detach()
+    from qrlsuite.compiled import networks
+    from qrlsuite.compiled.perceptron import array
+
+    values, records = compiled.values(array(x), True)
+    found, cotangents = np.empty(values.shape[:2], np.float32), np.empty_like(values)
+    share = np.float32(1.0) / np.float32(values.shape[1])
+    networks.chosen_errors(values, chosen.numpy(), array(aims), share, found, cotangents)
+    parts = compiled.parts(compiled.gradients(records, cotangents, None))
+    for parameter, part in zip(compiled.tensors, parts):
+        parameter.grad = part
+    return torch.from_numpy(found)
+
+
+def compilable(*tensors: Tensor) -> bool:
+    """Return whether tensors are float32 on the CPU, and in no transform of `torch.func`."""
+    right = all(each.dtype == torch.float32 and each.is_cpu for each in tensors)
+    return right and not torch._C._are_functorch_transforms_active()
 
 
 def quantum_parameters(module: nn.Module) -> set[str]:
@@ -444,8 +514,10 @@ class Adam:
         self._compiled = getattr(population, "compiled", False) is True
         first = self._named[0][1]
         self.steps = torch.zeros(first.shape[0], dtype=torch.int64)
-        self.mean = {name: torch.zeros_like(p) for name, p in self._named}
-        self.square = {name: torch.zeros_like(p) for name, p in self._named}
+        self.mean, self.square = (
+            dict(zip([name for name, _ in self._named], _zeros([p for _, p in self._named])))
+            for _ in range(2)
+        )
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -456,8 +528,7 @@ class Adam:
     def step(self, active: Tensor | None = None) -> None:
         """Move every agent, or those where `active` (S,) bool is true, along its gradient."""
         self.steps += 1 if active is None else active.to(torch.int64)
-        if self._compiled and all(_compilable(p) and p.is_contiguous() for _, p in self._named):
-            self._move(active)
+        if self._compiled and self._move(active):
             return
         beta1, beta2 = self.betas
         count = self.steps.clamp(min=1).to(torch.float64)
@@ -483,28 +554,39 @@ class Adam:
             mean.copy_(torch.where(mask, new_mean, mean))
             square.copy_(torch.where(mask, new_square, square))
 
-    def _move(self, active: Tensor | None) -> None:
-        """Make the step in one compiled pass over each parameter."""
+    def _move(self, active: Tensor | None) -> bool:
+        """Make the step in one compiled pass, for which parameters come to lie in one block; False if torch has to."""
+        moving = [(name, p) for name, p in self._named if p.grad is not None]
+        if not moving or not compilable(*(p for _, p in moving)):
+            return False
         from qrlsuite.compiled.networks import adam
+        from qrlsuite.compiled.perceptron import block_of, in_one_block, joined
 
-        size, (beta1, beta2) = len(self.steps), self.betas
+        in_one_block([p for _, p in self._named])
+        beta1, beta2 = self.betas
         corrections = [_corrections(beta1, beta2, max(count, 1)) for count in self.steps.tolist()]
         scale, roots = np.array(corrections).T
-        roots = roots.astype(np.float32)
-        moved = np.ones(size, np.bool_) if active is None else active.cpu().numpy()
+        moved = np.ones(len(scale), np.bool_) if active is None else active.cpu().numpy()
         constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
-        rates: dict[Any, Any] = {}
-        for name, parameter in self._named:
-            if parameter.grad is None:
-                continue
-            lr = self._lr[name]
-            if id(lr) not in rates:
-                rate = (lr.numpy() if isinstance(lr, Tensor) else lr) * scale
-                rates[id(lr)] = rate.astype(np.float32)
-            tensors = parameter.detach(), parameter.grad.contiguous(), self.mean[name], self.square[name]
+        groups = [moving] if len(moving) == len(self._named) else [[each] for each in moving]
+        for group in groups:
+            parts = [
+                [p for _, p in group],
+                *([own[name] for name, _ in group] for own in (self.mean, self.square)),
+            ]
+            parameters, means, squares = (block_of(part) for part in parts)
             adam(
-                *(each.numpy().reshape(size, -1) for each in tensors), rates[id(lr)], roots, moved, *constants
+                parameters,
+                joined([cast("Tensor", p.grad) for _, p in group]),
+                means,
+                squares,
+                np.array([p[0].numel() for _, p in group]),
+                np.array([_plain(self._lr[name]) * scale for name, _ in group], np.float32),
+                roots.astype(np.float32),
+                moved,
+                *constants,
             )
+        return True
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return step counts (S,) and both moments of every parameter (S, ...)."""
@@ -519,6 +601,19 @@ class Adam:
         for name in self.mean:
             self.mean[name].copy_(state[f"mean.{name}"])
             self.square[name].copy_(state[f"square.{name}"])
+
+
+def _plain(rate: float | Tensor) -> Any:
+    return rate.numpy() if isinstance(rate, Tensor) else rate
+
+
+def _zeros(parameters: Sequence[Tensor]) -> list[Tensor]:
+    """Return zeros like the parameters, one behind the other in one memory if all are of one kind."""
+    first = parameters[0]
+    if any((p.dtype, p.device) != (first.dtype, first.device) or not p.is_contiguous() for p in parameters):
+        return [torch.zeros_like(p) for p in parameters]
+    block = first.detach().new_zeros(sum(p.numel() for p in parameters))
+    return [part.view(p.shape) for part, p in zip(block.split([p.numel() for p in parameters]), parameters)]
 
 
 @functools.lru_cache(4)

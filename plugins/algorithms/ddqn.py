@@ -34,7 +34,7 @@ from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, part, prefixed
+from qrlsuite.population import Adam, by_seed, chosen_errors, part, prefixed
 from qrlsuite.seeding import Streams
 
 
@@ -153,24 +153,16 @@ class DDQN:
         offset = torch.arange(self.S, device=self.device)[:, None] * o.buffer
         batch = self.buffer.view(-1, self.columns)[(picked + offset).reshape(-1)].view(self.S, o.batch, -1)
         s, following = batch[..., :d].contiguous(), batch[..., d : 2 * d].contiguous()
-        action, reward, alive = (
-            batch[..., 2 * d].long()[..., None],
-            batch[..., 2 * d + 1],
-            batch[..., 2 * d + 2],
-        )
+        action, reward, alive = batch[..., 2 * d].long(), batch[..., 2 * d + 1], batch[..., 2 * d + 2]
         with torch.no_grad():
             best = self._greedy(following)[..., None]
             beyond = self.target(masks.observed(following, self.obs_dim))
             y = reward + o.gamma * alive * beyond.gather(2, best).squeeze(2)
-        error = self.online(masks.observed(s, self.obs_dim)).gather(2, action).squeeze(2) - y  # (S, batch)
-        losses = error.square().mean(1)
-        self.adam.zero_grad()
-        losses.sum().backward()
+        errors = chosen_errors(self.online, masks.observed(s, self.obs_dim), action, y)  # sets gradients
         self.adam.step()
         if int(self.adam.steps[0]) % o.target_steps == 0:
             self.target.load_state_dict(self.online.state_dict())
-        detached: Tensor = losses.detach().to(torch.float64)
-        return detached
+        return errors.square().mean(1).to(torch.float64)
 
     @torch.no_grad()
     def _greedy(self, seen: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import torch
 from pydantic import ConfigDict, Field
@@ -18,7 +18,10 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.options import Since, Tuned
-from qrlsuite.population import ACTIVATIONS, layers
+from qrlsuite.population import ACTIVATIONS, compilable, layers, sweep
+
+if TYPE_CHECKING:
+    from qrlsuite.compiled.perceptron import Sweep
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -99,10 +102,22 @@ class MLPPopulation(nn.Module):
         """Map (S, B, in) to (S, B, out)."""
         if isinstance(self.input_scale, Tensor) or self.input_scale != 1.0:
             x = x * self.input_scale
-        parameters = cast(
-            "list[Tensor]", [*self._parameters.values()]
-        )  # in the order of their names in `MLP`
+        whole = self._whole()
+        if whole is not None and compilable(x):
+            return whole(x)
+        parameters = self._listed()
         return layers(x, parameters[::2], parameters[1::2], self.options.activation)
+
+    def sweep(self) -> Sweep | None:
+        """Return it as one compiled sweep, see `qrlsuite.population.sweep`."""
+        scaled = isinstance(self.input_scale, Tensor) or self.input_scale != 1.0
+        return None if scaled else self._whole()
+
+    def _whole(self) -> Sweep | None:
+        return sweep(self, self._listed(), self.options.activation)
+
+    def _listed(self) -> list[Tensor]:
+        return cast("list[Tensor]", [*self._parameters.values()])  # in the order of their names in `MLP`
 
 
 def initial_layer(

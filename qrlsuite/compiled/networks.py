@@ -185,38 +185,40 @@ def _fill(values: Any, seed: int, start: int, samples: int, rows: Any) -> None:
 
 
 @kernel
-def forward(x: Any, weights: Any, biases: Any, activation: int, records: Any, keep: bool, out: Any) -> None:
+def forward(x: Any, parameters: Any, sizes: Any, activation: int, records: Any, keep: bool, out: Any) -> None:
     """Compute out (S, B, O) of x (S, B, I).
 
     Parameters
     ----------
-    weights, biases:
-        Of each layer (S, out, in) and (S, out).
+    parameters:
+        One behind the other, of each layer the weights (S, out, in) and the biases (S, out).
+    sizes:
+        Inputs, and outputs of each layer.
     activation:
         NOTHING, RELU or SINE, after every layer but the last.
     records:
         (chunks, rows, 2 V), see `record_rows`; with `keep` every chunk writes its own, else all write the first.
     """
-    wide, chunk, last = records.shape[2], 0, len(weights) - 1
-    slopes = out.shape[2]  # the row where the first layer's derivatives begin, without its inputs
-    for layer in range(1, len(weights)):
-        slopes += weights[layer].shape[2]
-    for s in range(x.shape[0]):
+    wide, chunk, last, seeds = records.shape[2], 0, len(sizes) - 2, x.shape[0]
+    slopes = 0  # the row where the first layer's derivatives begin, without its inputs
+    for layer in range(1, len(sizes)):
+        slopes += sizes[layer]
+    for s in range(seeds):
         for start in range(0, x.shape[1], wide):
             rows = records[chunk]
             if keep:
                 chunk += 1
             samples = min(wide, x.shape[1] - start)
             _fill(x, s, start, samples, rows)
-            begin = 0
-            for layer in range(len(weights)):
-                w, b = weights[layer], biases[layer]
-                o, i = w.shape[1], w.shape[2]
+            begin, place = 0, 0
+            for layer in range(last + 1):
+                o, i = sizes[layer + 1], sizes[layer]
                 _multiply(
-                    w, s * o * i, i, 1, o, i, rows, begin, rows, begin + i, b, s * o,
+                    parameters, place + s * o * i, i, 1, o, i, rows, begin, rows, begin + i,
+                    parameters, place + seeds * o * i + s * o,
                     activation if layer < last else NOTHING, rows, slopes + begin + i, 2 * samples > wide,
                 )  # fmt: skip
-                begin += i
+                begin, place = begin + i, place + seeds * o * (i + 1)
             for j in range(out.shape[2]):
                 for v in range(samples):
                     out[s, start + v, j] = rows[begin + j, v]
@@ -224,10 +226,10 @@ def forward(x: Any, weights: Any, biases: Any, activation: int, records: Any, ke
 
 @kernel
 def backward(
-    cotangents: Any, weights: Any, biases: Any, activation: int, records: Any, pair: Any, turned: Any, sums: Any,
-    weight_gradients: Any, bias_gradients: Any, x_gradients: Any, needed: bool,
+    cotangents: Any, parameters: Any, sizes: Any, activation: int, records: Any, pair: Any, turned: Any, sums: Any,
+    gradients: Any, x_gradients: Any, needed: bool,
 ) -> None:  # fmt: skip
-    """Compute the gradients of a pass that kept its records, of weights and biases and, if `needed`, of x.
+    """Compute the gradients of a pass that kept its records, of parameters and, if `needed`, of x.
 
     Parameters
     ----------
@@ -235,29 +237,36 @@ def backward(
         (S, B, O).
     pair, turned, sums:
         Working memory: two chunks of rows, one chunk turned, and the sums of all weights in whole vectors.
+    gradients:
+        Laid out as the parameters are.
     """
-    wide, chunk, last = records.shape[2], 0, len(weights) - 1
-    vector, batch = wide // 2, cotangents.shape[1]
-    height = weights[last].shape[1]
-    for layer in range(len(weights)):
-        height += weights[layer].shape[2]
-    for s in range(cotangents.shape[0]):
+    wide, chunk, last = records.shape[2], 0, len(sizes) - 2
+    vector, batch, seeds, height = wide // 2, cotangents.shape[1], cotangents.shape[0], 0
+    for layer in range(len(sizes)):
+        height += sizes[layer]
+    for s in range(seeds):
         sums[:] = 0.0
-        for layer in range(len(weights)):
-            bias_gradients[layer][s] = 0.0
+        place = 0
+        for layer in range(last + 1):
+            o, i = sizes[layer + 1], sizes[layer]
+            for j in range(o):
+                gradients[place + seeds * o * i + s * o + j] = 0.0
+            place += seeds * o * (i + 1)
+        end = place
         for start in range(0, batch, wide):
             rows = records[chunk]
             chunk += 1
             samples, side, at = min(wide, batch - start), 0, 0
             _fill(cotangents, s, start, samples, pair[0])
-            begin = height - cotangents.shape[2]
-            for back in range(len(weights)):
+            begin, place = height - cotangents.shape[2], end
+            for back in range(last + 1):
                 layer = last - back
-                w, own = weights[layer], pair[side]
-                o, i = w.shape[1], w.shape[2]
-                begin -= i
+                own = pair[side]
+                o, i = sizes[layer + 1], sizes[layer]
+                begin, place = begin - i, place - seeds * o * (i + 1)
+                bias = place + seeds * o * i + s * o
                 for j in range(o):
-                    bias_gradients[layer][s, j] += total(load(own, 2 * j) + load(own, 2 * j + 1))
+                    gradients[bias + j] += total(load(own, 2 * j) + load(own, 2 * j + 1))
                 if i >= o:
                     columns = -(-i // vector)
                     _turn(rows, begin, i, columns, samples, turned)
@@ -274,40 +283,68 @@ def backward(
                     if layer > 0 and activation == RELU:
                         how = WHERE_POSITIVE
                     elif layer > 0 and activation == SINE:
-                        how, other = TIMES, height + begin - weights[0].shape[2]
+                        how, other = TIMES, height + begin - sizes[0]
                     _multiply(
-                        w, s * o * i, 1, i, i, o, own, 0, pair[side], 0, biases[layer], -1, how, rows, other,
-                        2 * samples > wide,
+                        parameters, place + s * o * i, 1, i, i, o, own, 0, pair[side], 0, parameters, -1, how, rows,
+                        other, 2 * samples > wide,
                     )  # fmt: skip
             if needed:
                 for i in range(x_gradients.shape[2]):
                     for v in range(samples):
                         x_gradients[s, start + v, i] = pair[side, i, v]
-        at = 0
-        for back in range(len(weights)):
-            gradient = weight_gradients[last - back]
-            o, i = gradient.shape[1], gradient.shape[2]
+        at, place = 0, end
+        for back in range(last + 1):
+            o, i = sizes[last - back + 1], sizes[last - back]
+            place -= seeds * o * (i + 1)
             columns = -(-max(i, o) // vector) * vector
             for j in range(o):
                 for k in range(i):
-                    gradient[s, j, k] = sums[at + (j * columns + k if i >= o else k * columns + j)]
+                    gradients[place + (s * o + j) * i + k] = sums[
+                        at + (j * columns + k if i >= o else k * columns + j)
+                    ]
             at += min(i, o) * columns
+
+
+@kernel
+def chosen_errors(values: Any, chosen: Any, aims: Any, share: Any, errors: Any, cotangents: Any) -> None:
+    """Write values[s, b, chosen[s, b]] - aims[s, b] (S, B), and the derivatives of the sum of `share` their squares."""
+    for s in range(values.shape[0]):
+        for b in range(values.shape[1]):
+            error = values[s, b, chosen[s, b]] - aims[s, b]
+            errors[s, b] = error
+            for a in range(values.shape[2]):
+                cotangents[s, b, a] = 0.0
+            cotangents[s, b, chosen[s, b]] = share * (error + error)
 
 
 @rounded
 def adam(
-    parameter: Any, gradient: Any, mean: Any, square: Any, rate: Any, root: Any, active: Any,
+    parameters: Any, gradients: Any, means: Any, squares: Any, sizes: Any, rates: Any, root: Any, active: Any,
     share1: Any, keep2: Any, share2: Any, eps: Any,
 ) -> None:  # fmt: skip
-    """Move the numbers (S, N) of every active agent along their gradients, in place; every operation is rounded.
+    """Move the numbers of every active agent along their gradients, in place; every operation is rounded.
 
-    rate and root (S,) correct the moments' bias; share1 is 1 - beta1, keep2 beta2, share2 1 - beta2, all of one dtype.
+    Parameters
+    ----------
+    parameters, gradients, means, squares:
+        Blocks (S, n) one behind the other.
+    sizes:
+        n of each block.
+    rates, root:
+        Corrected for the moments' bias: of each block (S,), and (S,).
+    share1, keep2, share2:
+        1 - beta1, beta2 and 1 - beta2, in the dtype of the parameters.
     """
-    for s in range(parameter.shape[0]):
-        if active[s]:
-            for i in range(parameter.shape[1]):
-                g = gradient[s, i]
-                m = mean[s, i] + share1 * (g - mean[s, i])
-                v = keep2 * square[s, i] + share2 * g * g
-                mean[s, i], square[s, i] = m, v
-                parameter[s, i] -= rate[s] * m / (root[s] * np.sqrt(v) + eps)
+    place = 0
+    for block in range(len(sizes)):
+        for s in range(rates.shape[1]):
+            first, end = place, place + sizes[block]
+            place = end
+            if active[s]:
+                rate, r = rates[block, s], root[s]
+                for i in range(first, end):
+                    g = gradients[i]
+                    m = means[i] + share1 * (g - means[i])
+                    v = keep2 * squares[i] + share2 * g * g
+                    means[i], squares[i] = m, v
+                    parameters[i] -= rate * m / (r * np.sqrt(v) + eps)

@@ -1,18 +1,25 @@
-"""Layers of networks as one compiled sweep behind a `torch.autograd.Function`."""
+"""Layers of networks as one compiled sweep, by itself and behind a `torch.autograd.Function`."""
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from qrlsuite.compiled import vectors
+
 SPARE_BYTES = 64 << 20
-"""Records up to this size are kept from one pass to the next: fresh pages cost more time than a small network."""
+"""Working memory up to this size is kept from one pass to the next: fresh pages cost more time than a small network."""
 
 _spare: dict[tuple[int, int], Any] = {}
+
+Array = NDArray[np.float32]
 
 
 def perceptron(
@@ -37,64 +44,177 @@ def perceptron(
     ValueError
         If shapes do not fit: compiled loops would read what is beside an array.
     """
-    parameters = (*weights, *biases)
-    _require_fitting(x, weights, biases)
-    if torch.is_grad_enabled() and any(each.requires_grad for each in (x, *parameters)):
-        result: Tensor = _Perceptron.apply(x, activation, *parameters)  # type: ignore[no-untyped-call]
-        return result
-    return _outputs(x, _arrays(parameters), activation, False)[0]
+    return Sweep(weights, biases, activation)(x)
 
 
-def _require_fitting(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
-    shape = tuple(x.shape)
-    fits = len(shape) == 3 and len(weights) == len(biases) > 0
-    for weight, bias in zip(weights, biases):
-        outputs = weight.shape[1] if weight.dim() == 3 else 0
-        fits = fits and weight.shape == (shape[0], outputs, shape[2]) and bias.shape == (shape[0], outputs)
-        shape = (*shape[:2], outputs)
-    if not fits:
-        weight_shapes, bias_shapes = ([tuple(each.shape) for each in part] for part in (weights, biases))
-        raise ValueError(
-            f"layers of S seeds take x (S, B, in), weights (S, out, in) and biases (S, out); x is {tuple(x.shape)}, "
-            f"weights are {weight_shapes}, biases {bias_shapes}"
+class Sweep:
+    """The layers of S networks, ready for compiled passes.
+
+    Parameters
+    ----------
+    weights, biases:
+        Of every layer (S, out, in) and (S, out), float32 on the CPU. They are read where they lie if weights and biases
+        of the layers lie one behind the other (`in_one_block`), else copied.
+    activation:
+        "none", "relu" or "sin", after every layer but the last.
+
+    Raises
+    ------
+    ValueError
+        If their shapes do not fit.
+    """
+
+    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: str) -> None:
+        self.tensors = [each for pair in zip(weights, biases) for each in pair]
+        self.shapes = [each.shape for each in self.tensors]
+        self.sizes = _sizes(weights, biases)
+        self.seeds, self.activation = self.shapes[0][0], activation
+        self.code, self.rows, self.shapes_of_work = _plan(tuple(self.sizes.tolist()), activation)
+        self.parameters = joined(self.tensors)
+        self.places = [each.data_ptr() for each in self.tensors]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Map (S, B, in) to (S, B, out).
+
+        Raises
+        ------
+        ValueError
+            If the shape does not fit.
+        """
+        if torch.is_grad_enabled() and (x.requires_grad or any(each.requires_grad for each in self.tensors)):
+            result: Tensor = _Perceptron.apply(x, self, *self.tensors)  # type: ignore[no-untyped-call]
+            return result
+        return torch.from_numpy(self.values(array(x), False)[0])
+
+    def values(self, x: Array, keep: bool) -> tuple[Array, _Records]:
+        """Return outputs (S, B, out) of x (S, B, in), and the records of the pass, all of them if `keep`.
+
+        Raises
+        ------
+        ValueError
+            If the shape does not fit.
+        """
+        from qrlsuite.compiled import networks
+
+        if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.sizes[0]:
+            raise _misfit(x.shape, self.shapes)
+        wide = 2 * vectors.lanes(np.float32)
+        records = _Records(self.seeds * -(-x.shape[1] // wide) if keep else 1, self.rows, wide)
+        out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
+        networks.forward(x, self.parameters, self.sizes, self.code, records.array, keep, out)
+        return out, records
+
+    def gradients(self, records: _Records, cotangents: Array, x_gradient: Array | None) -> Array:
+        """Return the gradients of the parameters, laid out as these, of cotangents (S, B, out); fill that of x."""
+        from qrlsuite.compiled import networks
+
+        pair, turned, sums = (_Records(*shape) for shape in self.shapes_of_work)
+        gradients = np.empty_like(self.parameters)
+        networks.backward(
+            cotangents,
+            self.parameters,
+            self.sizes,
+            self.code,
+            records.array,
+            pair.array,
+            turned.array.reshape(-1),
+            sums.array.reshape(-1),
+            gradients,
+            np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
+            x_gradient is not None,
         )
+        return gradients
+
+    def parts(self, gradients: Array) -> list[Tensor]:
+        """Return the gradients of each weight and bias, in the order of the layers."""
+        parts = torch.from_numpy(gradients).split([shape.numel() for shape in self.shapes])
+        return [part.view(shape) for part, shape in zip(parts, self.shapes)]
 
 
-def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
-    return [each.detach().contiguous().numpy() for each in tensors]
+def array(tensor: Tensor) -> Array:
+    """Return a tensor on the CPU as a contiguous array."""
+    found: Array = tensor.detach().contiguous().numpy()
+    return found
 
 
-def _code(activation: str) -> int:
+def block_of(tensors: Sequence[Tensor]) -> Array | None:
+    """Return the numbers of contiguous float32 tensors that lie one behind the other in one memory; None of others."""
+    first, place, numbers = tensors[0].data_ptr(), tensors[0].data_ptr(), 0
+    for each in tensors:
+        if each.data_ptr() != place or each.dtype != torch.float32 or not each.is_contiguous():
+            return None
+        numbers += each.numel()
+        place = first + 4 * numbers
+    storage = tensors[0].untyped_storage()
+    if place > storage.data_ptr() + storage.nbytes():
+        return None
+    found: Array = tensors[0].detach().as_strided((numbers,), (1,)).numpy()
+    return found
+
+
+@torch.no_grad()
+def in_one_block(parameters: Sequence[Tensor]) -> None:
+    """Let float32 parameters on the CPU lie one behind the other in one memory; their values stay."""
+    if block_of(parameters) is not None:
+        return
+    block = torch.from_numpy(joined(parameters))
+    for parameter, part in zip(parameters, block.split([each.numel() for each in parameters])):
+        parameter.data = part.view(parameter.shape)
+
+
+def joined(tensors: Sequence[Tensor]) -> Array:
+    """Return the numbers of float32 tensors one behind the other: where they lie, if they do so, else in a copy."""
+    block = block_of(tensors)
+    return np.concatenate([array(each).reshape(-1) for each in tensors]) if block is None else block
+
+
+@functools.lru_cache(256)
+def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple[int, int, int]]]:
+    """Return the activation's code, the rows of a record, and the shapes of a backward pass's working memory."""
     from qrlsuite.compiled import networks
 
-    return {"none": networks.NOTHING, "relu": networks.RELU, "sin": networks.SINE}[activation]
-
-
-def _outputs(x: Tensor, arrays: list[Any], activation: str, keep: bool) -> tuple[Tensor, _Records]:
-    """Return outputs (S, B, out) of weights and biases, and the records of the pass, all of them if `keep`."""
-    from qrlsuite.compiled import networks, vectors
-
-    weights, biases = arrays[: len(arrays) // 2], arrays[len(arrays) // 2 :]
+    code = {"none": networks.NOTHING, "relu": networks.RELU, "sin": networks.SINE}[activation]
     vector = vectors.lanes(np.float32)
-    code = _code(activation)
-    rows = networks.record_rows([x.shape[2], *(w.shape[1] for w in weights)], code, vector)
-    records = _Records(len(x) * -(-x.shape[1] // (2 * vector)) if keep else 1, rows, 2 * vector)
-    out = np.empty((*x.shape[:2], weights[-1].shape[1]), np.float32)
-    inputs = x.detach().contiguous().numpy()
-    networks.forward(inputs, tuple(weights), tuple(biases), code, records.array, keep, out)
-    return torch.from_numpy(out), records
+    widest = -(-max(sizes) // vector) * vector
+    sums = sum(min(pair) * -(-max(pair) // vector) for pair in itertools.pairwise(sizes))
+    shapes = [(2, widest, 2 * vector), (1, 2 * vector, widest), (1, sums, vector)]
+    return code, networks.record_rows(sizes, code, vector), shapes
+
+
+def _sizes(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> NDArray[np.int64]:
+    """Return inputs and outputs of the layers.
+
+    Raises
+    ------
+    ValueError
+        If the shapes of the layers do not fit each other.
+    """
+    shapes = [each.shape for pair in zip(weights, biases) for each in pair]
+    fits = len(weights) == len(biases) > 0 and all(len(shape) == 3 for shape in shapes[::2])
+    sizes = [shapes[0][-1], *(shape[1] for shape in shapes[::2])] if fits else []
+    for weight, bias, i, o in zip(shapes[::2], shapes[1::2], sizes, sizes[1:]):
+        fits = fits and weight == (shapes[0][0], o, i) and bias == (shapes[0][0], o)
+    if not fits:
+        raise _misfit(None, [each.shape for each in (*weights, *biases)])
+    return np.array(sizes)
+
+
+def _misfit(x: Sequence[int] | None, shapes: Sequence[Sequence[int]]) -> ValueError:
+    seen = "" if x is None else f"x is {tuple(x)}, "
+    return ValueError(
+        f"layers of S seeds take x (S, B, in), weights (S, out, in) and biases (S, out); {seen}weights and biases are "
+        f"{', '.join(str(tuple(shape)) for shape in shapes)}"
+    )
 
 
 class _Records:
-    """What a chunk of samples is in every layer, (chunks, rows, 2 V); its memory then serves another pass."""
+    """Memory (n, rows, wide) of a pass, such as what a chunk of samples is in every layer; it then serves another."""
 
-    def __init__(self, chunks: int, rows: int, wide: int) -> None:
-        from qrlsuite.compiled.vectors import aligned
-
+    def __init__(self, number: int, rows: int, wide: int) -> None:
         self.key = rows, wide
         room = _spare.pop(self.key, None)
-        if room is None or len(room) < chunks:
-            room = aligned((chunks, rows, wide), np.float32)
+        if room is None or len(room) < number:
+            room = vectors.aligned((number, rows, wide), np.float32)
         self.array = room
 
     def __del__(self, spare: dict[tuple[int, int], Any] = _spare, most: int = SPARE_BYTES) -> None:
@@ -106,43 +226,23 @@ class _Perceptron(torch.autograd.Function):
     """Outputs of layers, with the gradients of inputs, weights and biases."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, activation: str, *parameters: Tensor) -> Tensor:
-        values, ctx.records = _outputs(x, _arrays(parameters), activation, True)
-        ctx.activation, ctx.inputs = activation, x.shape[2]
+    def forward(ctx: Any, x: Tensor, sweep: Sweep, *parameters: Tensor) -> Tensor:
+        values, ctx.records = sweep.values(array(x), True)
+        ctx.sweep = sweep
         ctx.save_for_backward(*parameters)
-        return values
+        return torch.from_numpy(values)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        from qrlsuite.compiled import networks, vectors
-
         if torch.is_grad_enabled():
             raise RuntimeError(
                 "compiled layers of a network are differentiated once: leave out create_graph=True, or compute in "
                 "float64, which torch differentiates any number of times"
             )
-        held = _arrays(ctx.saved_tensors)
-        weights, biases = tuple(held[: len(held) // 2]), tuple(held[len(held) // 2 :])
-        cotangent = cotangents[0].contiguous()
-        vector = vectors.lanes(np.float32)
-        gradients = [np.empty_like(each) for each in held]
-        sides = [(w.shape[1], w.shape[2]) for w in weights]
-        widest = -(-max(max(side) for side in sides) // vector) * vector
-        numbers = sum(min(side) * -(-max(side) // vector) * vector for side in sides)
-        needed = ctx.needs_input_grad[0]
-        x_gradient = np.empty((*cotangent.shape[:2], ctx.inputs) if needed else (1, 1, 1), np.float32)
-        networks.backward(
-            cotangent.numpy(),
-            weights,
-            biases,
-            _code(ctx.activation),
-            ctx.records.array,
-            vectors.aligned((2, widest, 2 * vector), np.float32),
-            vectors.aligned((2 * vector * widest,), np.float32),
-            vectors.aligned((numbers,), np.float32),
-            tuple(gradients[: len(weights)]),
-            tuple(gradients[len(weights) :]),
-            x_gradient,
-            needed,
-        )
-        return torch.from_numpy(x_gradient) if needed else None, None, *map(torch.from_numpy, gradients)
+        _ = ctx.saved_tensors  # refuses those that changed since
+        sweep, cotangent = ctx.sweep, array(cotangents[0])
+        x_gradient = None
+        if ctx.needs_input_grad[0]:
+            x_gradient = np.empty((*cotangent.shape[:2], sweep.sizes[0]), np.float32)
+        gradients = sweep.gradients(ctx.records, cotangent, x_gradient)
+        return None if x_gradient is None else torch.from_numpy(x_gradient), None, *sweep.parts(gradients)
