@@ -133,9 +133,9 @@ def sweep(population: nn.Module, parameters: Sequence[Tensor], activation: str) 
     return kept
 
 
-def _sweep_of(population: nn.Module, x: Tensor) -> Sweep | None:
-    """Return the sweep of a population that does nothing else to x."""
-    if population._forward_hooks or population._forward_pre_hooks or not compilable(x):
+def _sweep_of(population: nn.Module) -> Sweep | None:
+    """Return the sweep of a population that does nothing else to what it is given."""
+    if population._forward_hooks or population._forward_pre_hooks:
         return None
     found: Callable[[], Sweep | None] | None = getattr(population, "sweep", None)
     return None if found is None else found()
@@ -160,8 +160,8 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
     Tensor
         (S, B): the chosen outputs minus the aims.
     """
-    compiled = _sweep_of(population, x)
-    if compiled is None:
+    compiled = _sweep_of(population)
+    if compiled is None or not compilable(x, aims):
         errors = population(x).gather(2, chosen[..., None]).squeeze(2) - aims
         gradients(errors.square().mean(1).sum(), population)
         return errors.detach()
@@ -172,9 +172,7 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
     found, cotangents = np.empty(values.shape[:2], np.float32), np.empty_like(values)
     share = np.float32(1.0) / np.float32(values.shape[1])
     networks.chosen_errors(values, chosen.numpy(), array(aims), share, found, cotangents)
-    parts = compiled.parts(compiled.gradients(records, cotangents, None))
-    for parameter, part in zip(compiled.tensors, parts):
-        parameter.grad = part
+    compiled.set_gradients(records, cotangents)
     return torch.from_numpy(found)
 
 
@@ -511,13 +509,13 @@ class Adam:
                 self._lr[name] = self._lr[name] * factor
         self.betas = betas
         self.eps = eps
+        self._population = population
         self._compiled = getattr(population, "compiled", False) is True
         first = self._named[0][1]
         self.steps = torch.zeros(first.shape[0], dtype=torch.int64)
-        self.mean, self.square = (
-            dict(zip([name for name, _ in self._named], _zeros([p for _, p in self._named])))
-            for _ in range(2)
-        )
+        self.mean = {name: torch.zeros_like(p) for name, p in self._named}
+        self.square = {name: torch.zeros_like(p) for name, p in self._named}
+        self._blocks: tuple[Any, ...] | None = None
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -556,37 +554,50 @@ class Adam:
 
     def _move(self, active: Tensor | None) -> bool:
         """Make the step in one compiled pass, for which parameters come to lie in one block; False if torch has to."""
-        moving = [(name, p) for name, p in self._named if p.grad is not None]
-        if not moving or not compilable(*(p for _, p in moving)):
+        parameters = [p for _, p in self._named]
+        if any(p.grad is None for p in parameters):
             return False
-        from qrlsuite.compiled.networks import adam
-        from qrlsuite.compiled.perceptron import block_of, in_one_block, joined
+        if self._blocks is None or self._blocks[0] != [p.data_ptr() for p in parameters]:
+            if not compilable(*parameters):
+                return False
+            self._blocks = self._lay_out(parameters)
+        from qrlsuite.compiled import networks
+        from qrlsuite.compiled.perceptron import joined
 
-        in_one_block([p for _, p in self._named])
-        beta1, beta2 = self.betas
-        corrections = [_corrections(beta1, beta2, max(count, 1)) for count in self.steps.tolist()]
+        _, block, means, squares, sizes, rates = self._blocks
+        (beta1, beta2), counts = self.betas, self.steps.tolist()
+        corrections = [_corrections(beta1, beta2, max(count, 1)) for count in counts]
         scale, roots = np.array(corrections).T
-        moved = np.ones(len(scale), np.bool_) if active is None else active.cpu().numpy()
-        constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
-        groups = [moving] if len(moving) == len(self._named) else [[each] for each in moving]
-        for group in groups:
-            parts = [
-                [p for _, p in group],
-                *([own[name] for name, _ in group] for own in (self.mean, self.square)),
-            ]
-            parameters, means, squares = (block_of(part) for part in parts)
-            adam(
-                parameters,
-                joined([cast("Tensor", p.grad) for _, p in group]),
-                means,
-                squares,
-                np.array([p[0].numel() for _, p in group]),
-                np.array([_plain(self._lr[name]) * scale for name, _ in group], np.float32),
-                roots.astype(np.float32),
-                moved,
-                *constants,
-            )
+        whole = _sweep_of(self._population)
+        gradients = None if whole is None else whole.gradients_of(parameters)
+        networks.adam(
+            block,
+            joined([cast("Tensor", p.grad) for p in parameters]) if gradients is None else gradients,
+            means,
+            squares,
+            sizes,
+            (rates * scale).astype(np.float32),
+            roots.astype(np.float32),
+            np.ones(len(counts), np.bool_) if active is None else active.cpu().numpy(),
+            *(np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)),
+        )
         return True
+
+    def _lay_out(self, parameters: list[Tensor]) -> tuple[Any, ...]:
+        """Return where parameters are; they and both moments, each in one block; sizes and learning rates."""
+        from qrlsuite.compiled.perceptron import in_one_block, joined
+
+        self.mean, self.square = (
+            {name: each.contiguous() for name, each in own.items()} for own in (self.mean, self.square)
+        )
+        moments = [list(own.values()) for own in (self.mean, self.square)]
+        for part in (parameters, *moments):
+            in_one_block(part)
+        lr = [torch.as_tensor(self._lr[name], dtype=torch.float64).numpy() for name, _ in self._named]
+        rates = np.stack([np.broadcast_to(each, len(self.steps)) for each in lr])
+        sizes = np.array([p[0].numel() for p in parameters])
+        blocks = (joined(part) for part in (parameters, *moments))
+        return [p.data_ptr() for p in parameters], *blocks, sizes, rates
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return step counts (S,) and both moments of every parameter (S, ...)."""
@@ -601,19 +612,6 @@ class Adam:
         for name in self.mean:
             self.mean[name].copy_(state[f"mean.{name}"])
             self.square[name].copy_(state[f"square.{name}"])
-
-
-def _plain(rate: float | Tensor) -> Any:
-    return rate.numpy() if isinstance(rate, Tensor) else rate
-
-
-def _zeros(parameters: Sequence[Tensor]) -> list[Tensor]:
-    """Return zeros like the parameters, one behind the other in one memory if all are of one kind."""
-    first = parameters[0]
-    if any((p.dtype, p.device) != (first.dtype, first.device) or not p.is_contiguous() for p in parameters):
-        return [torch.zeros_like(p) for p in parameters]
-    block = first.detach().new_zeros(sum(p.numel() for p in parameters))
-    return [part.view(p.shape) for part, p in zip(block.split([p.numel() for p in parameters]), parameters)]
 
 
 @functools.lru_cache(4)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +34,8 @@ class Replay:
         self.columns = columns
         self.rows = torch.zeros((seeds, capacity, sum(columns.values())), device=device)
         self.stored = 0
+        self._borders = [0, *itertools.accumulate(columns.values())]
+        self._places = np.array(self._borders)
 
     @property
     def filled(self) -> int:
@@ -40,11 +44,17 @@ class Replay:
 
     def add(self, **values: Tensor) -> None:
         """Store E rows of every seed, over the oldest ones: each quantity (S, E, numbers), or (S, E)."""
-        parts = [values[name].to(torch.float32) for name in self.columns]
-        new = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
-        places = (self.stored + torch.arange(new.shape[1])) % self.rows.shape[1]
-        self.rows[:, places] = new
-        self.stored += new.shape[1]
+        capacity, new = self.rows.shape[1], len(values[next(iter(self.columns))][0])
+        place = self.stored % capacity
+        if place + new <= capacity:
+            for name, first, end in zip(self.columns, self._borders, self._borders[1:]):
+                held = self.rows[:, place : place + new, first:end]
+                held.copy_(values[name].reshape(held.shape))
+        else:
+            parts = [values[name].to(torch.float32) for name in self.columns]
+            both = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
+            self.rows[:, (self.stored + torch.arange(new)) % capacity] = both
+        self.stored += new
 
     def batch(self, draws: Tensor) -> dict[str, Tensor]:
         """Return rows of every seed, each quantity (S, B, numbers), contiguous.
@@ -55,11 +65,26 @@ class Replay:
             (S, B) float64, uniform in [0, 1): with replacement from what is held.
         """
         seeds, capacity, numbers = self.rows.shape
+        if self.rows.is_cpu:
+            return self._picked(draws)
         picked = (draws * self.filled).to(torch.int64)
         offset = torch.arange(seeds, device=self.rows.device)[:, None] * capacity
         found = self.rows.view(-1, numbers)[(picked + offset).reshape(-1)].view(seeds, -1, numbers)
         parts = torch.split(found, list(self.columns.values()), dim=2)
         return {name: part.contiguous() for name, part in zip(self.columns, parts)}
+
+    def _picked(self, draws: Tensor) -> dict[str, Tensor]:
+        """Return what `batch` does, by one compiled loop."""
+        from qrlsuite.compiled.networks import pick
+
+        seeds, batch = draws.shape
+        out = torch.empty(seeds * batch * self._borders[-1])
+        pick(self.rows.numpy(), draws.contiguous().numpy(), self.filled, self._places, out.numpy())
+        widths = self.columns.values()
+        parts = out.split([seeds * batch * width for width in widths])
+        return {
+            name: part.view(seeds, batch, width) for (name, width), part in zip(self.columns.items(), parts)
+        }
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return rows and counts, seed-first."""

@@ -35,6 +35,7 @@ from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
 from qrlsuite.population import Adam, by_seed, chosen_errors, part, prefixed
+from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
 
@@ -82,16 +83,16 @@ class DDQN:
         self.online = build_model(self.actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
-        self.stored = 0  # transitions ever stored, per seed
         self.epoch = 0
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
     def _hold(self, observations: Tensor) -> None:
         """Keep current observations, with masks behind them if there are any, and room for such transitions."""
         self.observations, self.seen_dim = observations, observations.shape[2]
-        # a transition is one row: observation, next observation, action, reward, 1 - terminated
-        self.columns = 2 * self.seen_dim + 3
-        self.buffer = torch.zeros((self.S, self.options.buffer, self.columns), device=self.device)
+        d = self.seen_dim  # `alive` is 1 - terminated
+        self.replay = Replay(
+            self.S, self.options.buffer, self.device, seen=d, after=d, action=1, reward=1, alive=1
+        )
 
     def start(self) -> None:
         """Reset the environments."""
@@ -100,7 +101,6 @@ class DDQN:
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
-        o = self.options
         explore, random_action, draws = self._epoch_numbers(rounds)
         losses = torch.zeros(self.S, dtype=torch.float64, device=self.device)
         for k in range(rounds):
@@ -110,9 +110,7 @@ class DDQN:
             )
             actions = torch.where(explore[:, k], uniform, greedy)  # (S, E)
             self._interact(actions)
-            filled = min(self.stored, o.buffer)
-            picked = (draws[:, k] * filled).to(torch.int64)  # (S, batch)
-            losses += self._learn(picked)
+            losses += self._learn(draws[:, k])
         self.epoch += 1
         return {"loss": (losses / rounds).cpu().numpy()}
 
@@ -132,35 +130,27 @@ class DDQN:
         """Step every environment once and store the S x E transitions."""
         lanes = actions.reshape(-1).cpu().numpy()
         after, rewards, terminated, _, infos = self.envs.step(lanes)
-        rows = torch.cat(
-            [
-                self.observations,
-                masks.behind(by_seed(arrived(after, infos), self.S, self.device), infos, arrived=True),
-                actions[..., None].to(torch.float32),
-                by_seed(rewards, self.S, self.device),
-                1.0 - by_seed(terminated, self.S, self.device),
-            ],
-            dim=2,
+        arrival = masks.behind(by_seed(arrived(after, infos), self.S, self.device), infos, arrived=True)
+        self.replay.add(
+            seen=self.observations,
+            after=arrival,
+            action=actions,
+            reward=by_seed(rewards, self.S, self.device),
+            alive=by_seed(~terminated, self.S, self.device),
         )
-        places = (self.stored + torch.arange(self.E)) % self.options.buffer
-        self.buffer[:, places] = rows
-        self.stored += self.E
-        self.observations = masks.behind(by_seed(after, self.S, self.device), infos)
+        self.observations = masks.behind(by_seed(after, self.S, self.device), infos) if infos else arrival
 
-    def _learn(self, picked: Tensor) -> Tensor:
-        """Make one Adam step of every agent on its batch `picked` (S, batch); returns the losses (S,)."""
-        o, d = self.options, self.seen_dim
-        offset = torch.arange(self.S, device=self.device)[:, None] * o.buffer
-        batch = self.buffer.view(-1, self.columns)[(picked + offset).reshape(-1)].view(self.S, o.batch, -1)
-        s, following = batch[..., :d].contiguous(), batch[..., d : 2 * d].contiguous()
-        action, reward, alive = batch[..., 2 * d].long(), batch[..., 2 * d + 1], batch[..., 2 * d + 2]
+    def _learn(self, draws: Tensor) -> Tensor:
+        """Make one Adam step of every agent on a batch drawn by `draws` (S, batch); returns the losses (S,)."""
+        batch = self.replay.batch(draws)
+        action, reward, alive = (batch[name].squeeze(2) for name in ("action", "reward", "alive"))
         with torch.no_grad():
-            best = self._greedy(following)[..., None]
-            beyond = self.target(masks.observed(following, self.obs_dim))
-            y = reward + o.gamma * alive * beyond.gather(2, best).squeeze(2)
-        errors = chosen_errors(self.online, masks.observed(s, self.obs_dim), action, y)  # sets gradients
+            best = self._greedy(batch["after"])[..., None]
+            beyond = self.target(masks.observed(batch["after"], self.obs_dim)).gather(2, best).squeeze(2)
+            y = reward + self.options.gamma * alive * beyond
+        errors = chosen_errors(self.online, masks.observed(batch["seen"], self.obs_dim), action.long(), y)
         self.adam.step()
-        if int(self.adam.steps[0]) % o.target_steps == 0:
+        if int(self.adam.steps[0]) % self.options.target_steps == 0:
             self.target.load_state_dict(self.online.state_dict())
         return errors.square().mean(1).to(torch.float64)
 
@@ -187,9 +177,9 @@ class DDQN:
             **prefixed(
                 online=self.online.state_dict(), target=self.target.state_dict(), adam=self.adam.state_dict()
             ),
-            "buffer": self.buffer,
+            "buffer": self.replay.rows,
             "observations": self.observations,
-            "counters": torch.tensor([[self.stored, self.epoch]] * self.S, dtype=torch.int64),
+            "counters": torch.tensor([[self.replay.stored, self.epoch]] * self.S, dtype=torch.int64),
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -198,8 +188,8 @@ class DDQN:
         self.target.load_state_dict(part(state, "target"))
         self.adam.load_state_dict(part(state, "adam"))
         self._hold(state["observations"].clone().to(self.device))
-        self.buffer.copy_(state["buffer"])
-        self.stored, self.epoch = (int(v) for v in state["counters"][0])
+        self.replay.rows.copy_(state["buffer"])
+        self.replay.stored, self.epoch = (int(v) for v in state["counters"][0])
 
 
 def memory(options: DDQNOptions, rounds: int) -> Memory:

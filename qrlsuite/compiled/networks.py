@@ -317,6 +317,28 @@ def chosen_errors(values: Any, chosen: Any, aims: Any, share: Any, errors: Any, 
             cotangents[s, b, chosen[s, b]] = share * (error + error)
 
 
+@kernel
+def pick(rows: Any, draws: Any, filled: int, borders: Any, out: Any) -> None:
+    """Write rows (S, C, N), drawn by numbers (S, B) in [0, 1) among the first `filled`, in blocks of columns.
+
+    Parameters
+    ----------
+    borders:
+        Where each block begins, and N.
+    out:
+        Blocks (S, B, n) one behind the other.
+    """
+    seeds, batch = draws.shape
+    for s in range(seeds):
+        for b in range(batch):
+            place = int(draws[s, b] * filled)
+            for block in range(len(borders) - 1):
+                first, width = borders[block], borders[block + 1] - borders[block]
+                begin = seeds * batch * first + (s * batch + b) * width
+                for column in range(width):
+                    out[begin + column] = rows[s, place, first + column]
+
+
 @rounded
 def adam(
     parameters: Any, gradients: Any, means: Any, squares: Any, sizes: Any, rates: Any, root: Any, active: Any,

@@ -17,7 +17,7 @@ from qrlsuite.compiled import vectors
 SPARE_BYTES = 64 << 20
 """Working memory up to this size is kept from one pass to the next: fresh pages cost more time than a small network."""
 
-_spare: dict[tuple[int, int], Any] = {}
+_spare: dict[tuple[str, int, int], Any] = {}
 
 Array = NDArray[np.float32]
 
@@ -72,6 +72,8 @@ class Sweep:
         self.code, self.rows, self.shapes_of_work = _plan(tuple(self.sizes.tolist()), activation)
         self.parameters = joined(self.tensors)
         self.places = [each.data_ptr() for each in self.tensors]
+        self.kept_gradients: Array | None = None
+        self._kept_parts: list[Tensor] = []
 
     def __call__(self, x: Tensor) -> Tensor:
         """Map (S, B, in) to (S, B, out).
@@ -99,17 +101,32 @@ class Sweep:
         if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.sizes[0]:
             raise _misfit(x.shape, self.shapes)
         wide = 2 * vectors.lanes(np.float32)
-        records = _Records(self.seeds * -(-x.shape[1] // wide) if keep else 1, self.rows, wide)
+        records = _Records("records", self.seeds * -(-x.shape[1] // wide) if keep else 1, self.rows, wide)
         out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
         networks.forward(x, self.parameters, self.sizes, self.code, records.array, keep, out)
         return out, records
 
-    def gradients(self, records: _Records, cotangents: Array, x_gradient: Array | None) -> Array:
-        """Return the gradients of the parameters, laid out as these, of cotangents (S, B, out); fill that of x."""
+    def set_gradients(self, records: _Records, cotangents: Array) -> None:
+        """Write the gradients of cotangents (S, B, out) to `grad` of the parameters, in memory that is used again."""
+        if self.kept_gradients is None:
+            self.kept_gradients = np.empty_like(self.parameters)
+            self._kept_parts = self.parts(self.kept_gradients)
+        self.pull(records, cotangents, self.kept_gradients, None)
+        for tensor, part in zip(self.tensors, self._kept_parts):
+            tensor.grad = part
+
+    def gradients_of(self, parameters: Sequence[Tensor]) -> Array | None:
+        """Return the gradients of all parameters, if these are they and have those that `set_gradients` wrote."""
+        if len(parameters) != len(self._kept_parts):
+            return None
+        same = zip(parameters, self.tensors, self._kept_parts)
+        return self.kept_gradients if all(p is own and p.grad is part for p, own, part in same) else None
+
+    def pull(self, records: _Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
+        """Write the gradients of the parameters, laid out as these, of cotangents (S, B, out), and that of x."""
         from qrlsuite.compiled import networks
 
         pair, turned, sums = (_Records(*shape) for shape in self.shapes_of_work)
-        gradients = np.empty_like(self.parameters)
         networks.backward(
             cotangents,
             self.parameters,
@@ -123,7 +140,6 @@ class Sweep:
             np.empty((1, 1, 1), np.float32) if x_gradient is None else x_gradient,
             x_gradient is not None,
         )
-        return gradients
 
     def parts(self, gradients: Array) -> list[Tensor]:
         """Return the gradients of each weight and bias, in the order of the layers."""
@@ -169,7 +185,7 @@ def joined(tensors: Sequence[Tensor]) -> Array:
 
 
 @functools.lru_cache(256)
-def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple[int, int, int]]]:
+def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple[str, int, int, int]]]:
     """Return the activation's code, the rows of a record, and the shapes of a backward pass's working memory."""
     from qrlsuite.compiled import networks
 
@@ -177,7 +193,7 @@ def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple
     vector = vectors.lanes(np.float32)
     widest = -(-max(sizes) // vector) * vector
     sums = sum(min(pair) * -(-max(pair) // vector) for pair in itertools.pairwise(sizes))
-    shapes = [(2, widest, 2 * vector), (1, 2 * vector, widest), (1, sums, vector)]
+    shapes = [("pair", 2, widest, 2 * vector), ("turned", 1, 2 * vector, widest), ("sums", 1, sums, vector)]
     return code, networks.record_rows(sizes, code, vector), shapes
 
 
@@ -210,14 +226,14 @@ def _misfit(x: Sequence[int] | None, shapes: Sequence[Sequence[int]]) -> ValueEr
 class _Records:
     """Memory (n, rows, wide) of a pass, such as what a chunk of samples is in every layer; it then serves another."""
 
-    def __init__(self, number: int, rows: int, wide: int) -> None:
-        self.key = rows, wide
+    def __init__(self, purpose: str, number: int, rows: int, wide: int) -> None:
+        self.key = purpose, rows, wide
         room = _spare.pop(self.key, None)
         if room is None or len(room) < number:
             room = vectors.aligned((number, rows, wide), np.float32)
         self.array = room
 
-    def __del__(self, spare: dict[tuple[int, int], Any] = _spare, most: int = SPARE_BYTES) -> None:
+    def __del__(self, spare: dict[tuple[str, int, int], Any] = _spare, most: int = SPARE_BYTES) -> None:
         if self.array.nbytes <= most:  # names of the module may be gone when the interpreter ends
             spare[self.key] = self.array
 
@@ -244,5 +260,6 @@ class _Perceptron(torch.autograd.Function):
         x_gradient = None
         if ctx.needs_input_grad[0]:
             x_gradient = np.empty((*cotangent.shape[:2], sweep.sizes[0]), np.float32)
-        gradients = sweep.gradients(ctx.records, cotangent, x_gradient)
+        gradients = np.empty_like(sweep.parameters)
+        sweep.pull(ctx.records, cotangent, gradients, x_gradient)
         return None if x_gradient is None else torch.from_numpy(x_gradient), None, *sweep.parts(gradients)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -21,12 +19,12 @@ def tabular(transition: list[float]) -> DDQN:
     made.online = Table(torch.tensor([[[0.5, -3.0], [1.0, 2.0]]]))
     made.target = Table(torch.tensor([[[7.0, 7.0], [10.0, 5.0]]]))
     made.adam = Adam(made.online, 1e-3, 1e-3)
-    made.buffer = torch.tensor([[transition]], dtype=torch.float32)
+    made.replay.rows, made.replay.stored = torch.tensor([[transition]], dtype=torch.float32), 1
     return made
 
 
 def loss(made: DDQN) -> float:
-    return float(made._learn(torch.zeros((1, 1), dtype=torch.int64))[0])
+    return float(made._learn(torch.zeros((1, 1), dtype=torch.float64))[0])
 
 
 def test_the_online_network_picks_and_the_target_network_rates() -> None:
@@ -42,18 +40,19 @@ def test_first_update_is_that_of_an_independent_computation() -> None:
     group = Group("ddqn", [3, 4], Contexts(2), batch=8, buffer=20, lr=2e-3, gamma=0.9)
     made: DDQN = group.algorithm
     generator = torch.Generator().manual_seed(1)
-    made.buffer = torch.randn(made.buffer.shape, generator=generator)
-    made.buffer[..., 8] = torch.randint(3, (2, 20), generator=generator)
-    made.buffer[..., 10] = torch.randint(2, (2, 20), generator=generator)
+    rows = made.replay.rows
+    rows[:], made.replay.stored = torch.randn(rows.shape, generator=generator), 20
+    rows[..., 8] = torch.randint(3, (2, 20), generator=generator)
+    rows[..., 10] = torch.randint(2, (2, 20), generator=generator)
     for parameter in made.target.parameters():
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     picked = torch.randint(20, (2, 8), generator=generator)
     online = [Perceptron(made.online, s) for s in range(2)]
     target = [Perceptron(made.target, s) for s in range(2)]
-    losses = made._learn(picked).numpy()
+    losses = made._learn((picked + 0.5).double() / 20).numpy()
     for s in range(2):
-        rows = made.buffer[s].numpy().astype(np.float64)[picked[s].numpy()]
-        states, following, (action, reward, alive) = rows[:, :4], rows[:, 4:8], rows[:, 8:].T
+        batch = rows[s].numpy().astype(np.float64)[picked[s].numpy()]
+        states, following, (action, reward, alive) = batch[:, :4], batch[:, 4:8], batch[:, 8:].T
         action = action.astype(int)
         best = online[s](following).argmax(1)
         y = reward + 0.9 * alive * target[s](following)[range(8), best]
@@ -97,34 +96,38 @@ def test_buffer_wraps_around() -> None:
     """Environment e's step t has reward t + 1: after three rounds of two, the sixth transition replaces the first."""
     group = Group("ddqn", [0], Clock([9, 9]), buffer=5, batch=2).start()
     group.algorithm.train_epoch(3)
-    rewards, lanes = group.algorithm.buffer[0, :, 7], group.algorithm.buffer[0, :, 1]
+    rewards, lanes = group.algorithm.replay.rows[0, :, 7], group.algorithm.replay.rows[0, :, 1]
     assert rewards.tolist() == [3, 1, 2, 2, 3]
     assert lanes.tolist() == pytest.approx([0.1, 0.1, 0, 0.1, 0])
-    assert group.algorithm.stored == 6
+    assert group.algorithm.replay.stored == 6
 
 
 def test_batches_are_drawn_from_what_the_buffer_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     group = Group("ddqn", [0, 1], Clock([9] * 4), buffer=7, batch=64).start()
-    seen: list[np.ndarray[Any, Any]] = []
-    learn = group.algorithm._learn
+    replay, seen = group.algorithm.replay, []
+    draw = replay.batch
 
-    def spy(picked: torch.Tensor) -> torch.Tensor:
-        seen.append(picked.numpy())
-        result: torch.Tensor = learn(picked)
-        return result
+    def spy(draws: torch.Tensor) -> dict[str, torch.Tensor]:
+        batch: dict[str, torch.Tensor] = draw(draws)
+        held = replay.rows[:, : replay.filled].clone()
+        seen.append((batch, held))
+        return batch
 
-    monkeypatch.setattr(group.algorithm, "_learn", spy)
+    monkeypatch.setattr(replay, "batch", spy)
     group.algorithm.train_epoch(5)
-    for picked, filled in zip(seen, (2, 4, 6, 7, 7)):
-        assert picked.shape == (2, 64)
-        assert set(picked.ravel().tolist()) == set(range(filled))
+    for (batch, held), filled in zip(seen, (2, 4, 6, 7, 7)):
+        rows = torch.cat([batch[name] for name in replay.columns], 2)
+        assert rows.shape == (2, 64, 9)
+        for s in range(2):
+            assert set(map(tuple, rows[s].tolist())) == set(map(tuple, held[s].tolist()))
+            assert held.shape[1] == filled
 
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_an_episode_ends_where_it_arrived_not_where_the_next_begins(cut: bool) -> None:
     group = Group("ddqn", [0], Clock([2], cut), buffer=4, batch=2).start()
     group.algorithm.train_epoch(3)
-    rows = group.algorithm.buffer[0]
+    rows = group.algorithm.replay.rows[0]
     assert rows[:3, 0].tolist() == pytest.approx([0.0, 0.1, 0.0])  # where each step began
     assert rows[:3, 3].tolist() == pytest.approx([0.1, 0.2, 0.1])  # where it arrived
     assert rows[:3, 8].tolist() == [1, 1 if cut else 0, 1]  # only a termination ends the future
