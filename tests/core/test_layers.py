@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ import torch
 from torch import Tensor
 
 from qrlsuite.compiled import networks, perceptron, vectors
-from qrlsuite.population import ACTIVATIONS, Adam, layers
+from qrlsuite.plugins.models import mlp
+from qrlsuite.population import ACTIVATIONS, Adam, chosen_errors, layers
 
 SIZES = [(3, 16, 16, 3), (3, 10, 1), (5, 7), (1, 1, 1), (2, 33, 18, 64, 4), (40, 8, 2)]
 
@@ -198,6 +201,55 @@ def test_threads_do_not_share_records() -> None:
     with ThreadPoolExecutor(4) as pool:
         for found, own in zip(pool.map(work, inputs), expected):
             assert all(torch.equal(a, b) for a, b in zip(found, own))
+
+
+class Behind(torch.nn.Module):
+    """A population of which nobody knows that it is one sweep."""
+
+    def __init__(self, population: torch.nn.Module) -> None:
+        super().__init__()
+        self.inner = population
+        self.compiled = True
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.inner(x)
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh", "sin", "none"])
+@pytest.mark.parametrize(("seeds", "batch", "scale"), [(3, 64, 1.0), (1, 7, 1.0), (2, 50, 0.5)])
+def test_errors_without_autograd_have_its_bits_and_those_of_the_steps_that_follow(
+    activation: Literal["relu", "tanh", "sin", "none"], seeds: int, batch: int, scale: float
+) -> None:
+    options = mlp.MLPOptions(width=12, activation=activation, input_scale=scale)
+    g = torch.Generator().manual_seed(3)
+    ours = mlp.population([mlp.build(3, 4, options, g) for _ in range(seeds)], options)
+    theirs = Behind(copy.deepcopy(ours))
+    adams = [Adam(each, 0.01, 0.01) for each in (ours, theirs)]
+    for _ in range(3):
+        x, aims = torch.randn(seeds, batch, 3, generator=g), torch.randn(seeds, batch, generator=g)
+        chosen = torch.randint(4, (seeds, batch), generator=g)
+        errors = [chosen_errors(each, x, chosen, aims) for each in (ours, theirs)]
+        assert torch.equal(*errors)
+        for p, q in zip(ours.parameters(), theirs.parameters()):
+            assert torch.equal(p.grad, q.grad)  # type: ignore[arg-type]
+        for adam in adams:
+            adam.step()
+        assert all(torch.equal(p, q) for p, q in zip(ours.parameters(), theirs.parameters()))
+    assert (ours.sweep() is None) == (activation == "tanh" or scale != 1.0)
+
+
+def test_a_moved_or_changed_parameter_is_seen() -> None:
+    options = mlp.MLPOptions(width=12)
+    g = torch.Generator().manual_seed(3)
+    population = mlp.population([mlp.build(3, 4, options, g) for _ in range(2)], options)
+    x = torch.randn(2, 5, 3)
+    before = population(x)
+    population.w1.data = population.w1.data * 2.0  # type: ignore[operator, union-attr]
+    moved = population(x)
+    assert not torch.equal(before, moved)
+    population.load_state_dict({name: p * 0.5 for name, p in population.state_dict().items()})
+    torch.testing.assert_close(population(x).double(), copy.deepcopy(population).double()(x.double()))
+    assert population.double()(x.double()).dtype == torch.float64
 
 
 def test_records_are_used_again() -> None:
