@@ -162,7 +162,7 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
     """
     compiled = _sweep_of(population)
     if compiled is None or not compilable(x, aims):
-        errors = population(x).gather(2, chosen[..., None]).squeeze(2) - aims
+        errors: Tensor = population(x).gather(2, chosen[..., None]).squeeze(2) - aims
         gradients(errors.square().mean(1).sum(), population)
         return errors.detach()
     from qrlsuite.compiled import networks
@@ -583,7 +583,7 @@ class Adam:
         )
         return True
 
-    def _lay_out(self, parameters: list[Tensor]) -> tuple[Any, ...]:
+    def _lay_out(self, parameters: Sequence[Tensor]) -> tuple[Any, ...]:
         """Return where parameters are; they and both moments, each in one block; sizes and learning rates."""
         from qrlsuite.compiled.perceptron import in_one_block, joined
 

@@ -80,8 +80,8 @@ class Replay:
         seeds, batch = draws.shape
         out = torch.empty(seeds * batch * self._borders[-1])
         pick(self.rows.numpy(), draws.contiguous().numpy(), self.filled, self._places, out.numpy())
-        widths = self.columns.values()
-        parts = out.split([seeds * batch * width for width in widths])
+        widths = list(self.columns.values())
+        parts = torch.split(out, [seeds * batch * width for width in widths])
         return {
             name: part.view(seeds, batch, width) for (name, width), part in zip(self.columns.items(), parts)
         }
