@@ -12,7 +12,7 @@ _HERE = "qrlsuite.plugins.circuits"
 
 @hookimpl
 def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
-    """Register `iqp`, `cx`, `cz` and `skolik`."""
+    """Register the paper's three structures, and the circuits of other papers."""
     for name, summary, options in (
         (
             "iqp",
@@ -22,8 +22,35 @@ def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
         ("cx", "A gate on every qubit, then a ring of CNOTs; options: gate, entangled", "GateOptions"),
         ("cz", "A gate on every qubit, then a ring of CZs; options: gate, entangled", "GateOptions"),
         ("skolik", "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs", "NoOptions"),
+        (
+            "jerbi",
+            "Trained rotations, a ring of CZs and the observation by turns; option: entangled",
+            "EntangledOptions",
+        ),
+        (
+            "hsiao",
+            "Qubits without entanglement: the observation and RX in every layer; options: encoding, entangled",
+            "HsiaoOptions",
+        ),
+        (
+            "perez-salinas",
+            "Universal re-uploading: the whole observation on every qubit, CZs between layers; options: inputs, "
+            "entangled",
+            "PerezSalinasOptions",
+        ),
+        (
+            "wang",
+            "Re-uploading on a GHZ or graph state, which is undone behind it; options: state, edges, entangled",
+            "WangOptions",
+        ),
+        (
+            "basic",
+            "The observation encoded once, as angles or bits, then RX and rings of CNOTs; options: encoding, entangled",
+            "BasicOptions",
+        ),
     ):
-        register(AnsatzSpec(name, summary, f"{_HERE}.ansatz:{options}", f"{_HERE}.ansatz:{name}"))
+        build = f"{_HERE}.ansatz:{name.replace('-', '_')}"
+        register(AnsatzSpec(name, summary, f"{_HERE}.ansatz:{options}", build))
 
 
 @hookimpl

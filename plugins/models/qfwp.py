@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
 from qrlsuite.plugins.models.mlp import initial_layer
-from qrlsuite.plugins.models.qlstm import QLSTMOptions, Remembering, initial
+from qrlsuite.plugins.models.qlstm import QLSTMOptions, Remembering
 from qrlsuite.population import linear
 
 
@@ -87,7 +87,7 @@ class QFWP(Remembering):
         drawn = self._shot_seeds()
         each = None if drawn is None else [vqc._derived(seed, b) for seed in drawn for b in range(batch)]
         values = self.measured(inner.reshape(seeds * batch, 1, -1), parameters, each, batch)
-        return self.shown(values.view(seeds, batch, -1), own).to(x.dtype), after.to(x.dtype)
+        return self._shown(values.view(seeds, batch, -1), own).to(x.dtype), after.to(x.dtype)
 
 
 def build(
@@ -105,8 +105,8 @@ def build(
     runner = vqc._Runner(options)
     circuit = runner.circuit
     if not options.linear:
-        vqc._require_fit(circuit, obs_dim, out_dim, role)
-    state = initial(runner, obs_dim, len(circuit.observables), out_dim, (), generator)
+        vqc._require_fit(runner, obs_dim, out_dim, role)
+    state = vqc.initial(runner, obs_dim, len(circuit.observables), out_dim, (), generator)
     shapes = _written(circuit)
     sizes = {"rows": next(iter(shapes.values()))[0], "columns": sum(size for _, size in shapes.values())}
     for name, size in sizes.items():

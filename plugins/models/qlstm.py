@@ -39,10 +39,9 @@ from torch import Tensor, nn
 
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.models import vqc
-from qrlsuite.plugins.models.mlp import initial_layer
 from qrlsuite.plugins.models.recurrent import lstm_step
 from qrlsuite.plugins.models.vqc import VQCOptions
-from qrlsuite.population import ACTIVATIONS, linear
+from qrlsuite.population import ACTIVATIONS
 
 GATES = 4
 
@@ -53,7 +52,7 @@ class QLSTMOptions(VQCOptions):
 
     qubits: Annotated[int, Field(ge=1, le=20, description="qubits of each circuit, and numbers of h")] = 4
     layers: Annotated[int, Field(ge=1, le=256, description="layers of each circuit")] = 2
-    ansatz: Annotated[str, Field(description="circuit family: iqp, cx, cz, skolik, or a plugin's")] = "cz"
+    ansatz: Annotated[str, Field(description="circuit family, see qrlsuite list ansatzes")] = "cz"
 
 
 class Remembering(vqc._Hybrid):
@@ -107,13 +106,6 @@ class Remembering(vqc._Hybrid):
             values.register_hook(lambda grad: executions.count_backward(circuits))  # type: ignore[no-untyped-call]
         return ACTIVATIONS[self._runner.options.activation_out](values)
 
-    def shown(self, values: Tensor, own: dict[str, Tensor]) -> Tensor:
-        """Return outputs (S, B, out) by what is behind the circuits."""
-        if self._runner.options.linear:
-            return linear(values, own["output.weight"], own["output.bias"])
-        factors = own["output.weight"][:, None]
-        return values[..., : factors.shape[2]] * factors
-
 
 class QLSTM(Remembering):
     """Quantum LSTM; parameters of circuits have an axis of the four gates, behind S in a population."""
@@ -130,7 +122,7 @@ class QLSTM(Remembering):
         )
         values = self.measured(given, parameters, each, GATES * batch).view(seeds, GATES, batch, -1)
         after = lstm_step(values[..., :width].transpose(1, 2).flatten(2), before.to(values.dtype))
-        return self.shown(after[..., :width], own).to(x.dtype), after.to(x.dtype)
+        return self._shown(after[..., :width], own).to(x.dtype), after.to(x.dtype)
 
 
 def build(
@@ -154,44 +146,8 @@ def build(
             f"{obs_dim} observations and {out_dim} outputs: choose {obs_dim + out_dim} qubits or more, so that the "
             "inputs beyond the observations are as many as the outputs or more"
         )
-    state = initial(runner, obs_dim + width, width, out_dim, (GATES,), generator)
+    state = vqc.initial(runner, obs_dim + width, width, out_dim, (GATES,), generator)
     return QLSTM(runner, state, 2 * width)
-
-
-def initial(
-    runner: vqc._Runner,
-    inputs: int,
-    values: int,
-    outputs: int,
-    copies: tuple[int, ...],
-    generator: torch.Generator,
-) -> dict[str, Tensor]:
-    """Draw an agent's parameters, as `vqc` does.
-
-    Parameters
-    ----------
-    inputs, values, outputs:
-        Numbers before the circuits, of their expectation values that are shown, and behind the last layer.
-    copies:
-        How many values each parameter of the circuit has, as a shape.
-    """
-    circuit, options = runner.circuit, runner.options
-    state: dict[str, Tensor] = {}
-    if options.linear:
-        state["input.weight"], state["input.bias"] = initial_layer(inputs, circuit.inputs, "torch", generator)
-    for name, parameter in circuit.parameters.items():
-        uniform = torch.rand((*copies, *parameter.shape), generator=generator)
-        state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
-        if name in vqc._scales(circuit):
-            state[f"circuit.{name}"] *= options.init_scale
-    if options.linear:
-        state["output.weight"], state["output.bias"] = initial_layer(values, outputs, "torch", generator)
-    else:
-        state["output.weight"] = torch.ones(outputs)
-    state = {name: value.to(getattr(torch, options.dtype)) for name, value in state.items()}
-    state["shot_key"] = torch.randint(2**63 - 1, (), generator=generator)
-    state["shot_count"] = torch.zeros((), dtype=torch.int64)
-    return state
 
 
 def population(modules: Sequence[Any], options: VQCOptions) -> nn.Module:

@@ -6,6 +6,11 @@ whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3
 layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as in earlier work on CartPole (Jerbi
 et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
 
+`readout` measures other products of Z than the circuit's own: pairs as in Skolik, Jerbi & Dunjko (2022) on CartPole, or
+the product of all as in Jerbi et al. (2021). `output_reuse` and `output_scale` are the classes OutputReuse and
+OutputScale of SimplyQRL (Lazaro, Vazquez & Bringas 2025, arXiv:2511.17112; scales begin at 2 there). Repeated values
+before a linear layer add no function: each weight becomes a sum of several, with other initial values and steps.
+
 What an algorithm asks for, logits, values, means and logarithms of spreads, are outputs like any other. Expectation
 values lie in -1 .. 1, and what is behind the circuit takes them elsewhere. Means are in halves of an action's range,
 or pass through a hyperbolic tangent, so they are needed there. Values may be hundreds, and Adam moves a weight by its
@@ -21,6 +26,7 @@ One module serves all backends; the models differ in which backend computes the 
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Sequence
 from dataclasses import field, fields
 from typing import Annotated, Any, ClassVar, Literal, cast
@@ -33,7 +39,8 @@ from torch import Tensor, nn
 
 from qrlsuite import registry, specs
 from qrlsuite.circuit import Circuit, CircuitBackend, ExecutionCounter, ansatz, create_backend, options_on
-from qrlsuite.circuit.description import in_bases, mean_field_refusal
+from qrlsuite.circuit.api import require_computable
+from qrlsuite.circuit.description import in_bases
 from qrlsuite.circuit.resources import shift_evaluations
 from qrlsuite.errors import OptionError, QrlSuiteError, nearest
 from qrlsuite.options import Since, Tuned, field_names, without_later
@@ -45,6 +52,7 @@ NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
 """Bytes of circuit states that the two simulators keep at most, except that PennyLane takes at least one seed."""
 
 Activation = Literal["none", "relu", "tanh"]
+Readout = Literal["ansatz", "single", "pairs", "neighbors", "all-pairs", "product"]
 OptionValue = bool | int | float | str
 
 
@@ -58,7 +66,7 @@ class VQCOptions:
 
     qubits: Annotated[int, Field(ge=1, le=20, description="qubits of the circuit")] = 10
     layers: Annotated[int, Field(ge=1, le=256, description="layers of the circuit")] = 4
-    ansatz: Annotated[str, Field(description="circuit family: iqp, cx, cz, skolik, or a plugin's")] = "iqp"
+    ansatz: Annotated[str, Field(description="circuit family, see qrlsuite list ansatzes")] = "iqp"
     gate: Annotated[
         Literal["rot", "xyz", "u3"], Field(description="variational gate, for the ansatzes that offer it")
     ] = "rot"
@@ -109,6 +117,29 @@ class VQCOptions:
         ),
         Since("0.2.0"),
     ] = 1.0
+    readout: Annotated[
+        Readout,
+        Field(
+            description="what is measured: ansatz, as it says (mostly Z of each qubit); single, Z of each qubit; "
+            "products of Z: pairs (Z0 Z1, Z2 Z3, ...), neighbors in a ring, all-pairs, or the product of all"
+        ),
+        Since("0.2.0"),
+    ] = "ansatz"
+    output_reuse: Annotated[
+        int,
+        Field(ge=1, le=64, description="how many times the expectation values are given to what is behind"),
+        Since("0.2.0"),
+    ] = 1
+    output_scale: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="initial value of a trained factor on each output; without linear layers there is one "
+            "anyway, at first 1",
+        ),
+        Since("0.2.0"),
+    ] = None
     critic: Annotated[
         Literal["circuit", "mlp"],
         Field(
@@ -158,8 +189,7 @@ class VQCOptions:
                 f"init_scale = {self.init_scale:g}: the circuit of ansatz '{self.ansatz}' multiplies no input by a "
                 "parameter"
             )
-        if circuit.mean_field and not registry.get(specs.CircuitBackendSpec, self.backend).mean_field:
-            raise OptionError(mean_field_refusal(self.backend))
+        require_computable(circuit, self.backend)
 
 
 class _Runner:
@@ -197,12 +227,14 @@ class _Runner:
 
 
 class _Affine(nn.Module):
-    """Holds `weight` (S, out, in) and `bias` (S, out), or without S in one agent's module."""
+    """Holds `weight` (S, out, in), `bias` (S, out) and perhaps `factor` (S, out); one agent's module has no S."""
 
-    def __init__(self, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, weight: Tensor, bias: Tensor, factor: Tensor | None = None) -> None:
         super().__init__()
         self.weight = nn.Parameter(weight)
         self.bias = nn.Parameter(bias)
+        if factor is not None:
+            self.factor = nn.Parameter(factor)
 
 
 class _Factors(nn.Module):
@@ -234,7 +266,7 @@ class _Hybrid(nn.Module):
             }
         )
         self.output: nn.Module = (
-            _Affine(state["output.weight"], state["output.bias"])
+            _Affine(state["output.weight"], state["output.bias"], state.get("output.factor"))
             if runner.options.linear
             else _Factors(state["output.weight"])
         )
@@ -296,11 +328,18 @@ class _Hybrid(nn.Module):
         executions.count_forward(inputs)
         if values.requires_grad:
             values.register_hook(lambda grad: executions.count_backward(inputs))  # type: ignore[no-untyped-call]
-        values = ACTIVATIONS[options.activation_out](values)
+        return self._shown(ACTIVATIONS[options.activation_out](values), state).to(x.dtype)
+
+    def _shown(self, values: Tensor, state: dict[str, Tensor]) -> Tensor:
+        """Return outputs (S, B, out) by what is behind the circuit."""
+        options = self._runner.options
+        if options.output_reuse > 1:
+            values = values.repeat(1, 1, options.output_reuse)
         if options.linear:
-            return linear(values, state["output.weight"], state["output.bias"]).to(x.dtype)
+            outputs = linear(values, state["output.weight"], state["output.bias"])
+            return outputs if options.output_scale is None else outputs * state["output.factor"][:, None]
         factors = state["output.weight"][:, None]  # (S, 1, out)
-        return (values[..., : factors.shape[2]] * factors).to(x.dtype)
+        return values[..., : factors.shape[2]] * factors
 
     def _shot_seeds(self) -> list[int] | None:
         """Return this pass's sampling seed of every agent, from its key and the number of its passes so far."""
@@ -355,14 +394,33 @@ def build_circuit(options: VQCOptions) -> Circuit:
     Raises
     ------
     OptionError
-        If the ansatz has no such option or size.
+        If the ansatz has no such option or size, or not the qubits that the readout needs.
     """
     ansatz_options: dict[str, Any] = dict(options.ansatz_options)
     if "gate" in field_names(specs.resolve(registry.get(specs.AnsatzSpec, options.ansatz).options)):
         ansatz_options.setdefault("gate", options.gate)
     elif options.gate != "rot":
         raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")
-    return ansatz(options.ansatz, options.qubits, options.layers, **ansatz_options)
+    circuit = ansatz(options.ansatz, options.qubits, options.layers, **ansatz_options)
+    if options.readout != "ansatz":
+        circuit.measure(_observables(circuit.qubits, options.readout))
+    return circuit
+
+
+def _observables(qubits: int, readout: Readout) -> list[tuple[int, ...]]:
+    """Return the qubits of every product of Z that a readout measures."""
+    if readout == "single":
+        return [(q,) for q in range(qubits)]
+    if readout == "product":
+        return [tuple(range(qubits))]
+    if qubits < 2 or (readout == "pairs" and qubits % 2):
+        needed = "an even number of qubits" if readout == "pairs" else "2 qubits or more"
+        raise OptionError(f"readout = '{readout}' with qubits = {qubits}: it needs {needed}")
+    if readout == "pairs":
+        return [(q, q + 1) for q in range(0, qubits, 2)]
+    if readout == "neighbors":
+        return [(q, (q + 1) % qubits) for q in range(qubits if qubits > 2 else 1)]
+    return list(itertools.combinations(range(qubits), 2))
 
 
 def _scales(circuit: Circuit) -> set[str]:
@@ -396,33 +454,55 @@ def build(
         return mlp.build(obs_dim, out_dim, mlp.MLPOptions(), generator)
     runner = _Runner(options)
     circuit = runner.circuit
+    if not options.linear:
+        _require_fit(runner, obs_dim, out_dim, role)
+    return VQC(runner, initial(runner, obs_dim, len(circuit.observables), out_dim, (), generator))
+
+
+def initial(
+    runner: _Runner,
+    inputs: int,
+    values: int,
+    outputs: int,
+    copies: tuple[int, ...],
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """Draw an agent's parameters.
+
+    Parameters
+    ----------
+    inputs, values, outputs:
+        Numbers before the circuits, of their expectation values that are shown, and behind the last layer.
+    copies:
+        How many values each parameter of the circuit has, as a shape.
+    """
+    circuit, options = runner.circuit, runner.options
     state: dict[str, Tensor] = {}
     if options.linear:
-        state["input.weight"], state["input.bias"] = initial_layer(
-            obs_dim, circuit.inputs, "torch", generator
-        )
-    else:
-        _require_fit(circuit, obs_dim, out_dim, role)
+        state["input.weight"], state["input.bias"] = initial_layer(inputs, circuit.inputs, "torch", generator)
     for name, parameter in circuit.parameters.items():
-        uniform = torch.rand(parameter.shape, generator=generator)
+        uniform = torch.rand((*copies, *parameter.shape), generator=generator)
         state[f"circuit.{name}"] = parameter.low + (parameter.high - parameter.low) * uniform
         if name in _scales(circuit):
             state[f"circuit.{name}"] *= options.init_scale
     if options.linear:
         state["output.weight"], state["output.bias"] = initial_layer(
-            len(circuit.observables), out_dim, "torch", generator
+            values * options.output_reuse, outputs, "torch", generator
         )
+        if options.output_scale is not None:
+            state["output.factor"] = torch.full((outputs,), options.output_scale)
     else:
-        state["output.weight"] = torch.ones(out_dim)
+        state["output.weight"] = torch.full((outputs,), options.output_scale or 1.0)
     state = {name: value.to(getattr(torch, options.dtype)) for name, value in state.items()}
     state["shot_key"] = torch.randint(2**63 - 1, (), generator=generator)
     state["shot_count"] = torch.zeros((), dtype=torch.int64)
-    return VQC(runner, state)
+    return state
 
 
-def _require_fit(circuit: Circuit, inputs: int, outputs: int, role: str) -> None:
+def _require_fit(runner: _Runner, inputs: int, outputs: int, role: str) -> None:
     """Refuse a circuit that cannot stand without linear layers."""
-    values = len(circuit.observables)
+    circuit = runner.circuit
+    values = len(circuit.observables) * runner.options.output_reuse
     if circuit.inputs == inputs and values >= outputs:
         return
     advice = "choose the qubits so that the inputs are as many, and the expectation values no fewer"
@@ -471,7 +551,8 @@ def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int
 
 def _entangled(options: VQCOptions) -> bool:
     """Return whether the circuit has a state of several qubits."""
-    return options.ansatz_options.get("entangled", True) is True
+    circuit = build_circuit(options)
+    return not circuit.mean_field and max(map(len, circuit.components())) > 1
 
 
 def _backend_options(options: VQCOptions) -> dict[str, Any]:

@@ -301,15 +301,31 @@ def _backend(name: str, circuit: Circuit, options: Mapping[str, Any]) -> tuple[C
     from qrlsuite import registry, specs
 
     spec = registry.get(specs.CircuitBackendSpec, name)
+    require_computable(circuit, name)
+    return spec, option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
+
+
+def require_computable(circuit: Circuit, backend: str) -> None:
+    """Refuse a circuit of a kind that a registered backend does not compute.
+
+    Raises
+    ------
+    UnknownNameError
+        If no backend has that name.
+    OptionError
+        For a mean-field approximation, or products of Paulis, where the backend has none; for both together.
+    """
+    from qrlsuite import registry, specs
+
+    spec = registry.get(specs.CircuitBackendSpec, backend)
     if circuit.mean_field and not spec.mean_field:
-        raise OptionError(mean_field_refusal(name))
+        raise OptionError(mean_field_refusal(backend))
     if circuit.measures_products and not spec.products:
-        raise OptionError(f"backend '{name}' measures Paulis of single qubits, and not products of them")
+        raise OptionError(f"backend '{backend}' measures Paulis of single qubits, and not products of them")
     if circuit.measures_products and circuit.mean_field:
         raise OptionError(
             "a mean-field approximation has no correlations, and so no products of Paulis to measure"
         )
-    return spec, option_values.build(specs.resolve(spec.options), options, f"circuit backend '{name}'")
 
 
 class _Prepared(threading.local):

@@ -321,3 +321,72 @@ def test_without_linear_layers_the_circuit_stands_alone(backend):
 def test_without_linear_layers_sizes_must_fit(obs, out):
     with pytest.raises(OptionError, match=f"3 expectation values, the network {obs} inputs and {out} out"):
         agents(1, small(qubits=3, linear=False), obs=obs, out=out)
+
+
+@pytest.mark.parametrize(
+    ("readout", "qubits", "observables"),
+    [
+        ("ansatz", 3, (0, 1, 2)),
+        ("single", 3, (0, 1, 2)),
+        ("pairs", 4, ((0, 1), (2, 3))),
+        ("neighbors", 3, ((0, 1), (1, 2), (2, 0))),
+        ("neighbors", 2, ((0, 1),)),
+        ("all-pairs", 3, ((0, 1), (0, 2), (1, 2))),
+        ("product", 3, ((0, 1, 2),)),
+        ("product", 1, (0,)),
+    ],
+)
+def test_readouts_are_products_of_z(readout, qubits, observables):
+    given = small("native", ansatz="skolik", qubits=qubits, readout=readout)
+    assert vqc.build_circuit(given).observables == observables
+    module = agents(1, given)[0]
+    assert module.output.weight.shape == (3, len(observables))
+    assert module(observations(5, 3)).shape == (5, 3)
+    assert ("readout" in options.identity(given)) == (readout != "ansatz")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"readout": "pairs"}, "readout = 'pairs' with qubits = 3: it needs an even number of qubits"),
+        ({"readout": "neighbors", "qubits": 1}, "'neighbors' with qubits = 1: it needs 2 qubits or more"),
+        ({"readout": "product", "ansatz_options": {"entangled": "mean-field"}}, "has no correlations"),
+    ],
+)
+def test_readouts_that_cannot_be_are_refused_at_once(values, message):
+    with pytest.raises(OptionError, match=message):
+        small("native", ansatz="cz", **values).check()
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_values_are_repeated_and_outputs_scaled(linear):
+    """The definitions of SimplyQRL: copies side by side, then a layer, then a trained factor for each output."""
+    given = small(
+        "native", dtype="float64", linear=linear, readout="product", output_reuse=3, output_scale=2.0
+    )
+    modules = agents(2, given, out=2)
+    name = "output.factor" if linear else "output.weight"
+    assert torch.equal(modules[0].get_parameter(name), torch.full((2,), 2.0, dtype=torch.float64))
+    with torch.no_grad():
+        modules[0].get_parameter(name).copy_(torch.tensor([3.0, -1.0]))
+    together, x = vqc.population(modules, given), observations(2, 5, 3, dtype=torch.float64)
+    for s, module in enumerate(modules):
+        p = dict(module.named_parameters())
+        inner = x[s] @ p["input.weight"].T + p["input.bias"] if linear else x[s]
+        circuit = vqc.build_circuit(given)
+        quantum = {key: p[f"circuit.{key}"][None] for key in circuit.parameters}
+        shown = torch.cat([create_backend("pennylane", circuit)(inner[None], quantum)[0]] * 3, dim=1)
+        shown = shown @ p["output.weight"].T + p["output.bias"] if linear else shown[:, :2]
+        torch.testing.assert_close(module(x[s]), shown * p[name], atol=1e-9, rtol=0)
+        assert torch.equal(together(x)[s], module(x[s]))
+    faster = agents(1, small("native", output_rate=10.0, output_scale=2.0))[0].learning_rates()
+    assert faster == dict.fromkeys(("output.weight", "output.bias", "output.factor"), 10.0)
+
+
+def test_memory_is_counted_where_qubits_have_a_common_state():
+    def counted(**values):
+        return vqc.memory(small("native", qubits=4, **values), 1, 8, 1)
+
+    assert counted(ansatz="hsiao") == 0, "its qubits are apart"
+    assert counted(ansatz="hsiao", readout="product") == counted(ansatz="iqp") > 0
+    assert counted(ansatz="cz", ansatz_options={"entangled": "mean-field"}) == 0
