@@ -18,11 +18,17 @@ class PennyLaneOptions:
 
     device: Annotated[
         str,
-        Field(min_length=1, description="PennyLane device: default.qubit, lightning.qubit, or a plugin's"),
+        Field(
+            min_length=1,
+            description="PennyLane device: default.qubit, qrlsuite.native (fast), lightning.qubit, or a plugin's",
+        ),
     ] = "default.qubit"
     diff_method: Annotated[
         DiffMethod,
-        Field(description="auto: backprop on default.qubit, adjoint on lightning.*, else parameter-shift"),
+        Field(
+            description="auto: backprop on default.qubit, adjoint on qrlsuite.native and lightning.*, else "
+            "parameter-shift"
+        ),
     ] = "auto"
     shots: Annotated[
         int | None, Field(ge=1, description="repetitions per expectation value; absent: exact")

@@ -2,8 +2,8 @@
 
 Angles are computed in torch for all operations at once (`qrlsuite.circuit.angles`) and enter one QNode on
 PennyLane's broadcast axis, seeds and batch together (lane = s * B + b). `default.qubit` simulates the whole axis
-in one pass and is differentiated by backpropagation, as in the paper; devices that do not broadcast get
-PennyLane's own expansion into single circuits.
+in one pass and is differentiated by backpropagation, as in the paper; so does `qrlsuite.native`, the suite's own
+simulator, with adjoint gradients. Devices that do not broadcast get PennyLane's own expansion into single circuits.
 
 With a finite number of shots every seed is executed by itself, on a device seeded for it, and differentiated by
 the parameter-shift rule. PennyLane's rule refuses broadcast circuits, so the shifted angles are put on the
@@ -30,9 +30,15 @@ from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.plugins.circuits.options import PennyLaneOptions
 
-BROADCASTING = "default.qubit"
-"""The device that simulates the broadcast axis in one pass, and through which torch can differentiate.
+BACKPROP = "default.qubit"
+"""The device through which torch can differentiate.
 `default.mixed` broadcasts too, but copies angles on the way (PennyLane 0.45), which cuts off their gradient."""
+
+BROADCASTING = (BACKPROP, "qrlsuite.native")
+"""The devices that simulate the broadcast axis in one pass."""
+
+ADJOINT = ("lightning.", "qrlsuite.native")
+"""Beginnings of the names of devices with adjoint gradients of their own."""
 
 MEMORY = 2**30
 """Bytes that the states of one differentiated pass may take; more seeds are recomputed in the backward pass."""
@@ -44,6 +50,7 @@ vectors and without them in what is left over at the end, so that a lane's bits 
 SIMULATORS = (
     "default.",
     "lightning.",
+    "qrlsuite.",
     "reference.",
     "null.",
     "simulator",
@@ -203,7 +210,7 @@ class PennyLaneBackend:
         # The shift rule is applied outside, so that the QNode need not be differentiable.
         method = None if self.diff_method == "parameter-shift" else self.diff_method
         qnode = qml.QNode(measure, device, interface="torch", diff_method=method, shots=self.shots)
-        return qnode if self.options.device == BROADCASTING else qml.transforms.broadcast_expand(qnode)
+        return qnode if self.options.device in BROADCASTING else qml.transforms.broadcast_expand(qnode)
 
     def _device_arguments(self) -> set[str]:
         return set(inspect.signature(type(self._device)).parameters)
@@ -276,25 +283,21 @@ def _apply(operation: Operation, angles: list[Any]) -> None:
 
 def _diff_method(options: PennyLaneOptions) -> str:
     """Choose how to differentiate, or say why it cannot be done."""
-    broadcasting = options.device == BROADCASTING
+    backprop = options.device == BACKPROP
     if options.diff_method == "auto":
         if options.shots is not None:
             return "parameter-shift"
         return (
-            "backprop"
-            if broadcasting
-            else "adjoint"
-            if options.device.startswith("lightning.")
-            else "parameter-shift"
+            "backprop" if backprop else "adjoint" if options.device.startswith(ADJOINT) else "parameter-shift"
         )
     if options.shots is not None and options.diff_method != "parameter-shift":
         raise OptionError(
             f"diff_method = '{options.diff_method}' needs exact states; with shots = {options.shots} "
             "use 'parameter-shift' or 'auto'"
         )
-    if options.diff_method == "backprop" and not broadcasting:
+    if options.diff_method == "backprop" and not backprop:
         raise OptionError(
-            f"diff_method = 'backprop' is not possible on device '{options.device}', only on '{BROADCASTING}'; "
+            f"diff_method = 'backprop' is not possible on device '{options.device}', only on '{BACKPROP}'; "
             "use 'adjoint', 'parameter-shift' or 'auto'"
         )
     return options.diff_method

@@ -150,21 +150,27 @@ def _begin(t: Any, c: int, state: Any) -> None:
 
 
 @inlined
+def _take(t: Any, component: int, n: int, state: Any, gates: Any) -> None:
+    """Take every step of a component."""
+    for m in range(t.components[component, 3], t.components[component, 4]):
+        kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
+        if kind == ROTATE:
+            rotate(state, n, a, b, gates, c, d, t.steps[m, 5])
+        elif kind == HADAMARD:
+            hadamard(state, n, a, b, c)
+        elif kind == PERMUTE:
+            permute(state, t.cycles, a, b)
+        else:
+            flip(state, t.negative, a, b)
+
+
+@inlined
 def _run(t: Any, states: Any, gates: Any) -> None:
     """Bring every component into its final state."""
     for component in range(t.components.shape[0]):
         n, state = _component(t, component, states)
         _begin(t, component, state)
-        for m in range(t.components[component, 3], t.components[component, 4]):
-            kind, a, b, c, d = t.steps[m, 0], t.steps[m, 1], t.steps[m, 2], t.steps[m, 3], t.steps[m, 4]
-            if kind == ROTATE:
-                rotate(state, n, a, b, gates, c, d, t.steps[m, 5])
-            elif kind == HADAMARD:
-                hadamard(state, n, a, b, c)
-            elif kind == PERMUTE:
-                permute(state, t.cycles, a, b)
-            else:
-                flip(state, t.negative, a, b)
+        _take(t, component, n, state, gates)
 
 
 @inlined
@@ -389,3 +395,113 @@ def backward(
                     grad_inputs[seed, first + v, i] = slopes[i, v]
         for p in range(flat.shape[1]):
             grad_flat[seed, p] = total(load(sums, p))
+
+
+@inlined
+def _place(t: Any, record: Any, first: int) -> Any:
+    """Return the sines and cosines, and the blocks, of a program whose rows in a record begin at `first`."""
+    second = first + 2 * t.rotations.shape[0]
+    return record[first:second], record[second : second + 6 * (t.blocks.shape[0] - 1)]
+
+
+@kernel
+def advance(t: Any, angles: Any, records: Any, first: int, fresh: int, inputs: Any) -> None:
+    """Bring the states of all chunks through a program of one component, see `states`.
+
+    `angles` (1, B, A) are the program's inputs. `records` (K, R, V) hold the states in their first rows, and receive
+    what `retreat` needs from row `first` on. Where `fresh` is 1, states begin in |0...0>. `inputs` (A, V) is scratch.
+    """
+    for chunk in range(records.shape[0]):
+        trig, gates = _place(t, records[chunk], first)
+        fill_inputs(angles, 0, chunk * inputs.shape[1], inputs)
+        prepare(t, angles[0], 0, inputs, trig, gates)
+        n, state = _component(t, 0, records[chunk])
+        if fresh:
+            _begin(t, 0, state)
+        _take(t, 0, n, state, gates)
+
+
+@kernel
+def retreat(
+    t: Any,
+    angles: Any,
+    records: Any,
+    first: int,
+    psis: Any,
+    lams: Any,
+    inputs: Any,
+    overlap: Any,
+    slopes: Any,
+    gradient: Any,
+) -> None:
+    """Undo a program on psi and lambda of all chunks, (K, 2^(n + 1), V) each, and add to `gradient` (B, A).
+
+    `records` are what `advance` left; `inputs` and `slopes` (A, V) and `overlap` (4, V) are scratch.
+    """
+    lanes = inputs.shape[1]
+    zero = splat(inputs, 0.0)
+    for chunk in range(records.shape[0]):
+        trig, gates = _place(t, records[chunk], first)
+        fill_inputs(angles, 0, chunk * lanes, inputs)
+        for a in range(slopes.shape[0]):
+            store(slopes, a, zero)
+        _unrun(t, psis[chunk], lams[chunk], gates, trig, inputs, overlap, angles[0], 0, slopes[:0], slopes)
+        for v in range(min(lanes, gradient.shape[0] - chunk * lanes)):
+            for a in range(slopes.shape[0]):
+                gradient[chunk * lanes + v, a] += slopes[a, v]
+
+
+@kernel
+def words(terms: Any, weights: Any, owners: Any, qubits: int, records: Any, lane: Any, out: Any) -> None:
+    """Add the mean of every Pauli word to the value out (B, O) of the observable that owns it.
+
+    `terms` (W, 3): the bits that a word flips (X, Y), those that give a sign (Y, Z), and its number of Y. `weights`
+    (W,) are their coefficients, `owners` (W,) the observables. `lane` (1, V) is scratch.
+    """
+    lanes = lane.shape[1]
+    for chunk in range(records.shape[0]):
+        state = records[chunk]
+        for w in range(terms.shape[0]):
+            flips, signs, turns = terms[w, 0], terms[w, 1], terms[w, 2] & 3
+            mean = splat(lane, 0.0)
+            for i in range(1 << qubits):
+                re, im = load(state, 2 * i), load(state, 2 * i + 1)
+                if flips == 0:
+                    x = re * re + im * im
+                else:
+                    j = 2 * (i ^ flips)
+                    if turns & 1:  # -Im
+                        x = load(state, j + 1) * re - load(state, j) * im
+                    else:
+                        x = load(state, j) * re + load(state, j + 1) * im
+                mean = mean - x if _odd(i & signs) else mean + x
+            store(lane, 0, mean)
+            weight = -weights[w] if turns & 2 else weights[w]
+            for v in range(min(lanes, out.shape[0] - chunk * lanes)):
+                out[chunk * lanes + v, owners[w]] += weight * lane[0, v]
+
+
+@kernel
+def weigh_words(
+    terms: Any, weights: Any, owners: Any, qubits: int, records: Any, lane: Any, cotangent: Any, lams: Any
+) -> None:
+    """Add (sum_w weight_w cotangent_w P_w) psi to lambda of all chunks, (K, 2^(n + 1), V); see `words`."""
+    lanes = lane.shape[1]
+    zero = splat(lane, 0.0)
+    for chunk in range(records.shape[0]):
+        state, lam = records[chunk], lams[chunk]
+        for w in range(terms.shape[0]):
+            flips, signs, turns = terms[w, 0], terms[w, 1], terms[w, 2] & 3
+            weight = -weights[w] if turns & 2 else weights[w]
+            store(lane, 0, zero)
+            for v in range(min(lanes, cotangent.shape[0] - chunk * lanes)):
+                lane[0, v] = weight * cotangent[chunk * lanes + v, owners[w]]
+            factor = load(lane, 0)
+            for i in range(1 << qubits):
+                j = 2 * (i ^ flips)
+                g = zero - factor if _odd(i & signs) else factor
+                re, im = g * load(state, 2 * i), g * load(state, 2 * i + 1)
+                if turns & 1:  # times i
+                    re, im = zero - im, re
+                store(lam, j, load(lam, j) + re)
+                store(lam, j + 1, load(lam, j + 1) + im)

@@ -94,7 +94,7 @@ def compile_circuit(circuit: Circuit) -> MeanFieldProgram:
 
     Gates are never collected: CRX and CRY in a row drop correlations twice.
     """
-    compiler = Compiler(circuit)
+    compiler = Compiler(circuit.parameters)
     steps: list[tuple[int, ...]] = []
     for operation in circuit:
         if operation.gate == "H":

@@ -26,14 +26,14 @@ counted in order: of n, the first is bit n - 1 of a basis state's index, the las
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.circuit.description import Angle, Circuit, Operation
+from qrlsuite.circuit.description import Angle, Circuit, Operation, Parameter
 from qrlsuite.errors import CircuitError
 
 AXIS_X, AXIS_Y, AXIS_Z, PHASE = 0, 1, 2, 3
@@ -141,10 +141,11 @@ class _Step:
 
 
 class _Steps:
-    """The steps of one component, as its gates come in."""
+    """The steps of one component, as its gates come in; `spare` Hadamards of it may join blocks."""
 
-    def __init__(self) -> None:
+    def __init__(self, spare: int) -> None:
         self.steps: list[_Step] = []
+        self.spare = spare
         self.joined = 0
 
     def find(self, touched: set[int], fits: Callable[[_Step], bool]) -> _Step | None:
@@ -169,7 +170,7 @@ class _Steps:
 
     def hadamard(self, bit: int) -> None:
         step = self.find({bit}, lambda s: s.control != NONE and bit in s.touched and bit not in s.hadamards)
-        if step is not None and self.joined < JOINED:
+        if step is not None and self.joined < self.spare:
             self.joined += 1
         else:
             step = self.find(
@@ -193,9 +194,10 @@ class _Steps:
 class Compiler:
     """The arrays of a program, as they grow component by component."""
 
-    def __init__(self, circuit: Circuit) -> None:
-        offsets = np.cumsum([0, *(p.size for p in circuit.parameters.values())])
-        self.offset = {name: int(start) for name, start in zip(circuit.parameters, offsets)}
+    def __init__(self, parameters: Mapping[str, Parameter]) -> None:
+        offsets = np.cumsum([0, *(p.size for p in parameters.values())])
+        self.offset = {name: int(start) for name, start in zip(parameters, offsets)}
+        self.parameters = sum(p.size for p in parameters.values())
         self.components: list[Component] = []
         self.steps: list[tuple[int, int, int, int, int, int]] = []
         self.angles: list[tuple[int, int, int]] = []
@@ -205,12 +207,12 @@ class Compiler:
         self.cycles: list[int] = []
         self.negative: list[int] = []
 
-    def component(self, operations: list[Operation], wires: list[int]) -> None:
-        """Append a connected component: the gates on these wires."""
+    def component(self, operations: Sequence[Operation], wires: Sequence[int], fresh: bool = True) -> None:
+        """Append a connected component: the gates on these wires, which begin in |0...0> where they are `fresh`."""
         n = len(wires)
         bit = {wire: n - 1 - place for place, wire in enumerate(wires)}
-        steps, first = _Steps(), len(self.steps)
-        opening, touched = 0, set[int]()
+        steps, first = _Steps(JOINED if fresh else 0), len(self.steps)
+        opening, touched = 0, set[int]() if fresh else set(bit.values())
         for operation in operations:
             bits = tuple(bit[wire] for wire in operation.wires)
             if operation.gate == "H" and bits[0] not in touched:
@@ -230,6 +232,28 @@ class Compiler:
         amplitude = sum(1 << c.qubits for c in self.components)
         place = sum(c.qubits for c in self.components)
         self.components.append(Component(n, amplitude, place, first, len(self.steps), opening, steps.joined))
+
+    def program(
+        self, inputs: int, products: Sequence[tuple[int, int]], observables: Sequence[int]
+    ) -> Program:
+        """Return what has grown as a program that measures these products and observables."""
+        return Program(
+            qubits=sum(c.qubits for c in self.components),
+            inputs=inputs,
+            parameters=self.parameters,
+            amplitudes=sum(1 << c.qubits for c in self.components),
+            components=np.array(self.components, np.int64),
+            steps=np.array(self.steps, np.int64).reshape(-1, 6),
+            angles=np.array(self.angles, np.int64).reshape(-1, 3),
+            constants=np.array(self.constants, np.float64),
+            rotations=np.array([r[:2] for r in self.rotations], np.int64).reshape(-1, 2),
+            factors=np.array([r[2] for r in self.rotations], np.float64),
+            blocks=np.array(self.blocks, np.int64),
+            cycles=np.array(self.cycles, np.int64),
+            negative=np.array(self.negative, np.int64),
+            products=np.array(products, np.int64).reshape(-1, 2),
+            observables=np.array(observables, np.int64),
+        )
 
     def step(self, step: _Step, qubits: int) -> None:
         """Lay a step out in the arrays."""
@@ -333,7 +357,7 @@ def compile_circuit(circuit: Circuit) -> Program:
         If gates connect more than `MAX_QUBITS` qubits.
     """
     circuit.require_simulable()
-    compiler = Compiler(circuit)
+    compiler = Compiler(circuit.parameters)
     places: dict[int, int] = {}
     components = circuit.components()
     member = {wire: number for number, wires in enumerate(components) for wire in wires}
@@ -354,20 +378,23 @@ def compile_circuit(circuit: Circuit) -> Program:
         first = compiler.components[component].bit
         products.append((component, sum(1 << (places[wire] - first) for wire in measured)))
         observables.append(circuit.qubits + len(products) - 1)
-    return Program(
-        qubits=circuit.qubits,
-        inputs=circuit.inputs,
-        parameters=circuit.parameter_count,
-        amplitudes=sum(1 << c.qubits for c in compiler.components),
-        components=np.array(compiler.components, np.int64),
-        steps=np.array(compiler.steps, np.int64).reshape(-1, 6),
-        angles=np.array(compiler.angles, np.int64).reshape(-1, 3),
-        constants=np.array(compiler.constants, np.float64),
-        rotations=np.array([r[:2] for r in compiler.rotations], np.int64).reshape(-1, 2),
-        factors=np.array([r[2] for r in compiler.rotations], np.float64),
-        blocks=np.array(compiler.blocks, np.int64),
-        cycles=np.array(compiler.cycles, np.int64),
-        negative=np.array(compiler.negative, np.int64),
-        products=np.array(products, np.int64).reshape(-1, 2),
-        observables=np.array(observables, np.int64),
-    )
+    return compiler.program(circuit.inputs, products, observables)
+
+
+def compile_operations(
+    qubits: int, inputs: int, operations: Sequence[Operation], fresh: bool = True
+) -> Program:
+    """Compile gates into a program on one state of all qubits, whether gates connect them or not; it measures nothing.
+
+    Parameters
+    ----------
+    qubits, inputs:
+        How many there are.
+    operations:
+        The gates. Their angles have inputs and constants, and no parameters.
+    fresh:
+        Whether the state begins in |0...0>; else the program runs on any state.
+    """
+    compiler = Compiler({})
+    compiler.component(operations, range(qubits), fresh)
+    return compiler.program(inputs, [], [])
