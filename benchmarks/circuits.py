@@ -18,10 +18,11 @@ With `--device cuda`: the native simulator on a GPU, 100 seeds together (50 of 1
 against one core of the machine that the GPU is in.
 
 Work: the paper's hybrid circuit (`iqp`, `rot`, 4 layers), gradients by inputs, scalings and weights. Peers are
-PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), lightning.qubit with
-adjoint gradients, Qiskit (values by Aer, native gradients) and JAX, jit and vmap, written by hand
-(`pip install jax`). Figures are medians of processor time: on shared cores the clock charges long calls for their
-neighbors, and short ones not, which would flatter the faster side. Ratios are to PennyLane's default.qubit.
+PennyLane's default.qubit with backprop (the paper's choice, the whole batch in one broadcast), the native simulator as
+a PennyLane device, lightning.qubit with adjoint gradients, Qiskit (values by Aer, native gradients) and JAX, jit and
+vmap, written by hand (`pip install jax`). Figures are medians of processor time: on shared cores the clock charges
+long calls for their neighbors, and short ones not, which would flatter the faster side. Ratios are to PennyLane's
+default.qubit.
 """
 
 from __future__ import annotations
@@ -52,21 +53,21 @@ def torch_call(
     dtype: torch.dtype,
     batch: int = BATCH,
     seeds: int = 1,
-    device: str = "cpu",
+    where: str = "cpu",
     **options: object,
 ) -> Call:
-    """Return one forward and backward pass through a registered backend."""
+    """Return one forward and backward pass through a registered backend, with its options."""
     run = create_backend(backend, circuit, **options)
     source = torch.Generator().manual_seed(0)
 
     def drawn(*shape: int) -> torch.Tensor:
         return torch.rand(seeds, *shape, dtype=dtype, generator=source)
 
-    x = drawn(batch, circuit.inputs).to(device).requires_grad_()
+    x = drawn(batch, circuit.inputs).to(where).requires_grad_()
     parameters = {
-        name: (6.28 * drawn(*p.shape)).to(device).requires_grad_() for name, p in circuit.parameters.items()
+        name: (6.28 * drawn(*p.shape)).to(where).requires_grad_() for name, p in circuit.parameters.items()
     }
-    cotangent = drawn(batch, len(circuit.observables)).to(device)
+    cotangent = drawn(batch, len(circuit.observables)).to(where)
     return lambda: run(x, parameters).backward(cotangent)
 
 
@@ -268,7 +269,7 @@ def print_gpu(qubits: list[int], layers: int, seconds: float, device: str) -> No
     for n in qubits:
         circuit = ansatz("iqp", qubits=n, layers=layers)
         seeds = 100 if n <= 10 else 50 if n <= 12 else 30
-        call = torch_call(circuit, "native", torch.float32, seeds=seeds, device=device)
+        call = torch_call(circuit, "native", torch.float32, seeds=seeds, where=device)
         times: list[float] = []
         call()  # compiles
         while sum(times) < seconds or len(times) < 3:
@@ -313,6 +314,10 @@ def main() -> None:
         circuit = ansatz(arguments.ansatz, qubits=n, layers=arguments.layers, gate=arguments.gate)
         peers: dict[str, tuple[Call, float]] = {
             "PennyLane default.qubit": (torch_call(circuit, "pennylane", torch.float32), 1.0),
+            "PennyLane qrlsuite.native": (
+                torch_call(circuit, "pennylane", torch.float64, device="qrlsuite.native"),
+                1.0,
+            ),
             "native float32": (torch_call(circuit, "native", torch.float32), 1.0),
             "native float64": (torch_call(circuit, "native", torch.float64), 1.0),
         }

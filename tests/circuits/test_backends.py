@@ -65,7 +65,12 @@ def test_every_ansatz_on_every_backend_agrees_with_pennylane(name, gate):
 
 
 @pytest.mark.parametrize(
-    ("backend", "options"), [("pennylane", {"device": "lightning.qubit"}), ("qiskit", {"estimator": "aer"})]
+    ("backend", "options"),
+    [
+        ("pennylane", {"device": "lightning.qubit"}),
+        ("pennylane", {"device": "qrlsuite.native"}),
+        ("qiskit", {"estimator": "aer"}),
+    ],
 )
 def test_devices_pass_the_checks_of_backends(backend, options):
     assert "shots" in assert_all_good(registry.get(specs.CircuitBackendSpec, backend), options)
@@ -201,6 +206,7 @@ def test_sampling_leaves_global_random_numbers_alone():
         ("pennylane", {"shots": 10}, "parameter-shift"),
         ("pennylane", {"device": "lightning.qubit"}, "adjoint"),
         ("pennylane", {"device": "lightning.qubit", "shots": 10}, "parameter-shift"),
+        ("pennylane", {"device": "qrlsuite.native"}, "adjoint"),
         ("pennylane", {"device": "default.mixed"}, "parameter-shift"),
         ("pennylane", {"diff_method": "parameter-shift"}, "parameter-shift"),
         ("qiskit", {}, "adjoint"),

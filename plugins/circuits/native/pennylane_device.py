@@ -9,11 +9,9 @@ kernels; all else, and everything with shots, by the functions with which `defau
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pennylane as qml
@@ -38,50 +36,26 @@ from pennylane.exceptions import DecompositionUndefinedError, DeviceError
 from pennylane.math import Interface
 from pennylane.measurements import ClassicalShadowMP, ExpectationMP, ShadowExpvalMP, StateMP
 from pennylane.operation import StatePrepBase
-from pennylane.ops import SparseHamiltonian
+from pennylane.ops import Controlled, SparseHamiltonian
 from pennylane.transforms import broadcast_expand, defer_measurements
 from pennylane.transforms.core import TransformProgram, transform
 
-from qrlsuite.circuit.description import Angle, Operation
 from qrlsuite.plugins.circuits.native.states import (
-    Matrix,
+    MATRIX_WIRES,
     MatrixObservable,
     Observables,
+    Rule,
     Samples,
     StateProgram,
     Word,
+    compiled,
     refuse_width,
 )
 
 Circuit = Any
 NAME = "qrlsuite.native"
-MATRIX_WIRES = 4
-"""Gates without angles on up to so many wires run by their matrix."""
-
 STATE_BYTES = 256 << 20
-"""States of circuits that run together take up to this size, where PennyLane measures them."""
-
-
-class Rule(NamedTuple):
-    """How the kernels know a gate.
-
-    Attributes
-    ----------
-    gate:
-        Their name of it; empty for a gate that is a phase.
-    angles:
-        Its angles: the gate's parameter with that index, or a number.
-    controlled:
-        Whether the first wire is a control.
-    phase:
-        It takes e^(i phase), or of a gate with parameters e^(i phase parameter), to be the same gate.
-    """
-
-    gate: str
-    angles: tuple[int | float, ...] = ()
-    controlled: bool = False
-    phase: float = 0.0
-
+"""States of circuits that run together take up to this size."""
 
 RULES = {
     "RX": Rule("RX", (0,)),
@@ -92,6 +66,7 @@ RULES = {
     "CRY": Rule("RY", (0,), controlled=True),
     "CRZ": Rule("RZ", (0,), controlled=True),
     "CRot": Rule("Rot", (0, 1, 2), controlled=True),
+    "C(U3)": Rule("U3", (0, 1, 2), controlled=True),
     "PhaseShift": Rule("RZ", (0,), phase=0.5),
     "ControlledPhaseShift": Rule("U3", (0.0, 0, 0.0), controlled=True),
     "GlobalPhase": Rule("", phase=-1.0),
@@ -310,15 +285,25 @@ class NativeDevice(Device):  # type: ignore[misc]  # PennyLane has no types
         return True
 
 
+def _rule(op: Any) -> Rule | None:
+    """Return how the kernels know a gate, if they do."""
+    if op.name == "C(U3)" and (len(op.control_wires) > 1 or not all(op.control_values)):
+        return None
+    return RULES.get(op.name)
+
+
 def _runs(op: Any) -> bool:
     """Return whether a gate runs as it is; all others are decomposed."""
-    if op.name in RULES:
+    if _rule(op) is not None:
         return True
     if len(op.wires) > MATRIX_WIRES or not op.has_matrix:
         return False
-    if op.num_params == 0 or (op.name == "QubitUnitary" and not qml.math.requires_grad(op.data[0])):
+    if op.num_params == 0:
         return True
-    return not op.has_decomposition and not any(qml.math.requires_grad(each) for each in op.data)
+    if any(qml.math.requires_grad(each) for each in op.data):
+        return False
+    # of broadcast controlled gates PennyLane 0.45 does not always find the decomposition
+    return op.name == "QubitUnitary" or isinstance(op, Controlled) or not op.has_decomposition
 
 
 @transform
@@ -347,28 +332,10 @@ def _require_width(wires: int) -> None:
         raise DeviceError(f"{NAME}: {error}") from None
 
 
-@lru_cache(maxsize=64)
-def _program(qubits: int, prepared: bool, gates: tuple[tuple[str, tuple[int, ...]], ...]) -> StateProgram:
-    """Compile gates, given by their names and wires; a name without a rule stands for a matrix."""
-    compiled: list[Operation | Matrix] = []
-    count = 0
-    for name, wires in gates:
-        rule = RULES.get(name)
-        if rule is None:
-            compiled.append(Matrix(wires))
-            continue
-        angles = [Angle(input=count + a) if isinstance(a, int) else Angle(constant=a) for a in rule.angles]
-        count += sum(isinstance(a, int) for a in rule.angles)
-        if rule.gate:
-            control, targets = (wires[0], wires[1:]) if rule.controlled else (None, wires)
-            compiled.append(Operation(rule.gate, targets, tuple(angles), control))
-    return StateProgram(qubits, count, compiled, prepared)
-
-
 def _job(circuit: Circuit) -> Job:
     """Translate a circuit that has been through `preprocess_transforms`."""
     circuit = circuit.map_to_standard_wires()
-    gates: list[tuple[str, tuple[int, ...]]] = []
+    gates: list[tuple[Rule | None, tuple[int, ...]]] = []
     angles: list[Any] = []
     matrices: list[Any] = []
     columns: list[int | None] = []
@@ -383,15 +350,15 @@ def _job(circuit: Circuit) -> Job:
         turns += [0.0] * len(prep.data)
         operations = operations[1:]
     for op in operations:
-        rule = RULES.get(op.name)
+        rule = _rule(op)
         wires = tuple(op.wires)
         if rule is None:
-            gates.append(("", wires))
+            gates.append((None, wires))
             matrices.append(np.asarray(qml.math.unwrap([op.matrix()])[0], np.complex128))
             columns += [None] * op.num_params
             turns += [0.0] * op.num_params
             continue
-        gates.append((op.name, wires))
+        gates.append((rule, wires))
         for value in op.data:
             columns.append(len(angles) if rule.gate else None)
             turns.append(rule.phase)
@@ -412,7 +379,7 @@ def _job(circuit: Circuit) -> Job:
     table = np.empty((next(iter(sizes), 1), len(angles)))
     for column, value in enumerate(angles):
         table[:, column] = np.real(value)
-    program = _program(len(circuit.wires), initial is not None, tuple(gates))
+    program = compiled(len(circuit.wires), initial is not None, tuple(gates))
     return Job(circuit, program, Samples(table, matrices, initial), phases, columns, turns, bool(sizes))
 
 
@@ -465,18 +432,17 @@ def _word(word: Any, coefficient: Any, number: int, measurement: Any) -> Word:
 
 def _groups(jobs: list[Job], exact: list[Observables | None]) -> Iterable[list[int]]:
     """Put circuits of the same gates and measurements together, so that they run in one pass."""
-    groups: OrderedDict[Any, list[int]] = OrderedDict()
+    groups: dict[Any, list[int]] = {}
     for i, (job, observables) in enumerate(zip(jobs, exact)):
-        apart: Any = i if job.samples.matrices or job.samples.initial is not None else None
+        alone = bool(job.samples.matrices) or job.samples.initial is not None
         measured: Any = None
         if observables is not None:
             measured = tuple((tuple(w.paulis.items()), *w[1:]) for w in observables.words)
-            apart = i if observables.matrices else apart
-        key = (id(job.program), measured, apart, observables is None and len(job.samples.angles) > 1 and i)
-        groups.setdefault(key, []).append(i)
+            alone = alone or bool(observables.matrices)
+        groups.setdefault((id(job.program), measured, i if alone else None), []).append(i)
     for group in groups.values():
-        states = exact[group[0]] is None
-        step = max(1, STATE_BYTES // (16 << jobs[group[0]].program.qubits)) if states else len(group)
+        lanes = max(len(jobs[i].samples.angles) for i in group)
+        step = max(1, STATE_BYTES // (lanes * (16 << jobs[group[0]].program.qubits)))
         for first in range(0, len(group), step):
             yield group[first : first + step]
 

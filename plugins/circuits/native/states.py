@@ -10,18 +10,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.circuit.description import MAX_QUBITS, Operation
+from qrlsuite.circuit.description import MAX_QUBITS, Angle, Operation
 from qrlsuite.compiled.cache import announce
 from qrlsuite.plugins.circuits.native.program import compile_operations
 
 PASS_BYTES = 64 << 20
 """States of one pass take up to this size; more samples take several passes."""
+
+SPARE_BYTES = 8 << 20
+"""Memory up to this size is kept from one pass to the next, one array per program: fresh pages cost time."""
+
+MATRIX_WIRES = 4
+"""Gates without angles on up to so many wires run by their matrix."""
 
 Complex = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -31,6 +39,27 @@ class Matrix(NamedTuple):
     """A gate given by its matrix: the qubits, the first of which is the highest bit of its index."""
 
     wires: tuple[int, ...]
+
+
+class Rule(NamedTuple):
+    """How the kernels know a gate.
+
+    Attributes
+    ----------
+    gate:
+        Their name of it; empty for a gate that is a phase, or nothing.
+    angles:
+        Its angles: the gate's parameter with that index, or a number.
+    controlled:
+        Whether the first wire is a control.
+    phase:
+        It takes e^(i phase), or of a gate with parameters e^(i phase parameter), to be the same gate.
+    """
+
+    gate: str
+    angles: tuple[int | float, ...] = ()
+    controlled: bool = False
+    phase: float = 0.0
 
 
 class Word(NamedTuple):
@@ -98,7 +127,7 @@ class Samples:
 
 
 class StateProgram:
-    """Gates on n qubits, compiled once, run for any angles; not to be shared between threads.
+    """Gates on n qubits, compiled once, run for any angles; calls from several threads wait for each other.
 
     Parameters
     ----------
@@ -132,6 +161,7 @@ class StateProgram:
         self.prepared = prepared
         self.segments: list[tuple[Any, int] | Matrix] = []
         self._room: Floats | None = None
+        self._lock = Lock()
         row: list[Operation] = []
         for gate in [*gates, None]:
             if isinstance(gate, Operation):
@@ -153,54 +183,69 @@ class StateProgram:
 
     def states(self, samples: Samples) -> Complex:
         """Return final states (B, 2^n), up to a global phase."""
-        return self._amplitudes(self._run(samples), len(samples.angles))
+        with self._lock:
+            return self._amplitudes(self._run(samples), len(samples.angles))
 
     def expectations(self, samples: Samples, observables: Observables) -> Floats:
         """Return means (B, O)."""
         values = np.zeros((len(samples.angles), observables.count))
         tables = observables.tables(self.qubits)
-        for first, some in self._passes(samples):
-            records = self._run(some)
-            out = values[first : first + len(some.angles)]
-            self.kernels.words(*tables, self.qubits, records, self.scratch[:1], out)
-            for each in observables.matrices:
-                psi = self._view(records)
-                applied = _applied(each.matrix, each.wires, psi)
-                mean = (psi[:, :, 0] * applied.real + psi[:, :, 1] * applied.imag).sum(1)
-                out[:, each.observable] += mean.reshape(-1)[: len(out)]
+        with self._lock:
+            for first, some in self._passes(samples):
+                records = self._run(some)
+                out = values[first : first + len(some.angles)]
+                self.kernels.words(*tables, self.qubits, records, self.scratch[:1], out)
+                for each in observables.matrices:
+                    psi = self._view(records)
+                    applied = _applied(each.matrix, each.wires, psi)
+                    mean = (psi[:, :, 0] * applied.real + psi[:, :, 1] * applied.imag).sum(1)
+                    out[:, each.observable] += mean.reshape(-1)[: len(out)]
         return values
 
     def gradients(self, samples: Samples, observables: Observables, cotangents: Floats) -> Floats:
         """Return the gradient (B, A) of sum(cotangents * means) by the angles, for cotangents (B, O)."""
         result = np.zeros((len(samples.angles), self.inputs))
         tables = observables.tables(self.qubits)
-        for first, some in self._passes(samples):
-            records = self._run(some)
-            given = np.ascontiguousarray(cotangents[first : first + len(some.angles)], np.float64)
-            lams = self._empty(len(records))
-            lams[:] = 0.0
-            self.kernels.weigh_words(*tables, self.qubits, records, self.scratch[:1], given, lams)
-            for each in observables.matrices:
-                applied = _applied(each.matrix, each.wires, self._view(records))
-                lanes = np.zeros(applied.shape[0] * self.lanes)
-                lanes[: len(given)] = given[:, each.observable]
-                lam, weight = self._view(lams), lanes.reshape(-1, 1, self.lanes)
-                lam[:, :, 0] += weight * applied.real
-                lam[:, :, 1] += weight * applied.imag
-            self._retreat(some, records, lams, result[first : first + len(some.angles)])
+        with self._lock:
+            for first, some in self._passes(samples):
+                records = self._run(some)
+                given = np.ascontiguousarray(cotangents[first : first + len(some.angles)], np.float64)
+                lams = self._weighed(records, tables, observables.matrices, given)
+                self._retreat(some, records, lams, result[first : first + len(some.angles)])
         return result
 
     def state_gradients(self, samples: Samples, cotangents: Complex) -> Complex:
         """Return sum_i cotangents_i dpsi_i / dangle, complex (B, A), for cotangents (B, 2^n) of the final states."""
         parts = []
-        records = self._run(samples)
-        for factor in (0.5, 0.5j):  # Im <lambda| P |psi> is the real part, and of i lambda the imaginary one
-            lams = self._empty(len(records))
-            _put(self._view(lams), factor * cotangents.conj())
-            result = np.zeros((len(samples.angles), self.inputs))
-            self._retreat(samples, records, lams, result)
-            parts.append(result)
+        with self._lock:
+            records = self._run(samples)
+            for factor in (
+                0.5,
+                0.5j,
+            ):  # Im <lambda| P |psi> is the real part, and of i lambda the imaginary one
+                lams = self._empty(len(records))
+                _put(self._view(lams), factor * cotangents.conj())
+                result = np.zeros((len(samples.angles), self.inputs))
+                self._retreat(samples, records, lams, result)
+                parts.append(result)
         return parts[0] + 1j * parts[1]
+
+    def _weighed(
+        self, records: Floats, tables: Any, matrices: Sequence[MatrixObservable], cotangents: Floats
+    ) -> Floats:
+        """Return lambda = (sum_o cotangents_o O_o) psi."""
+        lams = self._empty(len(records))
+        lams[:] = 0.0
+        self.kernels.weigh_words(*tables, self.qubits, records, self.scratch[:1], cotangents, lams)
+        lam = self._view(lams)
+        for each in matrices:
+            applied = _applied(each.matrix, each.wires, self._view(records))
+            weights = np.zeros(len(records) * self.lanes)
+            weights[: len(cotangents)] = cotangents[:, each.observable]
+            weighed = applied * weights.reshape(-1, 1, self.lanes)
+            lam[:, :, 0] += weighed.real
+            lam[:, :, 1] += weighed.imag
+        return lams
 
     def _passes(self, samples: Samples) -> Iterator[tuple[int, Samples]]:
         """Cut the samples so that the states of each part fit into `PASS_BYTES`."""
@@ -215,8 +260,8 @@ class StateProgram:
         if self._room is None or len(self._room) < chunks:
             self._room = self.aligned((chunks, self.rows, self.lanes), np.float64)
         records = self._room[:chunks]
-        if records.nbytes > PASS_BYTES:
-            self._room = None  # not kept
+        if records.nbytes > SPARE_BYTES:
+            self._room = None
         if not self.begins:
             psi = self._view(records)
             psi[:] = 0.0
@@ -267,6 +312,25 @@ class StateProgram:
         state = np.empty((len(psi), self.lanes, 1 << self.qubits), np.complex128)
         state.real, state.imag = psi[:, :, 0].swapaxes(1, 2), psi[:, :, 1].swapaxes(1, 2)
         return state.reshape(-1, 1 << self.qubits)[:count]
+
+
+@lru_cache(maxsize=64)
+def compiled(
+    qubits: int, prepared: bool, gates: tuple[tuple[Rule | None, tuple[int, ...]], ...]
+) -> StateProgram:
+    """Return the program of these gates on their wires; None stands for a matrix. It is kept for the next call."""
+    given: list[Operation | Matrix] = []
+    count = 0
+    for rule, wires in gates:
+        if rule is None:
+            given.append(Matrix(wires))
+            continue
+        angles = [Angle(input=count + a) if isinstance(a, int) else Angle(constant=a) for a in rule.angles]
+        count += len({a for a in rule.angles if isinstance(a, int)})
+        if rule.gate:
+            control, targets = (wires[0], wires[1:]) if rule.controlled else (None, wires)
+            given.append(Operation(rule.gate, targets, tuple(angles), control))
+    return StateProgram(qubits, count, given, prepared)
 
 
 def refuse_width(qubits: int) -> None:

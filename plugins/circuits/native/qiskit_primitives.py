@@ -1,0 +1,323 @@
+"""The native simulator as Qiskit's V2 primitives, in the place of `StatevectorEstimator` and `StatevectorSampler`.
+
+All parameter values of a circuit run as lanes of one pass. Gates that the kernels know run in them, gates without
+parameters on few qubits by their matrix, and all others by Qiskit's own definitions. With a seed, the numbers drawn are
+those that Qiskit's primitives draw.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from qiskit.circuit import ControlFlowOp, ParameterExpression, QuantumCircuit
+from qiskit.primitives import (
+    BaseEstimatorV2,
+    BaseSamplerV2,
+    BitArray,
+    DataBin,
+    PrimitiveJob,
+    PrimitiveResult,
+    PubResult,
+    SamplerPubResult,
+)
+from qiskit.primitives.containers.estimator_pub import EstimatorPub
+from qiskit.primitives.containers.sampler_pub import SamplerPub
+from qiskit.quantum_info import Operator
+
+from qrlsuite.errors import CircuitError
+from qrlsuite.plugins.circuits.native.states import (
+    MATRIX_WIRES,
+    Observables,
+    Rule,
+    Samples,
+    StateProgram,
+    Word,
+    compiled,
+    refuse_width,
+)
+
+STATE_BYTES = 256 << 20
+"""States that are sampled together take up to this size."""
+
+RULES = {
+    "rx": Rule("RX", (0,)),
+    "ry": Rule("RY", (0,)),
+    "rz": Rule("RZ", (0,)),
+    "p": Rule("RZ", (0,)),
+    "u": Rule("U3", (0, 1, 2)),
+    "crx": Rule("RX", (0,), controlled=True),
+    "cry": Rule("RY", (0,), controlled=True),
+    "crz": Rule("RZ", (0,), controlled=True),
+    "cp": Rule("U3", (0.0, 0, 0.0), controlled=True),
+    "id": Rule(""),
+    "h": Rule("H"),
+    "x": Rule("X"),
+    "y": Rule("Y"),
+    "z": Rule("Z"),
+    "s": Rule("S"),
+    "t": Rule("T"),
+    "sdg": Rule("RZ", (-math.pi / 2,)),
+    "tdg": Rule("RZ", (-math.pi / 4,)),
+    "sx": Rule("RX", (math.pi / 2,)),
+    "sxdg": Rule("RX", (-math.pi / 2,)),
+    "cx": Rule("CNOT"),
+    "cz": Rule("CZ"),
+    "swap": Rule("SWAP"),
+}
+"""Gates that run in the kernels, by Qiskit's names; up to a global phase, which no mean and no bit shows."""
+
+
+@dataclass
+class Plan:
+    """A circuit of which all parameter values run together.
+
+    Attributes
+    ----------
+    program, samples:
+        The compiled gates, and angles of all B parameter values.
+    bits:
+        Of every register by its name the qubit that is measured into each of its bits, None where none is.
+    """
+
+    program: StateProgram
+    samples: Samples
+    bits: dict[str, list[int | None]]
+
+
+class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
+    """Means of observables, as `qiskit.primitives.StatevectorEstimator` computes them.
+
+    Parameters
+    ----------
+    default_precision:
+        Standard deviation of Gaussian noise on every mean, where `run` is given none; 0 for exact means.
+    seed:
+        Of that noise: an integer, a generator, or None for fresh entropy.
+    """
+
+    def __init__(self, *, default_precision: float = 0.0, seed: Any = None) -> None:
+        self.default_precision = default_precision
+        self.seed = seed
+
+    def run(self, pubs: Iterable[Any], *, precision: float | None = None) -> Any:
+        """Return a job with the means of every pub, see Qiskit's `BaseEstimatorV2.run`.
+
+        Raises
+        ------
+        CircuitError
+            If a circuit has an operation without a definition, is measured or reset, or has too many qubits.
+        """
+        wanted = self.default_precision if precision is None else precision
+        work = [(pub, _plan(pub)) for pub in (EstimatorPub.coerce(each, wanted) for each in pubs)]
+        job = PrimitiveJob(lambda: PrimitiveResult(list(map(self._result, work)), metadata={"version": 2}))
+        job._submit()
+        return job
+
+    def _result(self, work: tuple[Any, Plan]) -> Any:
+        pub, plan = work
+        means = _means(pub, plan)
+        if pub.precision:
+            means = np.random.default_rng(self.seed).normal(means, pub.precision)
+        data = DataBin(evs=means, stds=np.zeros_like(means), shape=means.shape)
+        metadata = {"target_precision": pub.precision, "circuit_metadata": pub.circuit.metadata}
+        return PubResult(data, metadata=metadata)
+
+
+class SamplerV2(BaseSamplerV2):  # type: ignore[misc]
+    """Measured bits, as `qiskit.primitives.StatevectorSampler` draws them.
+
+    Parameters
+    ----------
+    default_shots:
+        Repetitions of every circuit, where `run` is given none.
+    seed:
+        Of the draws: an integer, a generator, or None for fresh entropy.
+    """
+
+    def __init__(self, *, default_shots: int = 1024, seed: Any = None) -> None:
+        self.default_shots = default_shots
+        self.seed = seed
+
+    def run(self, pubs: Iterable[Any], *, shots: int | None = None) -> Any:
+        """Return a job with the bits of every pub, see Qiskit's `BaseSamplerV2.run`.
+
+        Raises
+        ------
+        CircuitError
+            If a circuit has an operation without a definition, acts on measured qubits, or has too many qubits.
+        """
+        wanted = self.default_shots if shots is None else shots
+        work = [(pub, _plan(pub)) for pub in (SamplerPub.coerce(each, wanted) for each in pubs)]
+        job = PrimitiveJob(lambda: PrimitiveResult(list(map(self._result, work)), metadata={"version": 2}))
+        job._submit()
+        return job
+
+    def _result(self, work: tuple[Any, Plan]) -> Any:
+        pub, plan = work
+        read = sorted({q for bits in plan.bits.values() for q in bits if q is not None})
+        drawn = [
+            np.random.default_rng(self.seed).choice(len(p), size=pub.shots, p=p)
+            for p in _probabilities(plan, read)
+        ]
+        outcomes = np.array(drawn, np.int64).reshape(-1, pub.shots, 1)
+        arrays = {}
+        for name, bits in plan.bits.items():
+            places = [-1 if q is None else read.index(q) for q in bits]
+            values = (outcomes >> np.maximum(places, 0)) & (np.array(places) >= 0)
+            shaped = values.astype(bool).reshape(*pub.shape, pub.shots, len(bits))
+            arrays[name] = BitArray.from_bool_array(shaped, order="little")
+        metadata = {"shots": pub.shots, "circuit_metadata": pub.circuit.metadata}
+        return SamplerPubResult(DataBin(**arrays, shape=pub.shape), metadata=metadata)
+
+
+def _plan(pub: Any) -> Plan:
+    """Translate a circuit and all its parameter values."""
+    circuit = pub.circuit
+    try:
+        refuse_width(circuit.num_qubits)
+    except ValueError as error:
+        raise CircuitError(str(error)) from None
+    values = pub.parameter_values
+    table = values.as_array(circuit.parameters).reshape(math.prod(values.shape), circuit.num_parameters)
+    known = {parameter: table[:, i] for i, parameter in enumerate(circuit.parameters)}
+    gates: list[tuple[Rule | None, tuple[int, ...]]] = []
+    angles: list[Any] = []
+    matrices: list[NDArray[np.complex128]] = []
+    measured: dict[int, int] = {}
+    touched: set[int] = set()
+    for operation, qubits, clbits in _flat(circuit, range(circuit.num_qubits), range(circuit.num_clbits)):
+        if operation.name == "measure":
+            measured[clbits[0]] = qubits[0]
+            continue
+        if operation.name == "reset" and qubits[0] not in touched:
+            continue
+        again = set(qubits) & set(measured.values())
+        if again or operation.name == "reset":
+            raise CircuitError(
+                f"'{operation.name}' on qubit {qubits[0]} comes after a measurement or gates: circuits are measured at "
+                "their end, and reset at their beginning; use another qubit"
+            )
+        touched.update(qubits)
+        rule = RULES.get(operation.name)
+        if rule is None:
+            gates.append((None, tuple(reversed(qubits))))
+            matrices.append(Operator(operation).data)
+        else:
+            gates.append((rule, qubits))
+            if rule.gate and any(isinstance(a, int) for a in rule.angles):
+                angles += [_angle(value, known) for value in operation.params]
+    columns = np.empty((len(table), len(angles)))
+    for column, angle in enumerate(angles):
+        columns[:, column] = angle
+    bits: dict[str, list[int | None]] = {
+        register.name: [measured.get(circuit.find_bit(bit).index) for bit in register]
+        for register in circuit.cregs
+    }
+    return Plan(compiled(circuit.num_qubits, False, tuple(gates)), Samples(columns, matrices), bits)
+
+
+def _flat(
+    circuit: QuantumCircuit, qubits: Sequence[int], clbits: Sequence[int]
+) -> Iterator[tuple[Any, tuple[int, ...], tuple[int, ...]]]:
+    """Yield operations that run as they are, with qubits and bits; all others by their definitions.
+
+    Raises
+    ------
+    CircuitError
+        If an operation has no definition, or depends on measured bits.
+    """
+    for item in circuit.data:
+        operation = item.operation
+        if operation.name in ("barrier", "delay"):
+            continue
+        on = tuple(qubits[circuit.find_bit(q).index] for q in item.qubits)
+        into = tuple(clbits[circuit.find_bit(c).index] for c in item.clbits)
+        if isinstance(operation, ControlFlowOp):
+            raise CircuitError(
+                f"'{operation.name}' depends on measured bits, which this simulator cannot follow"
+            )
+        plain = all(not isinstance(value, ParameterExpression) for value in operation.params)
+        positive = getattr(operation, "ctrl_state", None) in (None, 1)
+        known = operation.name in ("measure", "reset") or (operation.name in RULES and positive)
+        matrix = plain and len(on) <= MATRIX_WIRES and not into and hasattr(operation, "__array__")
+        if known or matrix:
+            yield operation, on, into
+        elif getattr(operation, "definition", None) is None:
+            raise CircuitError(
+                f"operation '{operation.name}' on {len(on)} qubits has no definition by other gates: it cannot run here"
+            )
+        else:
+            yield from _flat(operation.definition, on, into)
+
+
+def _angle(value: Any, known: dict[Any, NDArray[np.float64]]) -> Any:
+    """Return a gate's angle of every sample (B,), or a number."""
+    if not isinstance(value, ParameterExpression):
+        return float(value)
+    if value in known:
+        return known[value]
+    names = list(value.parameters)
+    slopes = [value.gradient(name) for name in names]
+    if all(isinstance(slope, int | float) for slope in slopes):
+        start = float(value.bind(dict.fromkeys(names, 0.0)))
+        return start + sum(slope * known[name] for slope, name in zip(slopes, names))
+    rows = np.stack([known[name] for name in names], axis=1)
+    return np.array([float(value.bind(dict(zip(names, row)))) for row in rows.tolist()])
+
+
+def _means(pub: Any, plan: Plan) -> NDArray[np.float64]:
+    """Return the means of a pub, in its shape."""
+    shape = pub.shape
+    given = pub.observables.ravel()
+    sums = [_words(given[(i,)], pub.circuit.num_qubits) for i in range(given.size)]
+    count = len(plan.samples.angles)
+    rows = np.broadcast_to(np.arange(count).reshape(pub.parameter_values.shape), shape).reshape(-1)
+    columns = np.broadcast_to(np.arange(len(sums)).reshape(pub.observables.shape), shape).reshape(-1)
+    means = np.zeros(len(rows))
+    if count * len(sums) == len(rows):  # every observable of every sample
+        words = [Word(paulis, weight, o) for o, each in enumerate(sums) for paulis, weight in each]
+        table = plan.program.expectations(plan.samples, Observables(len(sums), words))
+        means[:] = table[rows, columns]
+    else:
+        for o, each in enumerate(sums):
+            which = np.flatnonzero(columns == o)
+            some = Samples(plan.samples.angles[rows[which]], plan.samples.matrices)
+            words = [Word(paulis, weight, 0) for paulis, weight in each]
+            means[which] = plan.program.expectations(some, Observables(1, words))[:, 0]
+    return means.reshape(shape)
+
+
+def _words(observable: Any, qubits: int) -> list[tuple[dict[int, str], float]]:
+    """Return Pauli words by qubit with their coefficients.
+
+    Raises
+    ------
+    CircuitError
+        If a term has projectors.
+    """
+    words = []
+    for label, coefficient in observable.items():
+        if set(label) - set("IXYZ"):
+            raise CircuitError(
+                f"observable '{label}': write projectors as sums of the Pauli matrices I, X, Y and Z"
+            )
+        paulis = {q: pauli for q, pauli in enumerate(reversed(label)) if pauli != "I"}
+        words.append((paulis, float(np.real(coefficient))))
+    return words
+
+
+def _probabilities(plan: Plan, read: list[int]) -> Iterator[NDArray[np.float64]]:
+    """Yield, sample by sample, the probabilities of the bits of some qubits, the first of which is the lowest."""
+    qubits = plan.program.qubits
+    step = max(1, STATE_BYTES // (16 << qubits))
+    for first in range(0, len(plan.samples.angles), step):
+        for state in plan.program.states(plan.samples.part(first, first + step)):
+            table = (state.real**2 + state.imag**2).reshape([2] * qubits)
+            other = tuple(q for q in range(qubits) if q not in read)
+            p = table.sum(axis=other).transpose().reshape(-1)
+            yield p / p.sum()
