@@ -222,7 +222,16 @@ def test_options_in_running_text_exist(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for code in re.findall(r"`([^`]+)`", " ".join(text.split())):
         if code.startswith(
-            ("pip ", "kubectl ", "mlflow", "tensorboard", "OPENBLAS", "python benchmarks", "benchmarks/")
+            (
+                "pip ",
+                "pl-device-test",
+                "kubectl ",
+                "mlflow",
+                "tensorboard",
+                "OPENBLAS",
+                "python benchmarks",
+                "benchmarks/",
+            )
         ):
             continue
         for word in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code):
