@@ -11,9 +11,9 @@ import pytest
 
 from qrlsuite.cli.commands.tune import LARGE
 from tests.commands import qrlsuite
+from tests.conftest import published_anew
 
 ROOT = Path(__file__).parents[2]
-ENTRIES = ROOT / "leaderboard/entries"
 SMALL = {
     "run": ("--seeds", "2", "--epochs", "1", "--workers", "1"),
     "evaluate": ("--episodes", "5"),
@@ -40,11 +40,7 @@ def small(words: list[str]) -> list[str]:
     return [*words, *more]
 
 
-@pytest.mark.xfail(
-    "code" not in json.loads((ENTRIES / "beam6g/ddqn-mlp-90e7f8d4/entry.json").read_text()),
-    reason="own runs of networks have other bits than the published ones, until these are trained anew",
-    strict=True,
-)
+@published_anew
 def test_the_examples_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("QRLSUITE_RUNS", raising=False)
