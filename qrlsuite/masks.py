@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from qrlsuite import population as populations
 from qrlsuite.seeding import Streams
 
 FORBIDDEN = -1e30
@@ -55,6 +56,14 @@ def masked(outputs: Tensor, seen: Tensor, inputs: int) -> Tensor:
     if seen.shape[-1] == inputs:
         return outputs
     return torch.where(seen[..., inputs:] > 0, outputs.clamp(min=FORBIDDEN / 2), FORBIDDEN)
+
+
+def best(population: nn.Module, seen: Tensor, inputs: int) -> Tensor:
+    """Return which output is the largest (S, B) of those that `seen` does not forbid, the first of equal ones."""
+    if seen.shape[-1] == inputs:
+        return populations.best(population, seen)
+    with torch.no_grad():
+        return masked(population(observed(seen, inputs)), seen, inputs).argmax(2)
 
 
 def drawn(

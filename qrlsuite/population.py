@@ -141,6 +141,39 @@ def _sweep_of(population: nn.Module) -> Sweep | None:
     return None if found is None else found()
 
 
+def best(population: nn.Module, x: Tensor) -> Tensor:
+    """Return which output is the largest (S, B), the first of equal ones, for x (S, B, in)."""
+    whole = _sweep_of(population)
+    if whole is None or not compilable(x):
+        with torch.no_grad():
+            found: Tensor = population(x).argmax(2)
+        return found
+    from qrlsuite.compiled import networks
+
+    values = whole.values(x.contiguous().numpy(), False)[0]
+    places = np.empty(values.shape[:2], np.int64)
+    networks.largest(values, places)
+    return torch.from_numpy(places)
+
+
+def chosen_values(population: nn.Module, x: Tensor, chosen: Tensor) -> Tensor:
+    """Return the outputs `chosen` (S, B), one of each sample, (S, B), for x (S, B, in); without gradients."""
+    whole = _sweep_of(population)
+    if whole is None or not compilable(x):
+        with torch.no_grad():
+            return _chosen(population(x), chosen)
+    from qrlsuite.compiled import networks
+
+    values = whole.values(x.contiguous().numpy(), False)[0]
+    out = np.empty(values.shape[:2], np.float32)
+    networks.chosen(values, chosen.numpy(), out)
+    return torch.from_numpy(out)
+
+
+def _chosen(values: Tensor, chosen: Tensor) -> Tensor:
+    return values.gather(2, chosen[..., None]).squeeze(2)
+
+
 def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor) -> Tensor:
     """Set the gradients of a mean squared error, summed over the agents, in a population's parameters.
 
@@ -162,7 +195,7 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
     """
     compiled = _sweep_of(population)
     if compiled is None or not compilable(x, aims):
-        errors: Tensor = population(x).gather(2, chosen[..., None]).squeeze(2) - aims
+        errors = _chosen(population(x), chosen) - aims
         gradients(errors.square().mean(1).sum(), population)
         return errors.detach()
     from qrlsuite.compiled import networks
@@ -564,23 +597,22 @@ class Adam:
         from qrlsuite.compiled import networks
         from qrlsuite.compiled.perceptron import joined
 
-        _, block, means, squares, sizes, rates = self._blocks
-        (beta1, beta2), counts = self.betas, self.steps.tolist()
-        corrections = [_corrections(beta1, beta2, max(count, 1)) for count in counts]
-        scale, roots = np.array(corrections).T
+        _, block, means, squares, sizes, rates, constants = self._blocks
+        counts = self.steps.tolist()
+        scale: Any
+        if counts.count(counts[0]) == len(counts):
+            scale, root = _corrections(*self.betas, max(counts[0], 1))
+            roots = np.full(len(counts), root, np.float32)
+        else:
+            scale, root = np.array([_corrections(*self.betas, max(count, 1)) for count in counts]).T
+            roots = root.astype(np.float32)
         whole = _sweep_of(self._population)
         gradients = None if whole is None else whole.gradients_of(parameters)
-        networks.adam(
-            block,
-            joined([cast("Tensor", p.grad) for p in parameters]) if gradients is None else gradients,
-            means,
-            squares,
-            sizes,
-            (rates * scale).astype(np.float32),
-            roots.astype(np.float32),
-            np.ones(len(counts), np.bool_) if active is None else active.cpu().numpy(),
-            *(np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)),
-        )
+        if gradients is None:
+            gradients = joined([cast("Tensor", p.grad) for p in parameters])
+        moved = np.ones(len(counts), np.bool_) if active is None else active.cpu().numpy()
+        corrected = (rates * scale).astype(np.float32)
+        networks.adam(block, gradients, means, squares, sizes, corrected, roots, moved, *constants)
         return True
 
     def _lay_out(self, parameters: Sequence[Tensor]) -> tuple[Any, ...]:
@@ -597,7 +629,9 @@ class Adam:
         rates = np.stack([np.broadcast_to(each, len(self.steps)) for each in lr])
         sizes = np.array([p[0].numel() for p in parameters])
         blocks = (joined(part) for part in (parameters, *moments))
-        return [p.data_ptr() for p in parameters], *blocks, sizes, rates
+        beta1, beta2 = self.betas
+        constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
+        return [p.data_ptr() for p in parameters], *blocks, sizes, rates, constants
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return step counts (S,) and both moments of every parameter (S, ...)."""

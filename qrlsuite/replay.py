@@ -35,7 +35,10 @@ class Replay:
         self.rows = torch.zeros((seeds, capacity, sum(columns.values())), device=device)
         self.stored = 0
         self._borders = [0, *itertools.accumulate(columns.values())]
-        self._places = np.array(self._borders)
+        blocks = list(zip(self._borders, columns.values()))
+        self._starts, self._within, self._widths = np.array(
+            [(first, column, width) for first, width in blocks for column in range(width)], np.uint64
+        ).T.copy()
 
     @property
     def filled(self) -> int:
@@ -46,10 +49,10 @@ class Replay:
         """Store E rows of every seed, over the oldest ones: each quantity (S, E, numbers), or (S, E)."""
         capacity, new = self.rows.shape[1], len(values[next(iter(self.columns))][0])
         place = self.stored % capacity
-        if place + new <= capacity:
+        if place + new <= capacity and self.rows.is_cpu:
+            held = self.rows.numpy()[:, place : place + new]
             for name, first, end in zip(self.columns, self._borders, self._borders[1:]):
-                held = self.rows[:, place : place + new, first:end]
-                held.copy_(values[name].reshape(held.shape))
+                held[:, :, first:end] = values[name].detach().numpy().reshape(len(held), new, -1)
         else:
             parts = [values[name].to(torch.float32) for name in self.columns]
             both = torch.cat([part if part.dim() == 3 else part[..., None] for part in parts], dim=2)
@@ -78,13 +81,15 @@ class Replay:
         from qrlsuite.compiled.networks import pick
 
         seeds, batch = draws.shape
-        out = torch.empty(seeds * batch * self._borders[-1])
-        pick(self.rows.numpy(), draws.contiguous().numpy(), self.filled, self._places, out.numpy())
-        widths = list(self.columns.values())
-        parts = torch.split(out, [seeds * batch * width for width in widths])
-        return {
-            name: part.view(seeds, batch, width) for (name, width), part in zip(self.columns.items(), parts)
-        }
+        samples, parts = seeds * batch, {}
+        out, first = np.empty(samples * self._borders[-1], np.float32), 0
+        begin = self._starts * np.uint64(samples) + self._within
+        rows = self.rows.view(-1).numpy()
+        pick(rows, self.rows.shape[1], draws.contiguous().numpy(), self.filled, begin, self._widths, out)
+        for (name, width), end in zip(self.columns.items(), self._borders[1:]):
+            parts[name] = torch.from_numpy(out[first : samples * end].reshape(seeds, batch, width))
+            first = samples * end
+        return parts
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return rows and counts, seed-first."""

@@ -34,7 +34,7 @@ from qrlsuite import masks
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Tuned
-from qrlsuite.population import Adam, by_seed, chosen_errors, part, prefixed
+from qrlsuite.population import Adam, by_seed, chosen_errors, chosen_values, part, prefixed
 from qrlsuite.replay import Replay
 from qrlsuite.seeding import Streams
 
@@ -101,29 +101,25 @@ class DDQN:
 
     def train_epoch(self, rounds: int) -> dict[str, NDArray[np.float64]]:
         """Interact and learn for `rounds` rounds; returns the mean squared TD error `loss` (S,)."""
-        explore, random_action, draws = self._epoch_numbers(rounds)
         losses = torch.zeros(self.S, dtype=torch.float64, device=self.device)
-        for k in range(rounds):
+        for k, (explore, action, draws) in enumerate(zip(*self._epoch_numbers(rounds))):
             greedy = self._greedy(self.observations)
-            uniform = masks.drawn(
-                random_action[:, k], self.observations, self.obs_dim, self.streams, self.epoch, k
-            )
-            actions = torch.where(explore[:, k], uniform, greedy)  # (S, E)
-            self._interact(actions)
-            losses += self._learn(draws[:, k])
+            uniform = masks.drawn(action, self.observations, self.obs_dim, self.streams, self.epoch, k)
+            self._interact(torch.where(explore, uniform, greedy))  # (S, E)
+            losses += self._learn(draws)
         self.epoch += 1
         return {"loss": (losses / rounds).cpu().numpy()}
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw an epoch's exploration (S, rounds, E), twice, and replay positions (S, rounds, batch) in [0, 1)."""
-        explore = np.empty((self.S, rounds, self.E), dtype=bool)
-        action = np.empty((self.S, rounds, self.E), dtype=np.int64)
-        draws = np.empty((self.S, rounds, self.options.batch))
+        """Draw an epoch's exploration (rounds, S, E), twice, and replay positions (rounds, S, batch) in [0, 1)."""
+        explore = np.empty((rounds, self.S, self.E), dtype=bool)
+        action = np.empty((rounds, self.S, self.E), dtype=np.int64)
+        draws = np.empty((rounds, self.S, self.options.batch))
         for s, streams in enumerate(self.streams):
             exploration = streams.numpy("exploration", self.epoch)
-            explore[s] = exploration.random((rounds, self.E)) < self.options.epsilon
-            action[s] = exploration.integers(self.actions, size=(rounds, self.E))
-            draws[s] = streams.numpy("replay", self.epoch).random((rounds, self.options.batch))
+            explore[:, s] = exploration.random((rounds, self.E)) < self.options.epsilon
+            action[:, s] = exploration.integers(self.actions, size=(rounds, self.E))
+            draws[:, s] = streams.numpy("replay", self.epoch).random((rounds, self.options.batch))
         return tuple(torch.from_numpy(a).to(self.device) for a in (explore, action, draws))  # type: ignore[return-value]
 
     def _interact(self, actions: Tensor) -> None:
@@ -144,20 +140,18 @@ class DDQN:
         """Make one Adam step of every agent on a batch drawn by `draws` (S, batch); returns the losses (S,)."""
         batch = self.replay.batch(draws)
         action, reward, alive = (batch[name].squeeze(2) for name in ("action", "reward", "alive"))
-        with torch.no_grad():
-            best = self._greedy(batch["after"])[..., None]
-            beyond = self.target(masks.observed(batch["after"], self.obs_dim)).gather(2, best).squeeze(2)
-            y = reward + self.options.gamma * alive * beyond
-        errors = chosen_errors(self.online, masks.observed(batch["seen"], self.obs_dim), action.long(), y)
+        seen, after = (masks.observed(batch[name], self.obs_dim) for name in ("seen", "after"))
+        y = reward + self.options.gamma * alive * chosen_values(
+            self.target, after, self._greedy(batch["after"])
+        )
+        errors = chosen_errors(self.online, seen, action.long(), y)  # Q(s, a) - y; sets gradients
         self.adam.step()
         if int(self.adam.steps[0]) % self.options.target_steps == 0:
             self.target.load_state_dict(self.online.state_dict())
-        return errors.square().mean(1).to(torch.float64)
+        return errors.square().mean(1)
 
-    @torch.no_grad()
     def _greedy(self, seen: Tensor) -> Tensor:
-        values = self.online(masks.observed(seen, self.obs_dim))
-        return masks.masked(values, seen, self.obs_dim).argmax(2)
+        return masks.best(self.online, seen, self.obs_dim)
 
     def act(
         self, observations: NDArray[np.float32], infos: Mapping[str, Any] = masks.NOTHING

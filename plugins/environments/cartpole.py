@@ -20,6 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
 from qrlsuite.actions import check_actions
+from qrlsuite.compiled.cache import rounded
 from qrlsuite.environment import LaneEnv, State, batched_spaces, require_state
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.normalization import KIND, Kind, Normalization
@@ -255,22 +256,17 @@ class CartPoleLanes(LaneEnv):
             raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions)
         check_actions(actions, self.num_envs, 2)
-        running = ~self._ended
-        if self._ended.any():
-            lanes = np.flatnonzero(running)  # ended lanes cost nothing
-            self.state[:, lanes] = advance(np.ascontiguousarray(self.state[:, lanes]), actions[lanes])
-        else:
-            self.state = advance(self.state, actions)
-        self._step += running
-        x, _, theta, _ = self.state
-        fallen = (np.abs(x) > X_LIMIT) | (np.abs(theta) > THETA_LIMIT)
-        terminated = fallen & running
-        truncated = (self._step >= self.options.steps) & running
+        rewards, (terminated, truncated) = np.zeros(self.num_envs), np.zeros((2, self.num_envs), np.bool_)
+        cos, sin = np.cos(self.state[2]), np.sin(self.state[2])  # numpy's, whose bits numba's need not be
+        push(
+            self.state, cos, sin, actions.astype(np.int64), self._ended, self._step, self.options.steps,
+            rewards, terminated, truncated,
+        )  # fmt: skip
         infos: dict[str, Any] = {}
         done = terminated | truncated
         if done.any():
             infos = self._finish(done)
-        return self._observations(), running.astype(np.float64), terminated, truncated, infos
+        return self._observations(), rewards, terminated, truncated, infos
 
     def state_dict(self) -> State:
         """Return the episodes' state, lane-first: `state` (L, 4), `step` (L,) and `ended` (L,).
@@ -308,10 +304,11 @@ class CartPoleLanes(LaneEnv):
     def _begin(self, lanes: NDArray[np.intp]) -> None:
         """Put `lanes` (ascending) at the beginning of new episodes."""
         per_stream = self.num_envs // len(self.streams)
-        owners, counts = np.unique(lanes // per_stream, return_counts=True)
+        counts = np.bincount(lanes // per_stream, minlength=len(self.streams)).tolist()
         drawn = [
-            self.streams[owner].uniform(low=-START, high=START, size=(count, 4))
-            for owner, count in zip(owners.tolist(), counts.tolist())
+            stream.uniform(low=-START, high=START, size=(count, 4))
+            for stream, count in zip(self.streams, counts)
+            if count
         ]
         self.state[:, lanes] = np.concatenate(drawn).T
         self._step[lanes] = 0
@@ -336,24 +333,31 @@ class CartPoleLanes(LaneEnv):
         return self._normalize(self.state.T.astype(np.float32, order="C"))
 
 
-def advance(state: NDArray[np.float64], actions: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Return the states (4, L) that follow `state` (4, L) under `actions` (L,), 0 or 1; explicit Euler steps.
+@rounded
+def push(
+    state: Any, cos: Any, sin: Any, actions: Any, ended: Any, step: Any, steps: int,
+    rewards: Any, terminated: Any, truncated: Any,
+) -> None:  # fmt: skip
+    """Push the carts of lanes that have not ended, `state` (4, L), in place; explicit Euler steps.
 
     Equations: Florian, "Correct equations for the dynamics of the cart-pole system" (2007), without friction.
     """
-    _, x_dot, theta, theta_dot = state
-    force = np.where(actions == 1, FORCE, -FORCE)
-    cos, sin = np.cos(theta), np.sin(theta)
-    temp = (force + POLE_MASS_LENGTH * np.square(theta_dot) * sin) / TOTAL_MASS
-    theta_acc = (GRAVITY * sin - cos * temp) / (
-        LENGTH * (4.0 / 3.0 - POLE_MASS * np.square(cos) / TOTAL_MASS)
-    )
-    x_acc = temp - POLE_MASS_LENGTH * theta_acc * cos / TOTAL_MASS
-    after = np.empty_like(state)
-    after[0::2] = state[0::2] + TAU * state[1::2]
-    after[1] = x_dot + TAU * x_acc
-    after[3] = theta_dot + TAU * theta_acc
-    return after
+    for lane in range(state.shape[1]):
+        if ended[lane]:
+            continue
+        x_dot, theta_dot, c, s = state[1, lane], state[3, lane], cos[lane], sin[lane]
+        force = FORCE if actions[lane] == 1 else -FORCE
+        temp = (force + POLE_MASS_LENGTH * (theta_dot * theta_dot) * s) / TOTAL_MASS
+        theta_acc = (GRAVITY * s - c * temp) / (LENGTH * (4.0 / 3.0 - POLE_MASS * (c * c) / TOTAL_MASS))
+        x_acc = temp - POLE_MASS_LENGTH * theta_acc * c / TOTAL_MASS
+        state[0, lane] += TAU * x_dot
+        state[2, lane] += TAU * theta_dot
+        state[1, lane] = x_dot + TAU * x_acc
+        state[3, lane] = theta_dot + TAU * theta_acc
+        step[lane] += 1
+        rewards[lane] = 1.0
+        terminated[lane] = abs(state[0, lane]) > X_LIMIT or abs(state[2, lane]) > THETA_LIMIT
+        truncated[lane] = step[lane] >= steps
 
 
 def parse(values: Mapping[str, Any]) -> CartPoleOptions:

@@ -306,6 +306,27 @@ def backward(
 
 
 @kernel
+def largest(values: Any, places: Any) -> None:
+    """Write where values (S, B, A) are the largest (S, B): the first of equal ones, and of NaN, which is above all."""
+    for s in range(values.shape[0]):
+        for b in range(values.shape[1]):
+            place = 0
+            for a in range(1, values.shape[2]):
+                here, found = values[s, b, a], values[s, b, place]
+                if here > found or (here != here and found == found):
+                    place = a
+            places[s, b] = place
+
+
+@kernel
+def chosen(values: Any, places: Any, out: Any) -> None:
+    """Write values[s, b, places[s, b]] (S, B)."""
+    for s in range(values.shape[0]):
+        for b in range(values.shape[1]):
+            out[s, b] = values[s, b, places[s, b]]
+
+
+@kernel
 def chosen_errors(values: Any, chosen: Any, aims: Any, share: Any, errors: Any, cotangents: Any) -> None:
     """Write values[s, b, chosen[s, b]] - aims[s, b] (S, B), and the derivatives of the sum of `share` their squares."""
     for s in range(values.shape[0]):
@@ -318,25 +339,22 @@ def chosen_errors(values: Any, chosen: Any, aims: Any, share: Any, errors: Any, 
 
 
 @kernel
-def pick(rows: Any, draws: Any, filled: int, borders: Any, out: Any) -> None:
-    """Write rows (S, C, N), drawn by numbers (S, B) in [0, 1) among the first `filled`, in blocks of columns.
+def pick(rows: Any, capacity: int, draws: Any, filled: int, first: Any, width: Any, out: Any) -> None:
+    """Write rows (S, capacity, N), drawn by numbers (S, B) in [0, 1) among the first `filled`, in blocks of columns.
 
     Parameters
     ----------
-    borders:
-        Where each block begins, and N.
-    out:
-        Blocks (S, B, n) one behind the other.
+    first, width:
+        Of each column, its place in the first row of its block in `out`, and the numbers of a row there.
     """
     seeds, batch = draws.shape
+    columns = np.uint64(len(first))
     for s in range(seeds):
         for b in range(batch):
-            place = int(draws[s, b] * filled)
-            for block in range(len(borders) - 1):
-                first, width = borders[block], borders[block + 1] - borders[block]
-                begin = seeds * batch * first + (s * batch + b) * width
-                for column in range(width):
-                    out[begin + column] = rows[s, place, first + column]
+            begin = np.uint64(s * capacity + int(draws[s, b] * filled)) * columns
+            sample = np.uint64(s * batch + b)
+            for c in range(columns):
+                out[first[c] + sample * width[c]] = rows[begin + c]
 
 
 @rounded

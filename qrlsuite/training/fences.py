@@ -67,6 +67,9 @@ def seeded(seed: int) -> Iterator[None]:
         torch.set_rng_state(kept[2])
 
 
+_OPEN: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+
+
 class Fence:
     """Refuses calls into plugins that move a global generator; built-in things are not watched.
 
@@ -82,8 +85,7 @@ class Fence:
         self.closed, self.alone = closed, alone
         self._calls: Counter[str] = Counter()
 
-    @contextlib.contextmanager
-    def around(self, call: str, fine: bool = True) -> Iterator[None]:
+    def around(self, call: str, fine: bool = True) -> contextlib.AbstractContextManager[None]:
         """Watch a call.
 
         Parameters
@@ -98,10 +100,13 @@ class Fence:
         PluginError
             If the call moved a global generator.
         """
+        if not self.closed:
+            return _OPEN
         self._calls[call] += 1
-        if not self.closed or (fine and self._calls[call] > FINE_CALLS):
-            yield
-            return
+        return _OPEN if fine and self._calls[call] > FINE_CALLS else self._watched(call)
+
+    @contextlib.contextmanager
+    def _watched(self, call: str) -> Iterator[None]:
         before = _states()
         yield
         if moved := _moved(before, _other_threads() if self.alone is None else not self.alone):

@@ -21,7 +21,6 @@ from qrlsuite.plugins.environments.cartpole import (
     TOTAL_MASS,
     CartPoleLanes,
     CartPoleOptions,
-    advance,
     parse,
 )
 
@@ -38,16 +37,24 @@ def single(stream: int) -> CartPoleEnv:
     return env
 
 
+def pushed_right(*state: float) -> list[float]:
+    env = lanes(1)
+    env.reset(options={"state": np.array([state])})
+    env.step(np.array([1]))
+    after: list[float] = env.state[:, 0].tolist()
+    return after
+
+
 def test_one_step_by_hand() -> None:
     """Pushed to the right at rest and upright: 10 N on both masses, and the pole's angle lags behind."""
-    after = advance(np.zeros((4, 1)), np.array([1]))[:, 0]
+    after = pushed_right(0.0, 0.0, 0.0, 0.0)
     push = FORCE / TOTAL_MASS
     falling = -push / (LENGTH * (4 / 3 - POLE_MASS / TOTAL_MASS))
     assert after[0] == 0
     assert after[2] == 0
     assert after[1] == pytest.approx(TAU * (push - POLE_MASS * LENGTH * falling / TOTAL_MASS))
     assert after[3] == pytest.approx(TAU * falling)
-    tilted = advance(np.array([[0.0], [0.0], [0.1], [0.0]]), np.array([1]))[3, 0]
+    tilted = pushed_right(0.0, 0.0, 0.1, 0.0)[3]
     assert tilted > after[3]
     assert GRAVITY == 9.8
 
