@@ -10,7 +10,7 @@ from qrlsuite.specs import NO_MODEL, ModelSpec
 
 @hookimpl
 def register_models(register: Callable[[ModelSpec], None]) -> None:
-    """Register `mlp`, `fourier`, `cnn`, `gru`, `lstm`, `none`, and `vqc-`, `qlstm-` and `qfwp-BACKEND`."""
+    """Register `mlp`, `tmlp`, `fourier`, `cnn`, `gru`, `lstm`, `none`, and `vqc-`, `qlstm-` and `qfwp-BACKEND`."""
     register(
         ModelSpec(
             name="mlp",
@@ -21,6 +21,17 @@ def register_models(register: Callable[[ModelSpec], None]) -> None:
             population="qrlsuite.plugins.models.mlp:population",
             numerics=2,
             memory="qrlsuite.plugins.models.mlp:memory",
+        )
+    )
+    register(
+        ModelSpec(
+            name="tmlp",
+            summary="Perceptron with tensor networks as weights; options: width, depth, cores, bond, activation",
+            family="classical",
+            options="qrlsuite.plugins.models.tmlp:TMLPOptions",
+            build="qrlsuite.plugins.models.tmlp:build",
+            population="qrlsuite.plugins.models.tmlp:population",
+            memory="qrlsuite.plugins.models.tmlp:memory",
         )
     )
     register(

@@ -19,6 +19,7 @@ from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.leaderboard.shelf.collect import collect
 from qrlsuite.options import parse_setting
 from qrlsuite.plugins.circuits.ansatz import NoOptions
+from qrlsuite.plugins.models.tmlp import contracted
 from qrlsuite.results.store import EntryStore
 from qrlsuite.specs import AnsatzSpec
 from qrlsuite.training import memory
@@ -48,6 +49,7 @@ def agent(model: str, *words: str, seed: int = 0) -> nn.Module:
         ("mlp", ("width=10", "depth=1", "activation=sin"), (73, 0), 0),
         ("fourier", (), (309, 0), 0),
         ("fourier", ("frequencies=51", "train=linear"), (309, 0), 153),
+        ("tmlp", (), (64 * (3 + 3 + 1) + 3 + 64 + 2 * 64 * 4, 0), 0),
     ],
 )
 def test_trainable_and_fixed_numbers(
@@ -66,6 +68,20 @@ def test_fourier_features_are_cosines_and_sines() -> None:
     many = agent("fourier", "frequencies=4000", "bandwidth=3.0").frequencies
     assert many.std().item() == pytest.approx(3.0, rel=0.03)
     assert many.mean().item() == pytest.approx(0.0, abs=0.15)
+
+
+def test_a_tensor_network_stands_for_a_weight() -> None:
+    """By the definition: a sum over the bonds of products of the cores; as wide as the weight of a linear layer."""
+    made = agent("tmlp", "width=27", "cores=3", "bond=2", "activation=sin")
+    p = dict(made.named_parameters())
+    cores = [p[f"a1_{j}"] for j in range(3)]
+    weight = torch.einsum("zaib,bcjd,dekz->aceijk", *cores).reshape(27, 27)
+    x = torch.rand(5, 3, generator=torch.Generator().manual_seed(1))
+    inner = torch.sin(torch.sin(x @ p["w0"].T + p["b0"]) @ weight.T + p["b1"])
+    torch.testing.assert_close(made(x), inner @ p["w2"].T + p["b2"])
+    wide = agent("tmlp", "width=1024", "bond=8")
+    entries = contracted([wide.get_parameter(f"a1_{j}")[None] for j in range(2)])
+    assert entries.std().item() == pytest.approx((3 * 1024) ** -0.5, rel=0.2)
 
 
 def test_the_gain_at_the_input() -> None:
@@ -99,7 +115,10 @@ def test_siren_s_initial_weights() -> None:
         ("fourier", ("frequencies=51", "train=linear")),
         ("mlp", ("width=10", "depth=1", "activation=sin", "input_scale=3.0")),
         ("mlp", ("width=44", "depth=1", "activation=sin", "init=siren")),
-        ("vqc-native", ("qubits=3", "layers=2", "train=scaling")),
+        ("tmlp", ("width=9", "bond=3", "activation=tanh")),
+        ("tmlp", ("width=27", "cores=3", "depth=3")),
+        ("vqc-native", ("qubits=3", "layers=2", "train=scaling", "readout=all-pairs", "output_reuse=2")),
+        ("vqc-native", ("qubits=3", "layers=1", "output_scale=2.0")),
         ("vqc-native", ("qubits=3", "layers=2", "train=linear", "entangled=mean-field")),
     ],
 )
@@ -245,11 +264,13 @@ def test_circuits_without_that_parameter(
         (("frequencies=100000000",), "frequencies = 100000000: Input should be less than or equal to 65536"),
         (("bandwidth=0",), "bandwidth = 0: Input should be greater than 0"),
         (("train=frequencies",), "train = 'frequencies': Input should be 'all' or 'linear'"),
+        (("width=60",), "width = 60: with cores = 2 it is a number to the power 2, such as 64"),
+        (("width=4", "cores=3"), "such as 8"),
     ],
 )
-def test_fourier_s_options(words: tuple[str, ...], message: str) -> None:
+def test_options_of_fourier_and_tmlp(words: tuple[str, ...], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        entry("fourier", *words)
+        entry("tmlp" if words[0].startswith("width") else "fourier", *words)
 
 
 def test_more_features_than_memory_are_refused() -> None:

@@ -362,13 +362,13 @@ def test_readouts_that_cannot_be_are_refused_at_once(values, message):
 def test_values_are_repeated_and_outputs_scaled(linear):
     """The definitions of SimplyQRL: copies side by side, then a layer, then a trained factor for each output."""
     given = small(
-        "native", dtype="float64", linear=linear, readout="product", output_reuse=3, output_scale=2.0
+        "native", dtype="float64", linear=linear, readout="neighbors", output_reuse=3, output_scale=2.0
     )
-    modules = agents(2, given, out=2)
+    modules = agents(2, given, out=5)
     name = "output.factor" if linear else "output.weight"
-    assert torch.equal(modules[0].get_parameter(name), torch.full((2,), 2.0, dtype=torch.float64))
+    assert torch.equal(modules[0].get_parameter(name), torch.full((5,), 2.0, dtype=torch.float64))
     with torch.no_grad():
-        modules[0].get_parameter(name).copy_(torch.tensor([3.0, -1.0]))
+        modules[0].get_parameter(name).copy_(torch.tensor([3.0, -1.0, 0.5, 2.0, -4.0]))
     together, x = vqc.population(modules, given), observations(2, 5, 3, dtype=torch.float64)
     for s, module in enumerate(modules):
         p = dict(module.named_parameters())
@@ -376,7 +376,7 @@ def test_values_are_repeated_and_outputs_scaled(linear):
         circuit = vqc.build_circuit(given)
         quantum = {key: p[f"circuit.{key}"][None] for key in circuit.parameters}
         shown = torch.cat([create_backend("pennylane", circuit)(inner[None], quantum)[0]] * 3, dim=1)
-        shown = shown @ p["output.weight"].T + p["output.bias"] if linear else shown[:, :2]
+        shown = shown @ p["output.weight"].T + p["output.bias"] if linear else shown[:, :5]
         torch.testing.assert_close(module(x[s]), shown * p[name], atol=1e-9, rtol=0)
         assert torch.equal(together(x)[s], module(x[s]))
     faster = agents(1, small("native", output_rate=10.0, output_scale=2.0))[0].learning_rates()

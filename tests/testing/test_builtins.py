@@ -62,6 +62,7 @@ WHERE_OFFERED = {
             "gru",
             "lstm",
             "mlp",
+            "tmlp",
             *(f"{m}-{b}" for m in ("vqc", "qlstm", "qfwp") for b in BACKENDS),
         )
     },
