@@ -70,6 +70,32 @@ def test_values_and_gradients_are_those_of_default_qubit(measure, batch):
         torch.testing.assert_close(got, expected, atol=1e-10, rtol=0)
 
 
+def test_gradients_by_coefficients_of_observables():
+    @qml.qnode(qml.device(NAME, wires=2))
+    def circuit(x, measure):
+        qml.RX(x, 0)
+        qml.CRY(x, [0, 1])
+        return measure()
+
+    def together(x, w):
+        first = w[0] * (w[1] * qml.Z(0) @ qml.Y(1) + qml.X(1))
+        second = qml.Hamiltonian(w[1:], [qml.Z(1), qml.Y(0)])
+        return circuit(x, lambda: (qml.expval(first), qml.expval(second)))
+
+    def apart(x, w):
+        words = qml.Z(0) @ qml.Y(1), qml.X(1), qml.Z(1), qml.Y(0)
+        zy, x1, z1, y0 = circuit(x, lambda: tuple(map(qml.expval, words)))
+        return w[0] * (w[1] * zy + x1), w[1] * z1 + w[2] * y0
+
+    gradients = []
+    for values in (together, apart):
+        w = torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64, requires_grad=True)
+        x = torch.linspace(0, 2, 11, dtype=torch.float64, requires_grad=True)
+        torch.stack(values(x, w)).pow(2).sum().backward()
+        gradients.append((x.grad, w.grad))
+    torch.testing.assert_close(*gradients, atol=1e-10, rtol=0)
+
+
 def test_circuits_of_one_execution_that_differ_in_their_angles_get_their_own_results():
     device, reference = (qml.device(name, wires=2) for name in (NAME, "default.qubit"))
     tapes = [

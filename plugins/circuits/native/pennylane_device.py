@@ -27,7 +27,6 @@ from pennylane.devices.preprocess import (
     decompose,
     device_resolve_dynamic_wires,
     no_sampling,
-    validate_adjoint_trainable_params,
     validate_device_wires,
     validate_measurements,
 )
@@ -267,7 +266,6 @@ class NativeDevice(Device):  # type: ignore[misc]  # PennyLane has no types
     def _add_adjoint(self, program: Any) -> None:
         program.add_transform(no_sampling, name=f"adjoint + {NAME}")
         program.add_transform(adjoint_state_measurements, device_vjp=True)
-        program.add_transform(validate_adjoint_trainable_params)
 
     def _has_adjoint(self, circuit: Circuit) -> bool:
         if any(isinstance(m.obs, SparseHamiltonian) for m in circuit.measurements):
@@ -477,6 +475,7 @@ def _vjp(job: Job, cotangents: Any) -> Any:
     """Return the vector-Jacobian product of a circuit, an array per trainable parameter."""
     circuit = job.circuit
     count = len(job.samples.angles)
+    weights: dict[int, Any] = {}
     if any(isinstance(m, StateMP) for m in circuit.measurements):
         gradient, phase = _state_gradient(job, cotangents)
     else:
@@ -488,7 +487,45 @@ def _vjp(job: Job, cotangents: Any) -> Any:
         given = cotangents if isinstance(cotangents, tuple | list) else [cotangents]
         table = np.stack([np.broadcast_to(np.real(np.asarray(c)).reshape(-1), count) for c in given], axis=1)
         gradient, phase = job.program.gradients(job.samples, observables, table), np.zeros(count)
-    return Gradients(_parameter_gradient(job, index, gradient, phase) for index in circuit.trainable_params)
+        weights = _weight_gradients(job, table)
+    return Gradients(
+        weights[index] if index in weights else _parameter_gradient(job, index, gradient, phase)
+        for index in circuit.trainable_params
+    )
+
+
+def _weight_gradients(job: Job, cotangents: NDArray[np.float64]) -> dict[int, Any]:
+    """Return the gradients by parameters of the observables, by the parameters' indices in the circuit.
+
+    An observable is linear in each of its coefficients: its slope is the difference of two values.
+    """
+    words: list[Word] = []
+    owners: dict[int, int] = {}
+    index = len(job.columns)
+    for number, measurement in enumerate(job.circuit.measurements):
+        observable = measurement.obs
+        for place in range(len(observable.data)):
+            if index in job.circuit.trainable_params:
+                moved = list(observable.data)
+                moved[place] = moved[place] + 1.0
+                sentence = qml.ops.functions.bind_new_parameters(observable, moved).pauli_rep
+                if sentence is None:
+                    raise DeviceError(
+                        f"{measurement}: {NAME} has no adjoint gradient by the entries of a matrix; use "
+                        "'parameter-shift', or coefficients of Pauli matrices"
+                    )
+                before = observable.pauli_rep
+                words += [
+                    _word(word, c - before.get(word, 0.0), len(owners), measurement)
+                    for word, c in sentence.items()
+                    if c != before.get(word, 0.0)
+                ]
+                owners[index] = number
+            index += 1
+    if not owners:
+        return {}
+    slopes = job.program.expectations(job.samples, Observables(len(owners), words))
+    return {index: slopes[:, i] @ cotangents[:, number] for i, (index, number) in enumerate(owners.items())}
 
 
 def _state_gradient(job: Job, cotangents: Any) -> tuple[Any, Any]:
@@ -508,13 +545,11 @@ def _state_gradient(job: Job, cotangents: Any) -> tuple[Any, Any]:
 
 def _parameter_gradient(job: Job, index: int, gradient: Any, phase: Any) -> Any:
     """Return the gradient by one parameter of the circuit: of every sample where the parameter is broadcast."""
-    if index >= len(job.columns):
-        return np.zeros(np.shape(job.circuit.get_parameters(trainable_only=False)[index]))
     column, turn = job.columns[index], job.turns[index]
     value = job.circuit.get_parameters(trainable_only=False)[index]
     if column is None and not turn:
         raise DeviceError(
-            f"{NAME} has no adjoint gradient by a matrix or a prepared state; use 'parameter-shift'"
+            f"{NAME} has no adjoint gradient by the entries of a matrix or state; use 'parameter-shift'"
         )
     total = turn * phase if turn else 0.0
     if column is not None:
