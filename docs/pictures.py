@@ -81,6 +81,10 @@ PICTURES: dict[str, Picture] = {
         "--entry 'mlp width=32' --entry 'mlp width=64' --entry 'vqc-native qubits=6' --entry 'vqc-native qubits=10'",
         ("entries/beam6g/*",),
     ),
+    "diagnose-circuit.png": Plot("diagnose ansatz iqp --qubits 2:16:2", ()),
+    "diagnose-agents.png": Plot(
+        "diagnose 'vqc-native qubits=6' --task beam6g --published", ("entries/beam6g/ddqn-vqc-native-*",)
+    ),
     "fields.png": Plot(
         "plot fields x=parameters y=final_score --task beam6g --published", ("entries/beam6g/*",)
     ),
@@ -135,6 +139,8 @@ CAPTIONS = {
     "study-fidelity-text.png": "The text's replay buffer and copies",
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
+    "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",
+    "diagnose-agents.png": "Trained agents beside themselves before training",
     "policies.png": "What trained agents earn",
     "study-deploy-shots.png": "Trained agents that act with shots",
     "study-deploy-errors.png": "Trained agents that act with gate errors",

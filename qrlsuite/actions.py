@@ -13,6 +13,7 @@ Whole numbers count from 0, also where the environment's do not. What an algorit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,35 @@ def choices(space: spaces.Space[Any]) -> list[int]:
     if isinstance(space, spaces.MultiDiscrete):
         return [int(n) for n in space.nvec.reshape(-1)]
     return [2] * size(space) if isinstance(space, spaces.MultiBinary) else []
+
+
+def information_of_choices(logits: NDArray[np.float64], sizes: Sequence[int]) -> NDArray[np.float64]:
+    """Return the Fisher information of independent softmaxes by their logits.
+
+    Of one softmax with probabilities p it is diag(p) - p p^T: the mean, over choices as they are drawn, of the outer
+    product of the gradient of log p.
+
+    Parameters
+    ----------
+    logits:
+        (..., outputs).
+    sizes:
+        How many choices each softmax has, as `choices` returns them; they sum to the outputs.
+
+    Returns
+    -------
+    NDArray
+        (..., outputs, outputs).
+    """
+    found = np.zeros((*logits.shape, logits.shape[-1]))
+    start = 0
+    for count in sizes:
+        part = slice(start, start + count)
+        p = np.exp(logits[..., part] - logits[..., part].max(axis=-1, keepdims=True))
+        p /= p.sum(axis=-1, keepdims=True)
+        found[..., part, part] = p[..., None] * (np.eye(count) - p[..., None, :])
+        start += count
+    return found
 
 
 def from_units(units: NDArray[np.floating[Any]], space: spaces.Box) -> NDArray[Any]:

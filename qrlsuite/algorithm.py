@@ -93,6 +93,10 @@ class Algorithm(Protocol):
         observation, and `infos` has what the lanes said of it, `action_mask` (S, B, choices) among it. What it
         remembers of an episode is a state of its own, forgotten where one begins: apart from that of training, which
         is in `state_dict`, and neither is in `policy_state`.
+
+        An algorithm whose network makes a policy may have a method `information(outputs)`: for what the first network
+        that it built returned, (S, B, outputs) float64, the Fisher information (S, B, outputs, outputs) of the actions'
+        distribution. Without it, `qrlsuite diagnose` takes outputs for values.
         """
 
     def state_dict(self) -> dict[str, Tensor]:

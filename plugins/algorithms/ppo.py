@@ -62,7 +62,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite import masks
-from qrlsuite.actions import choices, from_units, size
+from qrlsuite.actions import choices, from_units, information_of_choices, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.options import Since, Tuned
@@ -147,6 +147,10 @@ class Choices:
             entropies.append(-(log_policy.exp() * log_policy).sum(-1))
         return _total(log_probs), _total(entropies)
 
+    def information(self, outputs: FloatArray) -> FloatArray:
+        """Return the Fisher information (..., outputs, outputs) of pi."""
+        return information_of_choices(outputs, self.sizes)
+
     def lanes(self, chosen: Tensor) -> NDArray[Any]:
         """Return actions (..., numbers) as the environments take them."""
         shape = (*chosen.shape[:-1], *(self.space.shape or ()))
@@ -192,6 +196,11 @@ class Gaussian(nn.Module):
         away = (chosen - outputs) * (-log_spread).exp()
         log_probs = (-0.5 * away.square() - log_spread - HALF_LOG_2_PI).sum(-1)
         return log_probs, (log_spread + 0.5 + HALF_LOG_2_PI).sum(-1)
+
+    def information(self, outputs: FloatArray) -> FloatArray:
+        """Return the Fisher information (S, ..., numbers, numbers) of pi, by its means."""
+        spread = self._spread(torch.from_numpy(outputs)).detach().cpu().double().exp().numpy()
+        return np.asarray(np.eye(self.numbers) * np.broadcast_to(spread**-2.0, outputs.shape)[..., None])
 
     def lanes(self, chosen: Tensor) -> NDArray[Any]:
         """Return u (..., numbers) as the environments take them."""
@@ -546,6 +555,10 @@ class PPO:
         noise = [self.policy.noise(g, outputs.shape[1]) for g in self._validation]
         drawn = torch.from_numpy(np.stack(noise).astype(np.float32)).to(self.device)
         return self.policy.lanes(self.policy.draw(outputs, drawn))
+
+    def information(self, outputs: FloatArray) -> FloatArray:
+        """Return the Fisher information of the policy by the actor's outputs, see `qrlsuite.algorithm.Algorithm`."""
+        return self.policy.information(outputs)
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the actor's parameters and buffers, and the spreads of continuous actions."""

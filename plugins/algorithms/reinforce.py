@@ -42,6 +42,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from qrlsuite import masks
+from qrlsuite.actions import information_of_choices
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
@@ -322,6 +323,10 @@ class Reinforce:
         seen = masks.behind(torch.from_numpy(observations).to(self.device), infos)
         result: NDArray[np.int64] = self._logits(seen).argmax(2).cpu().numpy()
         return result
+
+    def information(self, outputs: FloatArray) -> FloatArray:
+        """Return the Fisher information of the policy by its logits, see `qrlsuite.algorithm.Algorithm`."""
+        return information_of_choices(outputs, [self.n_actions])
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the policy network's parameters and buffers."""

@@ -51,7 +51,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite import masks
-from qrlsuite.actions import from_units, size
+from qrlsuite.actions import from_units, information_of_choices, size
 from qrlsuite.algorithm import BuildModel, Memory
 from qrlsuite.environment import LaneEnv, arrived
 from qrlsuite.errors import OptionError
@@ -330,6 +330,17 @@ class SAC:
         if self.discrete:
             return self._lanes(self._logits(masks.behind(seen, infos)).argmax(2, keepdim=True))
         return self._lanes(torch.tanh(self._policy(seen)[0]))
+
+    def information(self, outputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Fisher information of the policy by the actor's outputs, see `qrlsuite.algorithm.Algorithm`.
+
+        The hyperbolic tangent, which maps the normal one to one, changes nothing of it.
+        """
+        if self.discrete:
+            return information_of_choices(outputs, [self.N])
+        of_means = np.exp(-2.0 * outputs[..., self.N :].clip(*LOG_SPREAD))
+        diagonal = np.concatenate([of_means, np.full_like(of_means, 2.0)], axis=-1)
+        return np.asarray(np.eye(2 * self.N) * diagonal[..., None])
 
     def policy_state(self) -> dict[str, Tensor]:
         """Return the policy's parameters and buffers."""

@@ -91,9 +91,7 @@ class Remembering(vqc._Hybrid):
 
     def circuit_states(self, x: Tensor) -> Tensor:
         """Refuse: they depend on what is remembered, too."""
-        raise OptionError(
-            "--entanglement: the states of circuits that remember are not known by observations alone"
-        )
+        raise OptionError("the states of circuits that remember are not known by observations alone")
 
     def measured(
         self, inputs: Tensor, parameters: dict[str, Tensor], seeds: list[int] | None, circuits: int

@@ -9,6 +9,8 @@
     api.board("beam6g", by="executions", published=True)
     api.plot("curves", entries=[small, large])
     api.evaluate("mlp width=16", best=4)
+    api.diagnose("mlp width=16")
+    api.diagnose_ansatz("iqp", qubits="4:12")
     api.play("mlp width=16").save("episode.gif")
     api.run_study("width.toml")
 
@@ -24,6 +26,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from qrlsuite.api.diagnosis import diagnose, diagnose_ansatz
     from qrlsuite.api.entries import board, compare, load, plot
     from qrlsuite.api.external import import_curves
     from qrlsuite.api.own import register
@@ -33,11 +36,12 @@ if TYPE_CHECKING:
     from qrlsuite.api.training import evaluate, train, tune
 
 __all__ = [
-    "board", "compare", "evaluate", "import_curves", "load", "new_study", "play", "plot", "read_study", "register",
-    "run_study", "table", "train", "tune",
+    "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "import_curves", "load", "new_study", "play", "plot",
+    "read_study", "register", "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _MODULES = {
+    "diagnosis": ("diagnose", "diagnose_ansatz"),
     "entries": ("board", "compare", "load", "plot"),
     "external": ("import_curves",),
     "own": ("register",),

@@ -20,7 +20,6 @@ from qrlsuite.engine.display import Bar
 from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, UnknownNameError
 from qrlsuite.experiment.task import Task, load
-from qrlsuite.leaderboard.pictures import entanglement as entanglement_picture
 from qrlsuite.leaderboard.pictures import histogram
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.leaderboard.shelf import published as published_entries
@@ -30,7 +29,6 @@ from qrlsuite.notation import parse_named
 from qrlsuite.results.store import EntryStore, entries
 from qrlsuite.training import evaluation
 from qrlsuite.training.deployment import Deployment, steps_per_episode
-from qrlsuite.training.entanglement import PARAMETERS, Entanglement, along_episodes
 from qrlsuite.training.evaluation import Played
 
 WIDE = 100
@@ -49,8 +47,6 @@ class Evaluation(Shown):
         Complete episodes of each agent.
     seed:
         The evaluation seed, which fixes the episodes.
-    entanglement:
-        That of the entries' circuits, where it was asked for.
     """
 
     task: str
@@ -58,7 +54,6 @@ class Evaluation(Shown):
     policies: tuple[Played, ...]
     episodes: int
     seed: int
-    entanglement: tuple[Entanglement, ...] = ()
     score: str = "score"
     """What the task ranks: `score`, or the name of a metric."""
 
@@ -71,13 +66,10 @@ class Evaluation(Shown):
             "episodes": self.episodes,
             "selection": "last validation score",
             "policies": [each.summary() for each in self.policies],
-            **({"entanglement": [each.as_dict() for each in self.entanglement]} if self.entanglement else {}),
         }
 
     def figure(self) -> Figure:
-        """Draw the histogram of the episodes' sums of rewards, or the entanglement where it was asked for."""
-        if self.entanglement:
-            return entanglement_picture.draw(self.entanglement, title=self.task)
+        """Draw the histogram of the episodes' sums of rewards."""
         note = ""
         if any(each.seeds for each in self.policies):
             note = (
@@ -122,30 +114,6 @@ class Evaluation(Shown):
             row += [""] * (len(names) - len(row))
             table.add_row(*(Text(row[i]) for i in shown))
         yield table
-        if self.entanglement:
-            yield self._entanglement()
-
-    def _entanglement(self) -> Table:
-        """Return a row per entry and parameters: means over agents, episodes and steps."""
-        table = Table(
-            title=Text("entanglement of the circuits' states along the episodes"),
-            title_justify="left",
-            header_style="bold",
-            box=box.SIMPLE_HEAD,
-            caption=Text(
-                "meyer-wallach: 0 for products, 1 at most; half-cut entropy: bits, n // 2 at most; means over agents, "
-                "episodes and steps; initial: the same agents before training, on the same observations"
-            ),
-            caption_justify="left",
-            pad_edge=False,
-        )
-        for name in ("policy", "parameters", "meyer-wallach", "half-cut entropy", "at most"):
-            table.add_column(Text(name), justify="left" if name in ("policy", "parameters") else "right")
-        for each in self.entanglement:
-            for which in PARAMETERS:
-                means = [f"{np.nanmean(by_network[which]):.3f}" for by_network in each.values.values()]
-                table.add_row(Text(each.name), Text(which), *means, str(each.qubits // 2))
-        return table
 
     def _notes(self) -> list[str]:
         """Say how the agents were chosen, and what the choice promised against what came."""
@@ -179,7 +147,6 @@ def evaluate(
     seed: int = 0,
     device: str = "cpu",
     progress: bool = True,
-    entanglement: bool = False,
     backend: str | None = None,
     yes: bool = False,
     published: bool = False,
@@ -200,8 +167,6 @@ def evaluate(
         As for `qrlsuite.training.evaluation.trained`.
     progress:
         Whether to show a bar.
-    entanglement:
-        Measure the entanglement of every entry's circuit, too.
     backend:
         Play every entry with its circuits on this backend, too: `qiskit shots=1000`, see
         `qrlsuite.training.deployment`. What this costs is said first; finished episodes are kept.
@@ -237,9 +202,6 @@ def evaluate(
         if not each.simulator and not yes:
             raise OptionError(f"{each.name} is no simulator: {cost}; add --yes to execute them")
         console.print(f"{each.name}: {cost}", soft_wrap=True)
-    measured = (
-        tuple(along_episodes(s, best, episodes, seed, device, on) for s in stores) if entanglement else ()
-    )
     bar = Bar(console, TimeRemainingColumn())
 
     def report(name: str, done: int, total: int) -> None:
@@ -268,7 +230,6 @@ def evaluate(
         (*played, *elsewhere, *references),
         episodes,
         seed,
-        measured,
         entry.task.file.score.called,
     )
 

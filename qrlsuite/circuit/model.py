@@ -16,7 +16,7 @@ class CircuitModel(Protocol):
     """What `build` and `population` of a model with a circuit return, beside a `torch.nn.Module`.
 
     The suite recognizes such a network by these attributes: it counts executions, prepares the circuit before the first
-    epoch, evaluates the agents on other backends and measures their entanglement. A network that has `executions` must
+    epoch, evaluates the agents on other backends and diagnoses them. A network that has `executions` must
     have the others, too.
     """
 

@@ -62,6 +62,9 @@ BUILT_IN = {
         LazyCommand(
             "evaluate", "Play trained agents against reference policies.", f"{_ROOM}.evaluate:evaluate"
         ),
+        LazyCommand(
+            "diagnose", "Gradients, Fisher information, entanglement, ...", f"{_ROOM}.diagnose:diagnose"
+        ),
         LazyCommand("play", "Show an episode of a trained agent.", f"{_ROOM}.play:play"),
         LazyCommand("tune", "Search settings on seeds of their own.", f"{_ROOM}.tune:tune"),
         LazyCommand(
@@ -145,7 +148,7 @@ RENAMED_OPTIONS = {
                         "--looks '20,40,60 alpha=.01 margin=.1 first_seed=10000', as the file's table [looks] has it"),
     },
     "verify": {"--choice": "--rerun '2 choice=31'"},
-    "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'"},
+    "evaluate": {"--backend-set": "--backend 'qiskit shots=1000'", "--entanglement": "qrlsuite diagnose ENTRY"},
     "": {
         "--minutes": "--budget 30min",
         **dict.fromkeys(("--partition", "--time", "--engine-set"), _ENGINE),

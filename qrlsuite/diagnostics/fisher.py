@@ -23,8 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-TOLERANCE = 1e-10
-"""Eigenvalues below this part of the largest are rounding, of Jacobians in float64."""
+TOLERANCE = 1e-20
+"""Eigenvalues below this part of the largest are rounding: singular values of Jacobians in float64 have 10 digits."""
+
+ROUNDING = 1e-14
+"""Eigenvalues of a metric below this part of the largest are rounding."""
 
 
 class Information(NamedTuple):
@@ -48,7 +51,7 @@ class Information(NamedTuple):
         return int(np.count_nonzero(self.eigenvalues))
 
 
-def information(jacobians: Array, metric: Array | None = None, tolerance: float = TOLERANCE) -> Information:
+def information(jacobians: Array, metric: Array | None = None) -> Information:
     """Return the Fisher information of parameters from Jacobians at N states.
 
     Parameters
@@ -57,8 +60,6 @@ def information(jacobians: Array, metric: Array | None = None, tolerance: float 
         (N, O, P).
     metric:
         (N, O, O), the Fisher information A of the outputs at each state; None stands for the identity.
-    tolerance:
-        Eigenvalues below this part of the largest are 0.
 
     Returns
     -------
@@ -70,18 +71,11 @@ def information(jacobians: Array, metric: Array | None = None, tolerance: float 
     _, values, directions = np.linalg.svd(rows.reshape(-1, size) / math.sqrt(states), full_matrices=False)
     eigenvalues = np.zeros(size)
     eigenvalues[: len(values)] = np.square(values)
-    eigenvalues[eigenvalues <= tolerance * eigenvalues[0]] = 0.0
+    eigenvalues[eigenvalues <= TOLERANCE * eigenvalues[0]] = 0.0
     gauge = np.full(size, np.nan)
     if states * outputs >= 2 * size:
         gauge = 1.0 - np.square(directions[: np.count_nonzero(eigenvalues)]).sum(axis=0)
     return Information(eigenvalues, gauge)
-
-
-def softmax_metric(logits: Array) -> Array:
-    """Return the Fisher information diag(p) - p p^T (..., O, O) of a softmax's logits (..., O)."""
-    p = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    p /= p.sum(axis=-1, keepdims=True)
-    return np.asarray(p[..., None] * (np.eye(p.shape[-1]) - p[..., None, :]))
 
 
 def effective_dimension(
@@ -141,4 +135,5 @@ def shares(gauge: Array, sizes: Mapping[str, int]) -> dict[str, float]:
 def _root(metric: Array) -> Array:
     """Return R with R^T R = A, for positive semidefinite A (..., O, O)."""
     values, vectors = np.linalg.eigh(metric)
-    return np.asarray(np.sqrt(np.clip(values, 0.0, None))[..., None] * np.swapaxes(vectors, -1, -2))
+    values = np.where(values > ROUNDING * values[..., -1:], values, 0.0)
+    return np.asarray(np.sqrt(values)[..., None] * np.swapaxes(vectors, -1, -2))

@@ -71,8 +71,9 @@ def factor_per_qubit(qubits: Sequence[int], gradients: Sequence[Array], seed: in
     if len(gradients) < 2:
         return None
     values = np.stack([_resampled(each, seed + k) for k, each in enumerate(gradients)])
-    if not np.all(values > 0):
+    if not np.all(values[:, 0] > 0):
         return None
+    values = values[:, np.all(values > 0, axis=0)]  # of few draws, a resample may be one draw again and again
     away = np.asarray(qubits, np.float64) - np.mean(qubits)
     slopes = away @ np.log2(values) / (away @ away)
     return Estimate(*_summary(2.0**slopes))

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import unitary_group
 
+from qrlsuite.actions import information_of_choices
 from qrlsuite.circuit import Circuit, ansatz
 from qrlsuite.circuit.jacobian import jacobians
 from qrlsuite.diagnostics import circuits, fisher, fourier, gradients, states
@@ -99,13 +100,13 @@ def test_fisher_information_of_a_softmax_is_the_mean_of_the_scores_outer_product
     p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
     scores = J - (p[..., None] * J).sum(1, keepdims=True)
     expected = np.einsum("sa,sap,saq->pq", p, scores, scores) / 5
-    found = fisher.information(J, fisher.softmax_metric(logits))
+    found = fisher.information(J, information_of_choices(logits, [3]))
     np.testing.assert_allclose(found.eigenvalues, np.linalg.eigvalsh(expected)[::-1], rtol=1e-10)
     shifted = np.concatenate(
         [J, np.ones((5, 3, 1))], axis=2
     )  # a number added to all logits changes no policy
     np.testing.assert_allclose(
-        fisher.information(shifted, fisher.softmax_metric(logits)).gauge, [0, 0, 0, 0, 1], atol=1e-10
+        fisher.information(shifted, information_of_choices(logits, [3])).gauge, [0, 0, 0, 0, 1], atol=1e-10
     )
     assert np.isnan(fisher.information(J[:2]).gauge).all()  # too few states to tell
 

@@ -95,5 +95,5 @@ def test_what_it_cannot_be_is_refused(tiny_task: str) -> None:
         qlstm.build(2, 3, small, torch.Generator())
     with pytest.raises(OptionError, match=r"take one of drqn, ppo: qrlsuite run 'drqn qlstm-native'"):
         Trainer(resolve(tiny_task, "qlstm-native", "ddqn", [parse_setting("qubits=2")]), [0])
-    with pytest.raises(OptionError, match="--entanglement: the states of circuits that remember"):
+    with pytest.raises(OptionError, match="the states of circuits that remember"):
         agents()[0].circuit_states(torch.zeros(2, 1, 2))

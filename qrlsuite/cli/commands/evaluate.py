@@ -42,14 +42,6 @@ def evaluate(
         int,
         typer.Option("--seed", min=0, help="Seed of the episodes, which are the same for all policies."),
     ] = 0,
-    entanglement: Annotated[
-        bool,
-        typer.Option(
-            "--entanglement",
-            help="Measure how entangled the circuits' states are along the episodes, trained and initial; --out draws "
-            "it.",
-        ),
-    ] = False,
     backend: Annotated[
         str | None,
         typer.Option(
@@ -106,7 +98,6 @@ def evaluate(
         episodes=episodes,
         seed=seed,
         progress=not json_output,
-        entanglement=entanglement,
         backend=backend,
         yes=yes,
         published=published,
