@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from qrlsuite import api as api
     from qrlsuite.api import board as board
     from qrlsuite.api import compare as compare
+    from qrlsuite.api import diagnose as diagnose
+    from qrlsuite.api import diagnose_ansatz as diagnose_ansatz
     from qrlsuite.api import evaluate as evaluate
     from qrlsuite.api import import_curves as import_curves
     from qrlsuite.api import load as load
@@ -39,9 +41,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.1"
 
 __all__ = [
-    "Circuit", "__version__", "api", "board", "compare", "evaluate", "hookimpl", "import_curves", "layer", "load",
-    "new_study", "play", "plot", "read_study", "register", "register_environments", "run_study", "table", "train",
-    "tune",
+    "Circuit", "__version__", "api", "board", "compare", "diagnose", "diagnose_ansatz", "evaluate", "hookimpl",
+    "import_curves", "layer", "load", "new_study", "play", "plot", "read_study", "register", "register_environments",
+    "run_study", "table", "train", "tune",
 ]  # fmt: skip
 
 _FROM_API = frozenset(__all__) - {
