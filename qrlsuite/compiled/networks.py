@@ -177,11 +177,12 @@ def _turn(source: Any, begin: int, rows: int, columns: int, samples: int, target
 @inlined
 def _fill(values: Any, seed: int, start: int, samples: int, rows: Any) -> None:
     """Transpose a chunk of values (S, B, F) into rows; zeros where there is no sample."""
+    own = values[seed, start : start + samples]
     for f in range(values.shape[2]):
+        row = rows[f]
         for v in range(samples):
-            rows[f, v] = values[seed, start + v, f]
-        for v in range(samples, rows.shape[1]):
-            rows[f, v] = 0.0
+            row[v] = own[v, f]
+        row[samples:] = 0.0
 
 
 @kernel
@@ -219,9 +220,11 @@ def forward(x: Any, parameters: Any, sizes: Any, activation: int, records: Any, 
                     activation if layer < last else NOTHING, rows, slopes + begin + i, 2 * samples > wide,
                 )  # fmt: skip
                 begin, place = begin + i, place + seeds * o * (i + 1)
+            own = out[s, start : start + samples]
             for j in range(out.shape[2]):
+                row = rows[begin + j]
                 for v in range(samples):
-                    out[s, start + v, j] = rows[begin + j, v]
+                    own[v, j] = row[v]
 
 
 @kernel
@@ -298,10 +301,12 @@ def backward(
             place -= seeds * o * (i + 1)
             columns = -(-max(i, o) // vector) * vector
             for j in range(o):
-                for k in range(i):
-                    gradients[place + (s * o + j) * i + k] = sums[
-                        at + (j * columns + k if i >= o else k * columns + j)
-                    ]
+                gradient = gradients[place + (s * o + j) * i : place + (s * o + j + 1) * i]
+                if i >= o:
+                    gradient[:] = sums[at + j * columns : at + j * columns + i]
+                else:
+                    for k in range(i):
+                        gradient[k] = sums[at + k * columns + j]
             at += min(i, o) * columns
 
 
@@ -382,9 +387,14 @@ def adam(
             place = end
             if active[s]:
                 rate, r = rates[block, s], root[s]
-                for i in range(first, end):
-                    g = gradients[i]
-                    m = means[i] + share1 * (g - means[i])
-                    v = keep2 * squares[i] + share2 * g * g
-                    means[i], squares[i] = m, v
-                    parameters[i] -= rate * m / (r * np.sqrt(v) + eps)
+                own, slope = (
+                    parameters[first:end],
+                    gradients[first:end],
+                )  # of slices, loops have no index below 0
+                mean, square = means[first:end], squares[first:end]
+                for i in range(end - first):
+                    g = slope[i]
+                    m = mean[i] + share1 * (g - mean[i])
+                    v = keep2 * square[i] + share2 * g * g
+                    mean[i], square[i] = m, v
+                    own[i] -= rate * m / (r * np.sqrt(v) + eps)
