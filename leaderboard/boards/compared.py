@@ -150,20 +150,28 @@ SYMBOLS = {
 """What a cell of a comparison looks like; the sign says everything, the color only helps."""
 
 
+LONGEST_WORD = 14
+"""Letters that a column's head may have side by side; entries with longer words in their labels are A and B."""
+
+
 def pair_table(pair: PairVerdict) -> Table:
     """Return two entries threshold by threshold as a table."""
     heading, *labels, size, p, verdict = pair.columns()
-    heads = ("\n".join(textwrap.wrap(label, 9, break_long_words=False)) for label in labels)
+    heads = ["\n".join(textwrap.wrap(label, 9, break_long_words=False)) for label in labels]
+    notes = pair.notes
+    if max(len(word) for label in labels for word in label.split()) > LONGEST_WORD:
+        heads, verdict = ["A", "B"], "A needs"
+        notes = [f"A: {labels[0]}; B: {labels[1]}", *notes]
     result = Table(
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         show_edge=False,
-        caption="\n".join(pair.notes),
+        caption="\n".join(notes),
         caption_justify="left",
     )
     for name in (heading, *heads, size, p):
         result.add_column(Text(name), justify="right", no_wrap=True)
-    result.add_column(Text(verdict), overflow="fold")
+    result.add_column(Text(verdict), no_wrap=True)
     for row in pair.rows():
         result.add_row(*map(Text, row))
     return result

@@ -67,7 +67,10 @@ def collect(
         for other in copies if published and len(shown) < len(copies) else ():
             if other is not shown[0]:
                 size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
-                refused.append(f"{other.folder}: {size}; shown once, from {shown[0].folder}")
+                kept = f"{len(shown[0].seeds)} of {shown[0].curves.shape[1]}"
+                refused.append(
+                    f"{other.folder}: {size} of an entry of which {shown[0].folder} has {kept}: shown once"
+                )
     return collected, refused
 
 

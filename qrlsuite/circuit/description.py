@@ -76,10 +76,12 @@ ISING: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
     "RYY": (("RX", (math.pi / 2,)), ("RX", (-math.pi / 2,))),
     "RZZ": (),
 }
-"""Rotations exp(-i a PP / 2) of two qubits, which `Circuit.append` writes as CNOT, RZ, CNOT: by what turns both qubits
-before, and back after."""
+"""Rotations exp(-i a PP / 2) of two qubits, which `Circuit.append` writes as CNOT, RZ, CNOT (as one controlled rotation
+in a mean-field approximation): by what turns both qubits before, and back after."""
 
-COMPOSED = {f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"}
+COMPOSED = {f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"} | {
+    f"ISING{axis}{axis}": f"R{axis}{axis}" for axis in "XYZ"
+}
 """Gates that others have, and how to append them here."""
 
 
@@ -368,7 +370,7 @@ class Circuit:
         Parameters
         ----------
         gate:
-            A key of `GATES`; or RXX, RYY, RZZ, which are appended as the CNOTs and rotations that they are made of.
+            A key of `GATES`; or RXX, RYY, RZZ, which are appended as the gates that they are made of.
         wires:
             The qubit, or (control, target) for CNOT, or the pair for CZ, SWAP, RXX, RYY and RZZ.
         angles:
@@ -413,12 +415,26 @@ class Circuit:
         for name, values in turns[:1]:
             for wire in pair:
                 self.append(name, wire, *values)
-        self.append("CNOT", pair)
-        self.append("RZ", pair[1], *angles)
-        self.append("CNOT", pair)
+        if self.mean_field:  # one gate on both qubits, after which correlations are dropped
+            self.append("RZ", pair[1], *angles)
+            self.append("RZ", pair[1], self._twice_back(gate, angles[0]), control=pair[0])
+        else:
+            self.append("CNOT", pair)
+            self.append("RZ", pair[1], *angles)
+            self.append("CNOT", pair)
         for name, values in turns[1:]:
             for wire in pair:
                 self.append(name, wire, *values)
+
+    def _twice_back(self, gate: str, angle: Angle | float) -> Angle | float:
+        """Return -2 times an angle, as exp(-i a ZZ / 2) is RZ(a), and RZ(-2 a) where the first qubit is 1."""
+        try:
+            return -2.0 * angle
+        except CircuitError:
+            raise CircuitError(
+                f"{gate} in a mean-field approximation: its angle is a sum of an input and a parameter; give it one of "
+                f"them alone, or write the gate with one controlled rotation"
+            ) from None
 
     def _check(self, angle: Angle) -> None:
         if not (math.isfinite(angle.constant) and math.isfinite(angle.times)):

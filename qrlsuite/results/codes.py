@@ -23,7 +23,7 @@ from qrlsuite.experiment.identity import CodeIdentity
 from qrlsuite.results import genuine, survey
 from qrlsuite.results.claims import move_away
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import EntryStore, read_json, write_json
+from qrlsuite.results.store import EntryStore, copies_of_plugins, read_json, write_json
 
 UNKNOWN = ""
 """The digest of seeds whose code was not recorded."""
@@ -243,6 +243,7 @@ def require_installed(store: EntryStore, seeds: Collection[int], current: CodeId
                 raise ChangedCodeError(
                     f"{store.path}: seeds {format_seeds(group.seeds)} were trained by another code than is installed: "
                     f"{listed(changed)}; install that code, or say with `qrlsuite run --same` that nothing changed"
+                    f"{copies_of_plugins(store, store.record())}"
                 )
 
 

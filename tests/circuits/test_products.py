@@ -268,6 +268,25 @@ def test_a_mean_field_approximation_measures_any_pauli_of_one_qubit():
     np.testing.assert_allclose(got, [np.sin(0.3), -np.sin(0.4), np.cos(0.3)], atol=1e-12)
 
 
+@pytest.mark.parametrize("gate", ["RXX", "RYY", "RZZ"])
+@pytest.mark.parametrize("angle", [0.0, 0.8])
+def test_a_rotation_of_two_qubits_is_one_gate_of_a_mean_field_approximation(gate, angle):
+    """Its correlations are dropped behind it alone: angle 0 changes nothing."""
+    classical, exact = Circuit(2, inputs=1, mean_field=True), Circuit(2, inputs=1)
+    for circuit in (classical, exact):
+        for q, (a, b) in enumerate([(0.4, 0.9), (1.3, -0.5)]):
+            circuit.append("RY", q, a)
+            circuit.append("RX", q, b)
+        circuit.append(gate, (0, 1), circuit.input(0))
+    got = expectations(
+        classical, [[angle]], {}
+    )  # all that is measured of one qubit each is exact behind one gate
+    np.testing.assert_allclose(got, expectations(exact, [[angle]], {}), atol=1e-12)
+    w = classical.parameter("w", (1,))
+    with pytest.raises(CircuitError, match=f"{gate} in a mean-field approximation: its angle is a sum"):
+        classical.append(gate, (0, 1), classical.input(0) + w[0])
+
+
 @pytest.mark.parametrize("number", [2, 2.0, np.float32(2), np.int64(2)])
 def test_numbers_of_numpy_are_numbers(number):
     x = Circuit(1).input(0)
