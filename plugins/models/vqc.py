@@ -505,7 +505,9 @@ def _require_fit(runner: _Runner, inputs: int, outputs: int, role: str) -> None:
     values = len(circuit.observables) * runner.options.output_reuse
     if circuit.inputs == inputs and values >= outputs:
         return
-    advice = "choose the qubits so that the inputs are as many, and the expectation values no fewer"
+    advice = (
+        "choose qubits, or options of the ansatz, so that inputs are as many, and expectation values no fewer"
+    )
     if role == "critic":
         advice = "set critic=mlp, which takes a perceptron for it, or linear=true"
     raise OptionError(

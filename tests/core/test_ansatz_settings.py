@@ -68,7 +68,7 @@ def test_an_option_that_the_model_hands_on_stays_the_models() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("ansatz=ising", "lr=2"), r"--set algorithm\.lr=\.\.\. or --set ansatz\.lr="),
+        (("ansatz=ising", "lr=2"), r"write algorithm\.lr=\.\.\. or ansatz\.lr="),
         (("ansatz=ising", "couplng=zz"), "--set couplng: no option of that name; did you mean 'coupling'"),
         (
             ("ansatz=ising", "ansatz.couplng=zz"),

@@ -235,7 +235,7 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     own = set(options.field_names(VQCOptions))
     assert own == {
         "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype", "train",
-        "init_scale", "linear", "output_rate", "critic",
+        "init_scale", "linear", "output_rate", "critic", "readout", "output_reuse", "output_scale",
     }  # fmt: skip
     for name in BACKENDS:
         theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, name).options)
