@@ -23,7 +23,7 @@ from qrlsuite.leaderboard.boards.ranked import learning_curves
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.store import MEASURED
 from qrlsuite.statistics import areas, final_scores, last_epochs
-from qrlsuite.statistics.times import times_below
+from qrlsuite.statistics.times import times_below, times_lost
 
 Rows = Literal["entries", "seeds", "epochs"]
 """What a row of a table is."""
@@ -70,6 +70,9 @@ SCORES = (
         _REAL,
         "mean over the task's thresholds (above them where less is better); what boards rank by",
         _STEPS,
+    ),
+    Field(
+        "steps_lost", _REAL, "those of them after a threshold was first reached: what was forgotten", _STEPS
     ),
     Field("final_score", _REAL, "mean score of the last tenth of the epochs"),
     Field("area", _REAL, "mean score of all epochs"),
@@ -232,6 +235,7 @@ def _scores(entry: EntryResults) -> dict[str, NDArray[np.float64]]:
     curves, grid = learning_curves(entry), entry.task_file.ranking.grid
     return {
         "steps_below_threshold": times_below(entry.curves, grid, entry.steps_per_epoch).mean(axis=1),
+        "steps_lost": times_lost(entry.curves, grid, entry.steps_per_epoch).mean(axis=1),
         "final_score": final_scores(curves),
         "area": areas(curves),
     }

@@ -30,6 +30,8 @@ from qrlsuite.training.diagnosis import EPISODES, MEASURES, PARAMETERS, Diagnosi
 
 SAMPLES, GAMMA = 10_000, 1.0
 """n and gamma of effective dimensions."""
+NAMED = 4
+"""Numbers without effect that a table names; --json has all."""
 ABBAS = (
     f"effective dimension: Abbas et al. 2021, n = {SAMPLES}, gamma = {GAMMA:g}; mean trace of the Fisher information "
     "normalized to the number of parameters"
@@ -46,6 +48,8 @@ class Scanned:
         Its size, and how many numbers are trained.
     variances:
         Of the gradient, by readout: `local` and `global`.
+    shapes:
+        Of each parameter of the circuit.
     information:
         Fisher information at each draw of the parameters; None where it is not computed, as all below.
     frequencies, power:
@@ -60,6 +64,7 @@ class Scanned:
     layers: int
     parameters: int
     variances: Mapping[str, Estimate]
+    shapes: Mapping[str, tuple[int, ...]]
     information: Sequence[Information] | None
     frequencies: np.ndarray[Any, np.dtype[np.float64]] | None
     power: np.ndarray[Any, np.dtype[np.float64]] | None
@@ -71,6 +76,13 @@ class Scanned:
     def rank(self) -> int | None:
         """Directions of the parameters that have an effect, at the draw that has most."""
         return None if self.information is None else max(each.rank for each in self.information)
+
+    @property
+    def without_effect(self) -> list[str] | None:
+        """Names of the single parameters that have no effect at any draw."""
+        if self.information is None:
+            return None
+        return fisher.without_effect(np.min([each.gauge for each in self.information], axis=0), self.shapes)
 
     @property
     def effective_dimension(self) -> float | None:
@@ -97,6 +109,7 @@ class Scanned:
             "gradient_variance": {name: each._asdict() for name, each in self.variances.items()},
             "rank": self.rank,
             "gauge_directions": None if self.rank is None else self.parameters - self.rank,
+            "without_effect": self.without_effect,
             "effective_dimension": self.effective_dimension,
             "eigenvalues": None
             if self.information is None
@@ -293,7 +306,11 @@ class AgentsDiagnosis(Shown):
         if not found or sum(found.values()) < 0.05:
             return ""
         parts = ", ".join(f"{name} {share:.1f}" for name, share in found.items() if share >= 0.05)
-        return f"gauge directions of {each.name}, by parameter: {parts}"
+        alone = ", ".join(each.without_effect(PARAMETERS[0])[:NAMED])
+        return (
+            f"gauge directions of {each.name}, by parameter: {parts}"
+            + f"; without effect: {alone}" * bool(alone)
+        )
 
 
 def diagnose_ansatz(
@@ -414,6 +431,7 @@ def _scanned(circuit: Circuit, layers: int, found: Mapping[str, Any], seed: int)
         layers,
         circuit.parameter_count,
         {name: gradients.variance(each, seed) for name, each in found.items()},
+        {name: parameter.shape for name, parameter in circuit.parameters.items()},
         circuits.fisher(circuit, seed=seed) if small else None,
         frequencies,
         power,

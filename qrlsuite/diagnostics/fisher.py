@@ -132,6 +132,20 @@ def shares(gauge: Array, sizes: Mapping[str, int]) -> dict[str, float]:
     return {name: float(part.sum()) for name, part in zip(sizes, np.split(gauge, ends[:-1]))}
 
 
+def without_effect(gauge: Array, shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Return the names of single numbers that have no effect, such as `weights[3, 0, 2]`.
+
+    Parameters
+    ----------
+    gauge:
+        (P,), see `Information`.
+    shapes:
+        Shape of each named part of the parameters, in C order; they have P numbers.
+    """
+    names = [f"{name}{list(index)}" for name, shape in shapes.items() for index in np.ndindex(shape)]
+    return [name for name, part in zip(names, gauge, strict=True) if part > 1.0 - 1e-6]
+
+
 def _root(metric: Array) -> Array:
     """Return R with R^T R = A, for positive semidefinite A (..., O, O)."""
     values, vectors = np.linalg.eigh(metric)

@@ -53,6 +53,21 @@ def times_below(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray
     return epochs_of_runs(values, grid) * whole(steps_per_epoch, "steps_per_epoch", at_least=1)
 
 
+def times_lost(curves: ArrayLike, grid: Grid, steps_per_epoch: int) -> IntArray:
+    """Return, shape (N, E), the part of `times_below` after each threshold was first reached: what was forgotten.
+
+    It is 0 for a run that never loses a threshold again, and for one that never reaches it.
+
+    Examples
+    --------
+    >>> times_lost([[0.0, 0.9, 0.5, 0.9], [0.0, 0.0, 0.0, 0.0]], Grid.relative([0.1], [0.5]), 2000).tolist()
+    [[2000], [0]]
+    """
+    there = reached(checked(curves, relative=grid.epsilons is not None), grid)
+    lost = np.count_nonzero(np.logical_or.accumulate(there, axis=1) & ~there, axis=1).T.astype(np.int64)
+    return np.asarray(lost * whole(steps_per_epoch, "steps_per_epoch", at_least=1))
+
+
 def epochs_of_runs(curves: Curve, grid: Grid) -> IntArray:
     """Return, shape (N, E), the number of epochs before each threshold, for checked curves of shape (N, T)."""
     epochs: IntArray = (curves.shape[1] - np.count_nonzero(reached(curves, grid), axis=1)).T.astype(np.int64)

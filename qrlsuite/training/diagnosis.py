@@ -14,6 +14,7 @@ Circuits are computed exactly, by the native simulator, whatever they were train
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -61,8 +62,8 @@ class Diagnosis:
         Seeds of the agents.
     outputs:
         `policy` where the Fisher information is that of the policy, else `values`: Gaussians of unit variance.
-    sizes:
-        Numbers that learn in each of the network's parameters.
+    shapes:
+        Of each of the network's parameters that learn, of one agent.
     information:
         Of each agent; empty for a network that remembers, whose outputs depend on more than its input.
     powers:
@@ -79,7 +80,7 @@ class Diagnosis:
     name: str
     seeds: tuple[int, ...]
     outputs: str
-    sizes: Mapping[str, int]
+    shapes: Mapping[str, tuple[int, ...]]
     information: Mapping[str, tuple[fisher.Information, ...]]
     powers: Mapping[str, Array]
     qubits: int | None
@@ -89,7 +90,7 @@ class Diagnosis:
     @property
     def parameters(self) -> int:
         """Numbers of an agent that learn."""
-        return sum(self.sizes.values())
+        return sum(map(math.prod, self.shapes.values()))
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values; of entanglement mean and percentiles over agents, episodes and steps."""
@@ -107,6 +108,7 @@ class Diagnosis:
                 row["rank"] = [each.rank for each in infos]
                 row["eigenvalues"] = [each.eigenvalues[: each.rank].tolist() for each in infos]
                 row["gauge_directions"] = self.gauge(which)
+                row["without_effect"] = self.without_effect(which)
                 row["mean_frequency"] = [fourier.mean_frequency(each) for each in self.powers[which]]
                 row["power"] = self.powers[which].mean(axis=0).tolist()
             if self.entanglement:
@@ -122,7 +124,13 @@ class Diagnosis:
     def gauge(self, which: str) -> dict[str, float] | None:
         """Return how many gauge directions each of the network's parameters has, mean over agents; None if unknown."""
         known = [each.gauge for each in self.information[which] if not np.isnan(each.gauge).any()]
-        return fisher.shares(np.mean(known, axis=0), self.sizes) if known else None
+        sizes = {name: math.prod(shape) for name, shape in self.shapes.items()}
+        return fisher.shares(np.mean(known, axis=0), sizes) if known else None
+
+    def without_effect(self, which: str) -> list[str]:
+        """Return the names of the single numbers that have no effect, of any agent."""
+        known = [each.gauge for each in self.information[which]]
+        return fisher.without_effect(np.min(known, axis=0), self.shapes)
 
 
 def along_episodes(
@@ -167,7 +175,7 @@ def along_episodes(
         which: getattr(trainer.algorithm, "information", None) for which, trainer in trainers.items()
     }
     learned = {n: p for n, p in networks["trained"].named_parameters() if p.requires_grad}
-    sizes = {name: p[0].numel() for name, p in learned.items()}
+    shapes = {name: tuple(p.shape[1:]) for name, p in learned.items()}
     information: dict[str, tuple[fisher.Information, ...]] = {}
     powers: dict[str, Array] = {}
     steps = np.unique(np.linspace(0, len(inputs) - 1, STEPS).round().astype(np.int64))
@@ -178,7 +186,7 @@ def along_episodes(
             exact = copy.deepcopy(network).double()
             with torch.no_grad():
                 outputs = exact.forward(inputs[0][:, :1].double()).shape[-1]
-            enough = min(-(-2 * sum(sizes.values()) // outputs) + 8, MOST_STATES)
+            enough = min(-(-2 * sum(map(math.prod, shapes.values())) // outputs) + 8, MOST_STATES)
             x = _inputs(inputs, lengths, enough)
             information[which] = _information(exact, x, of_outputs[which], which, report)
             powers[which] = _powers(exact, inputs, lengths)
@@ -189,7 +197,7 @@ def along_episodes(
         evaluation.policy_name(store, on),
         tuple(seeds),
         "values" if of_outputs["trained"] is None else "policy",
-        sizes,
+        shapes,
         information,
         powers,
         qubits,

@@ -88,6 +88,7 @@ def test_fisher_information_of_one_qubit() -> None:
         np.testing.assert_allclose(found.eigenvalues, [np.sin(a) ** 2, 0.0], atol=1e-12)
         np.testing.assert_allclose(found.gauge, [0.0, 1.0], atol=1e-12)
         assert fisher.shares(found.gauge, {"a": 1, "b": 1}) == pytest.approx({"a": 0.0, "b": 1.0})
+        assert fisher.without_effect(found.gauge, {"w": (2,)}) == ["w[1]"]
     p = (1 + np.cos(angles)) / 2
     of_probabilities = np.stack([np.diag(1 / np.array([each, 1 - each])) for each in p])
     both = np.concatenate([J, -J], axis=1) / 2

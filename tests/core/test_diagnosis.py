@@ -101,6 +101,7 @@ def test_gauge_directions_of_a_policy_hold_what_is_added_to_all_logits(train: Tr
     assert found.outputs == "policy"
     gauge = found.gauge("trained")
     assert gauge is not None
+    assert "circuit.weights[1, 1, 2]" in found.without_effect("trained")
     assert gauge["output.bias"] == pytest.approx(1.0, abs=1e-6)
 
 
@@ -136,6 +137,7 @@ def test_a_circuit_over_its_size(tmp_path: Path) -> None:
         (n, law) for law in (1, 2) for n in (1, 2, 3)
     ]
     assert list(sizes[0]["gradient_variance"]) == ["local"]
+    assert sizes[5]["without_effect"][-1] == "weights[1, 2, 2]"  # the last RZ
     assert sizes[5]["rank"] + sizes[5]["gauge_directions"] == sizes[5]["parameters"] == 36
 
 

@@ -50,6 +50,7 @@ def test_an_entry_is_a_row_whose_numbers_are_those_of_boards(published: list[Ent
     for row, entry in zip(rows, published):
         curves = learning_curves(entry)
         assert row["steps_below_threshold"] == mean_time(curves, entry.task_file.ranking.grid).mean
+        assert 0 <= row["steps_lost"] < row["steps_below_threshold"]
         assert row["final_score"] == final_scores(curves).mean()
         assert row["area"] == pytest.approx(entry.curves.mean())
         assert (row["entry"], row["name"], row["source"]) == (entry.label, entry.name, "published")

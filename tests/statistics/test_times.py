@@ -13,6 +13,7 @@ import pytest
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import Grid, LearningCurves, mean_time, times, times_below
 from qrlsuite.statistics.estimator import complexity
+from qrlsuite.statistics.times import times_lost
 from tests.statistics.conftest import SURFACE, entry
 
 CELL = Grid.relative([0.1, 0.5], [0.5])
@@ -25,6 +26,13 @@ def test_by_hand() -> None:
     assert (times_below(curves, absolute, 100) == times_below(curves, CELL, 100)).all()
     assert times.epochs_of_runs(np.array(curves, np.float32), CELL).tolist() == [[2, 1], [1, 1], [3, 3]]
     assert doctest.testmod(times).attempted
+
+
+def test_what_is_lost_after_a_threshold_was_first_reached() -> None:
+    two = Grid.relative([0.5, 0.1], [0.5])
+    curves = [[0.0, 0.6, 0.4, 0.9, 0.6], [0.6, 0.9, 0.9, 0.9, 0.9], [0.0, 0.0, 0.0, 0.0, 0.0]]
+    assert times_lost(curves, two, 10).tolist() == [[10, 10], [0, 0], [0, 0]]
+    assert (times_lost(curves, two, 10) <= times_below(curves, two, 10)).all()
 
 
 @pytest.mark.parametrize("index", [0, 1])
