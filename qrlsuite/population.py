@@ -144,30 +144,20 @@ def _sweep_of(population: nn.Module) -> Sweep | None:
 def best(population: nn.Module, x: Tensor) -> Tensor:
     """Return which output is the largest (S, B), the first of equal ones, for x (S, B, in)."""
     whole = _sweep_of(population)
-    if whole is None or not compilable(x):
+    if whole is None or not compilable(x) or x.requires_grad:
         with torch.no_grad():
             found: Tensor = population(x).argmax(2)
         return found
-    from qrlsuite.compiled import networks
-
-    values = whole.values(x.contiguous().numpy(), False)[0]
-    places = np.empty(values.shape[:2], np.int64)
-    networks.largest(values, places)
-    return torch.from_numpy(places)
+    return torch.from_numpy(whole.best(x.contiguous().numpy()))
 
 
 def chosen_values(population: nn.Module, x: Tensor, chosen: Tensor) -> Tensor:
     """Return the outputs `chosen` (S, B), one of each sample, (S, B), for x (S, B, in); without gradients."""
     whole = _sweep_of(population)
-    if whole is None or not compilable(x):
+    if whole is None or not compilable(x) or x.requires_grad:
         with torch.no_grad():
             return _chosen(population(x), chosen)
-    from qrlsuite.compiled import networks
-
-    values = whole.values(x.contiguous().numpy(), False)[0]
-    out = np.empty(values.shape[:2], np.float32)
-    networks.chosen(values, chosen.numpy(), out)
-    return torch.from_numpy(out)
+    return torch.from_numpy(whole.chosen(x.contiguous().numpy(), chosen.contiguous().numpy()))
 
 
 def _chosen(values: Tensor, chosen: Tensor) -> Tensor:
@@ -198,15 +188,8 @@ def chosen_errors(population: nn.Module, x: Tensor, chosen: Tensor, aims: Tensor
         errors = _chosen(population(x), chosen) - aims
         gradients(errors.square().mean(1).sum(), population)
         return errors.detach()
-    from qrlsuite.compiled import networks
-    from qrlsuite.compiled.perceptron import array
-
-    values, records = compiled.values(array(x), True)
-    found, cotangents = np.empty(values.shape[:2], np.float32), np.empty_like(values)
-    share = np.float32(1.0) / np.float32(values.shape[1])
-    networks.chosen_errors(values, chosen.numpy(), array(aims), share, found, cotangents)
-    compiled.set_gradients(records, cotangents)
-    return torch.from_numpy(found)
+    parts = (each.detach().contiguous().numpy() for each in (x, chosen, aims))
+    return torch.from_numpy(compiled.chosen_errors(*parts))
 
 
 def compilable(*tensors: Tensor) -> bool:

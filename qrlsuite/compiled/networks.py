@@ -324,23 +324,34 @@ def largest(values: Any, places: Any) -> None:
 
 
 @kernel
-def chosen(values: Any, places: Any, out: Any) -> None:
-    """Write values[s, b, places[s, b]] (S, B)."""
+def chosen(values: Any, places: Any, out: Any) -> bool:
+    """Write values[s, b, places[s, b]] (S, B); return whether all places are some."""
     for s in range(values.shape[0]):
         for b in range(values.shape[1]):
-            out[s, b] = values[s, b, places[s, b]]
+            place = places[s, b]
+            if place < 0 or place >= values.shape[2]:
+                return False
+            out[s, b] = values[s, b, place]
+    return True
 
 
 @kernel
-def chosen_errors(values: Any, chosen: Any, aims: Any, share: Any, errors: Any, cotangents: Any) -> None:
-    """Write values[s, b, chosen[s, b]] - aims[s, b] (S, B), and the derivatives of the sum of `share` their squares."""
+def chosen_errors(values: Any, places: Any, aims: Any, share: Any, errors: Any, cotangents: Any) -> bool:
+    """Write errors (S, B) of chosen outputs, and the derivatives of the sum of `share` times their squares.
+
+    Return whether all places are some.
+    """
     for s in range(values.shape[0]):
         for b in range(values.shape[1]):
-            error = values[s, b, chosen[s, b]] - aims[s, b]
+            place = places[s, b]
+            if place < 0 or place >= values.shape[2]:
+                return False
+            error = values[s, b, place] - aims[s, b]
             errors[s, b] = error
             for a in range(values.shape[2]):
                 cotangents[s, b, a] = 0.0
-            cotangents[s, b, chosen[s, b]] = share * (error + error)
+            cotangents[s, b, place] = share * (error + error)
+    return True
 
 
 @kernel

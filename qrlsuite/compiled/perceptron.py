@@ -12,10 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from qrlsuite.compiled import vectors
+from qrlsuite.compiled import networks, vectors
 
 SPARE_BYTES = 64 << 20
 """Working memory up to this size is kept from one pass to the next: fresh pages cost more time than a small network."""
+
+WIDE = 2 * vectors.lanes(np.float32)
+"""Samples of a chunk."""
 
 _spare: dict[tuple[str, int, int], Any] = {}
 
@@ -96,15 +99,39 @@ class Sweep:
         ValueError
             If the shape does not fit.
         """
-        from qrlsuite.compiled import networks
-
         if x.ndim != 3 or x.shape[0] != self.seeds or x.shape[2] != self.sizes[0]:
             raise _misfit(x.shape, self.shapes)
-        wide = 2 * vectors.lanes(np.float32)
-        records = _Records("records", self.seeds * -(-x.shape[1] // wide) if keep else 1, self.rows, wide)
+        chunks = self.seeds * -(-x.shape[1] // WIDE) if keep else 1
+        records = _Records("records", chunks, self.rows, WIDE)
         out = np.empty((*x.shape[:2], self.shapes[-1][1]), np.float32)
         networks.forward(x, self.parameters, self.sizes, self.code, records.array, keep, out)
         return out, records
+
+    def best(self, x: Array) -> NDArray[np.int64]:
+        """Return which output is the largest (S, B), the first of equal ones."""
+        values, _ = self.values(x, False)
+        places = np.empty(values.shape[:2], np.int64)
+        networks.largest(values, places)
+        return places
+
+    def chosen(self, x: Array, places: NDArray[np.int64]) -> Array:
+        """Return one output of each sample (S, B)."""
+        values, _ = self.values(x, False)
+        found = np.empty(values.shape[:2], np.float32)
+        if places.shape != found.shape or not networks.chosen(values, places, found):
+            raise _unchosen(places, values)
+        return found
+
+    def chosen_errors(self, x: Array, places: NDArray[np.int64], aims: Array) -> Array:
+        """Return one output of each sample minus its aim (S, B); set the gradients of their summed mean squares."""
+        values, records = self.values(x, True)
+        errors, cotangents = np.empty(values.shape[:2], np.float32), np.empty_like(values)
+        share = np.float32(1.0) / np.float32(values.shape[1])
+        fits = places.shape == aims.shape == errors.shape
+        if not fits or not networks.chosen_errors(values, places, aims, share, errors, cotangents):
+            raise _unchosen(places, values)
+        self.set_gradients(records, cotangents)
+        return errors
 
     def set_gradients(self, records: _Records, cotangents: Array) -> None:
         """Write the gradients of cotangents (S, B, out) to `grad` of the parameters, in memory that is used again."""
@@ -124,8 +151,6 @@ class Sweep:
 
     def pull(self, records: _Records, cotangents: Array, gradients: Array, x_gradient: Array | None) -> None:
         """Write the gradients of the parameters, laid out as these, of cotangents (S, B, out), and that of x."""
-        from qrlsuite.compiled import networks
-
         pair, turned, sums = (_Records(*shape) for shape in self.shapes_of_work)
         networks.backward(
             cotangents,
@@ -187,8 +212,6 @@ def joined(tensors: Sequence[Tensor]) -> Array:
 @functools.lru_cache(256)
 def _plan(sizes: tuple[int, ...], activation: str) -> tuple[int, int, list[tuple[str, int, int, int]]]:
     """Return the activation's code, the rows of a record, and the shapes of a backward pass's working memory."""
-    from qrlsuite.compiled import networks
-
     code = {"none": networks.NOTHING, "relu": networks.RELU, "sin": networks.SINE}[activation]
     vector = vectors.lanes(np.float32)
     widest = -(-max(sizes) // vector) * vector
@@ -220,6 +243,13 @@ def _misfit(x: Sequence[int] | None, shapes: Sequence[Sequence[int]]) -> ValueEr
     return ValueError(
         f"layers of S seeds take x (S, B, in), weights (S, out, in) and biases (S, out); {seen}weights and biases are "
         f"{', '.join(str(tuple(shape)) for shape in shapes)}"
+    )
+
+
+def _unchosen(places: NDArray[np.int64], values: Array) -> ValueError:
+    return ValueError(
+        f"choose one of {values.shape[2]} outputs of each sample, of shape {values.shape[:2]}: the choice has the "
+        f"shape {places.shape} and goes from {places.min(initial=0)} to {places.max(initial=0)}"
     )
 
 
