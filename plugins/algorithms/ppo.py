@@ -199,7 +199,7 @@ class Gaussian(nn.Module):
 
     def information(self, outputs: FloatArray) -> FloatArray:
         """Return the Fisher information (S, ..., numbers, numbers) of pi, by its means."""
-        spread = self._spread(torch.from_numpy(outputs)).detach().cpu().double().exp().numpy()
+        spread = self._spread(torch.tensor(outputs)).detach().cpu().double().exp().numpy()
         return np.asarray(np.eye(self.numbers) * np.broadcast_to(spread**-2.0, outputs.shape)[..., None])
 
     def lanes(self, chosen: Tensor) -> NDArray[Any]:
