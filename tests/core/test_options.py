@@ -60,7 +60,7 @@ def test_a_bare_key_goes_where_it_belongs() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("gamma=1", "write --set model.gamma=... or --set algorithm.gamma=..."),
+        ("gamma=1", "write model.gamma=... or algorithm.gamma=..."),
         ("widht=1", "no option of that name; did you mean 'width'"),
         ("modle.width=1", "sides are model, algorithm"),
     ],
