@@ -66,10 +66,11 @@ def collect(
         collected += shown
         for other in copies if published and len(shown) < len(copies) else ():
             if other is not shown[0]:
-                size = f"{len(other.seeds)} seeds of {other.curves.shape[1]} epochs"
-                kept = f"{len(shown[0].seeds)} of {shown[0].curves.shape[1]}"
+                here, there = (
+                    f"{len(each.seeds)} seeds of {each.curves.shape[1]} epochs" for each in (other, shown[0])
+                )
                 refused.append(
-                    f"{other.folder}: {size} of an entry of which {shown[0].folder} has {kept}: shown once"
+                    f"{other.folder}: {here}; shown are {there} of the same entry, from {shown[0].folder}"
                 )
     return collected, refused
 

@@ -584,7 +584,7 @@ def test_own_runs_of_a_published_entry_are_shown_once(
     train("mine", range(2), EPOCHS)
     entries, refused = collect.collect(tmp_path / "mine", published=True)
     assert [len(entry.seeds) for entry in entries] == [8]
-    assert "2 seeds of 3 epochs; shown once" in refused[0]
+    assert "2 seeds of 3 epochs; shown are 8 seeds of 3 epochs of the same entry, from" in refused[0]
     train("short", range(9), 1)
     entries, refused = collect.collect(tmp_path / "short", published=True)
     assert [(entry.curves.shape, "(published)" in entry.label) for entry in entries] == [
