@@ -1,10 +1,14 @@
 """Layers of networks as one compiled sweep (`qrlsuite.compiled.networks`), beside batched matrix products of torch.
 
     python benchmarks/networks.py [--width 16 64 256] [--seeds 50]
+    python benchmarks/networks.py --training [--width 16 64] [--seeds 10]
 
 Printed are microseconds of processor time per seed for a batch of 64, forward and backward, billions of operations per
 second, and their share of the bound, a loop of independent fused multiply-adds; medians, one thread, one run. Values
 and gradients are compared with torch's in double precision first, and one seed alone with the same seed among others.
+
+With `--training` it is DDQN on CartPole, with the settings of its preset `tuned`: milliseconds of processor time for a
+seed and an epoch of 1000 interactions, without validation, here and by JAX (`jax_ddqn.py`, compilation not counted).
 """
 
 from __future__ import annotations
@@ -12,11 +16,14 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-from collections.abc import Sequence
+import statistics
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import numpy as np
 import torch
@@ -24,7 +31,9 @@ from circuits import fma_loop, median_ms
 
 from qrlsuite.compiled.networks import NOTHING, RELU, backward, forward, record_rows
 from qrlsuite.compiled.vectors import aligned, lanes
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.population import linear
+from qrlsuite.training.trainer import Trainer
 
 Arrays = list[Any]
 
@@ -39,16 +48,20 @@ def sweep(weights: Arrays, biases: Arrays, x: Any, cotangents: Any, relu: bool =
     numbers = sum(min(w.shape[1:]) * -(-max(w.shape[1:]) // v) * v for w in weights)
     room = [aligned(shape, np.float32) for shape in ((2, widest, 2 * v), (2 * v * widest,), (numbers,))]
     out = np.empty((*x.shape[:2], sizes[-1]), np.float32)
-    gradients = [tuple(np.empty_like(each) for each in part) for part in (weights, biases)]
+    arrays = [each for pair in zip(weights, biases) for each in pair]
+    parameters = np.concatenate([each.ravel() for each in arrays])
+    gradients, layers = np.empty_like(parameters), np.array(sizes, np.int64)
+    ends = np.cumsum([each.size for each in arrays])[:-1]
+    parts = [part.reshape(each.shape) for part, each in zip(np.split(gradients, ends), arrays)]
 
     def values() -> Any:
-        forward(x, tuple(weights), tuple(biases), how, records, True, out)
+        forward(x, parameters, layers, how, records, True, out)
         return out
 
     def slopes() -> Any:
         nothing = np.empty((1, 1, 1), np.float32)
-        backward(cotangents, tuple(weights), tuple(biases), how, records, *room, *gradients, nothing, False)
-        return gradients
+        backward(cotangents, parameters, layers, how, records, *room, gradients, nothing, False)
+        return tuple(parts[::2]), tuple(parts[1::2])
 
     return values, slopes
 
@@ -113,6 +126,44 @@ def measure(width: int, seeds: int, bound: float, seconds: float) -> None:
         )
 
 
+def training(width: int, seeds: int, epochs: int = 12) -> None:
+    """Print what an epoch of DDQN on CartPole takes a seed, beside JAX's."""
+    import jax
+    import jax_ddqn
+
+    entry = resolve("cartpole", f"mlp width={width}", "ddqn", preset="tuned")
+    trainer = Trainer(entry, range(seeds))
+    trainer.start()
+    o, model = entry.algorithm_options, entry.model_options
+    begin, epoch, _ = jax_ddqn.compiled(
+        jax_ddqn.Settings(
+            width=model.width, depth=model.depth, lr=o.lr, gamma=o.gamma, epsilon=o.epsilon, buffer=o.buffer,
+            batch=o.batch, target_steps=o.target_steps, environments=10, rounds=100,
+        )
+    )  # fmt: skip
+    agents = begin(jax.vmap(jax.random.key)(np.arange(seeds)))
+
+    def by_jax() -> None:
+        nonlocal agents
+        agents = jax.block_until_ready(epoch(agents))
+
+    by_jax()  # compiles
+    ours, theirs = (
+        _epoch_ms(run, epochs) / seeds for run in (lambda: trainer.algorithm.train_epoch(100), by_jax)
+    )
+    print(f"width {width}, {seeds} seeds: {ours:.1f} ms a seed and epoch, JAX {theirs:.1f}", flush=True)
+
+
+def _epoch_ms(run: Callable[[], Any], epochs: int) -> float:
+    """Return the median of processor milliseconds."""
+    times = []
+    for _ in range(epochs):
+        begun = time.process_time()
+        run()
+        times.append(1e3 * (time.process_time() - begun))
+    return statistics.median(times)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(
@@ -121,8 +172,13 @@ def main() -> None:
     parser.add_argument("--width", type=int, nargs="+", default=[10, 16, 64, 256])
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=1.0, help="per measurement")
+    parser.add_argument("--training", action="store_true", help="whole epochs of DDQN, beside JAX's")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.training:
+        for width in arguments.width:
+            training(width, arguments.seeds)
+        return
     loop, operations = fma_loop()
     bound = operations / median_ms(loop, arguments.seconds) / 1e6
     print(f"bound: {bound:.0f} GF/s")
