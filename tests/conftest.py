@@ -100,14 +100,6 @@ def pytest_collection_finish() -> None:
             sys.modules[name].subprocess = FORKED  # type: ignore[attr-defined]
 
 
-_WIDTH_64 = Path(__file__).parents[1] / "leaderboard/entries/beam6g/ddqn-mlp-90e7f8d4/entry.json"
-published_anew = pytest.mark.xfail(
-    "code" not in json.loads(_WIDTH_64.read_text()),
-    reason="own runs of networks have other bits than the published ones, until these are trained anew",
-    strict=True,
-)
-"""Goes with the published networks of `numerics` 1."""
-
 TINY = """
 format_version = 1
 name = "tiny"

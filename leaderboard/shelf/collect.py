@@ -75,6 +75,10 @@ def collect(
     return collected, refused
 
 
+PUBLISHED = "-published"
+"""Behind the name of a published entry that stands beside own runs of it."""
+
+
 def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
     """Return copies of an entry in lists, one for each code that trained some."""
     kinds: list[list[EntryResults]] = []
@@ -89,14 +93,27 @@ def by_code(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
 
 
 def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
-    """Return copies of an entry by code, each with its mark where there are several codes."""
+    """Return copies of an entry by code, each with its mark where there are several codes.
+
+    Where all own seeds have one code and the published ones another, these are marked as published.
+    """
     kinds = by_code(copies)
     if len(kinds) == 1:
         return kinds
+    own = [same for same in kinds if any(entry.source == "runs" for entry in same)]
+    if len(own) == 1 and len(kinds) == 2:
+        return [*own, *([_as_published(each) for each in same] for same in kinds if same is not own[0])]
     return [
         [entry.marked("@" + (entry.codes[0] if entry.codes else "0" * 8)[:8]) for entry in same]
         for same in kinds
     ]
+
+
+def _as_published(entry: EntryResults) -> EntryResults:
+    """Return an entry under a name of its own, beside one's own runs of it."""
+    if entry.name.endswith(PUBLISHED):
+        return entry
+    return replace(entry, name=f"{entry.name}{PUBLISHED}", label=f"{entry.label} (published)")
 
 
 def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
@@ -235,6 +252,8 @@ def read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) 
             raise
         found = _every_copy(runs, base.rstrip(), published, tasks)
     told = told_apart(found)
+    if not mark and len(told) == 2 and told[1][0].name.endswith(PUBLISHED):
+        return [copy for copies in told for copy in copies]
     meant = [copies for copies in told if not mark or copies[0].name.rpartition("@")[2].startswith(mark)]
     if len(meant) != 1:
         labels = listed([f"'{copies[0].label}'" for copies in told])
@@ -268,7 +287,7 @@ def _shown(copies: Sequence[EntryResults]) -> list[EntryResults]:
     """Return what is shown of an entry's copies: the better one; or both where the own one gets less far."""
     own, further = copies[0], best(copies)
     if own.source == "runs" and _weight(own)[0] < _weight(further)[0]:
-        return [own, replace(further, name=f"{further.name}-published", label=f"{further.label} (published)")]
+        return [own, _as_published(further)]
     return [further]
 
 

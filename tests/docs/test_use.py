@@ -11,7 +11,6 @@ import pytest
 
 from qrlsuite.cli.commands.tune import LARGE
 from tests.commands import qrlsuite
-from tests.conftest import published_anew
 
 ROOT = Path(__file__).parents[2]
 SMALL = {
@@ -40,7 +39,6 @@ def small(words: list[str]) -> list[str]:
     return [*words, *more]
 
 
-@published_anew
 def test_the_examples_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("QRLSUITE_RUNS", raising=False)

@@ -15,7 +15,7 @@ from qrlsuite.leaderboard.boards.compared import compare_entries
 from qrlsuite.leaderboard.shelf import collect
 from qrlsuite.results.store import EntryStore
 from tests.commands import say
-from tests.conftest import TINY, Train, published_anew, trainer
+from tests.conftest import TINY, Train, trainer
 from tests.leaderboard.boards import entry as drawn
 from tests.leaderboard.boards import refused
 
@@ -104,7 +104,6 @@ def with_smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trainer("beam6g", root)("runs", range(3), 1).parents[1]
 
 
-@published_anew
 def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
     words = ("--task", "beam6g", "--runs", str(with_smoke), "--out", str(tmp_path / "p.svg"))
 
@@ -127,7 +126,6 @@ def test_a_smoke_run_cuts_no_picture(with_smoke: Path, tmp_path: Path) -> None:
     assert "left out" not in output
 
 
-@published_anew
 def test_a_shorter_own_entry_stands_beside_the_published_one(with_smoke: Path) -> None:
     def rows(*words: str) -> dict[int, list[tuple[str, int]]]:
         done = say("leaderboard", "--runs", str(with_smoke), "--format", "json", "--published", *words)
