@@ -40,6 +40,10 @@ def coupled(agents: Sequence[nn.Module], options: Any) -> nn.Module:
     return stacked(agents, lambda y: y + 1e-6 * y.mean(0))
 
 
+def steeper(agents: Sequence[nn.Module], options: Any) -> nn.Module:
+    return stacked(agents, lambda y: y + (len(y) - 1) * (y - y.detach()))
+
+
 def forgetful(agents: Sequence[Any], options: Any) -> nn.Module:
     offset = torch.stack([agent.out.bias.detach().sum() for agent in agents])
     return stacked(agents, lambda y: y + 1e-6 * offset[:, None, None])
@@ -146,6 +150,7 @@ EDITS = [
     edit("population", r"declares other quantum parameters than its agents",
          "def forward", QUANTUM, family="quantum", population=made("classical_population")),
     edit("seed independence", r"among themselves compute other values", also=["state"], population=made("coupled")),
+    edit("seed independence", r"among themselves get another gradient of", population=made("steeper")),
     edit("seed independence", r"among themselves compute other values than among all 5 \(width = 5\): torch rounds "
          r".*silu.*: use relu.* tanh", "torch.tanh", "nn.functional.silu"),
     edit("options per agent", r"gain = 10 computes something else beside one with another value than alone",
