@@ -75,7 +75,7 @@ def collect(
     return collected, refused
 
 
-PUBLISHED = "-published"
+BESIDE = "-published"
 """Behind the name of a published entry that stands beside own runs of it."""
 
 
@@ -111,9 +111,9 @@ def told_apart(copies: Iterable[EntryResults]) -> list[list[EntryResults]]:
 
 def _as_published(entry: EntryResults) -> EntryResults:
     """Return an entry under a name of its own, beside one's own runs of it."""
-    if entry.name.endswith(PUBLISHED):
+    if entry.name.endswith(BESIDE):
         return entry
-    return replace(entry, name=f"{entry.name}{PUBLISHED}", label=f"{entry.label} (published)")
+    return replace(entry, name=f"{entry.name}{BESIDE}", label=f"{entry.label} (published)")
 
 
 def check_tasks(runs: Path, tasks: Collection[str], published: bool = False) -> None:
@@ -252,7 +252,7 @@ def read_copies(runs: Path, name: str, published: bool, tasks: Collection[str]) 
             raise
         found = _every_copy(runs, base.rstrip(), published, tasks)
     told = told_apart(found)
-    if not mark and len(told) == 2 and told[1][0].name.endswith(PUBLISHED):
+    if not mark and len(told) == 2 and told[1][0].name.endswith(BESIDE):
         return [copy for copies in told for copy in copies]
     meant = [copies for copies in told if not mark or copies[0].name.rpartition("@")[2].startswith(mark)]
     if len(meant) != 1:
