@@ -296,6 +296,9 @@ class CircuitBackendSpec(NumericSpec):
     mean_field, products:
         Whether it computes `Circuit.mean_field` too, and measures products of Pauli Z (`Circuit.measured`); where not,
         such a circuit is refused before it gets there.
+    max_qubits:
+        How many qubits it computes together; None stands for any number. A circuit in which gates or observables
+        connect more is refused, and one with more that are not connected is given to it in parts.
     """
 
     kind, kinds = "circuit_backend", "circuit_backends"
@@ -304,6 +307,15 @@ class CircuitBackendSpec(NumericSpec):
     factory: str
     mean_field: bool = False
     products: bool = False
+    max_qubits: int | None = 20
+
+    def __post_init__(self) -> None:
+        Spec.__post_init__(self)
+        most = self.max_qubits
+        if most is not None and (isinstance(most, bool) or not isinstance(most, int) or most < 1):
+            raise PluginError(
+                f"circuit backend '{self.name}': max_qubits = {most!r} must be a number of qubits, or None for any"
+            )
 
 
 @dataclass(frozen=True, slots=True)

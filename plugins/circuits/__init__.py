@@ -9,6 +9,9 @@ from qrlsuite.specs import AnsatzSpec, CircuitBackendSpec
 
 _HERE = "qrlsuite.plugins.circuits"
 
+MAX_QUBITS = 20
+"""How many qubits the simulators take: a state of 2^20 amplitudes, 16 MiB, for every sample."""
+
 
 @hookimpl
 def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
@@ -64,6 +67,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             factory=f"{_HERE}.native:NativeBackend",
             mean_field=True,
             products=True,
+            max_qubits=MAX_QUBITS,
         )
     )
     register(
@@ -73,6 +77,7 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             options=f"{_HERE}.options:PennyLaneOptions",
             factory=f"{_HERE}.pennylane:PennyLaneBackend",
             products=True,
+            max_qubits=MAX_QUBITS,
         )
     )
     register(
@@ -82,5 +87,6 @@ def register_circuit_backends(register: Callable[[CircuitBackendSpec], None]) ->
             options=f"{_HERE}.options:QiskitOptions",
             factory=f"{_HERE}.qiskit:QiskitBackend",
             products=True,
+            max_qubits=MAX_QUBITS,
         )
     )

@@ -96,7 +96,6 @@ class PennyLaneBackend:
     """
 
     def __init__(self, circuit: Circuit, options: PennyLaneOptions) -> None:
-        circuit.require_simulable("pennylane")
         self.circuit = circuit
         self.options = options
         self.shots: int | None = options.shots

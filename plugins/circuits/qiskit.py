@@ -70,7 +70,6 @@ class QiskitBackend:
     """
 
     def __init__(self, circuit: Circuit, options: QiskitOptions) -> None:
-        circuit.require_simulable("qiskit")
         self.options = options
         self.shots: int | None = options.shots
         self.gradient = _gradient(options)

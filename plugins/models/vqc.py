@@ -64,7 +64,7 @@ class VQCOptions:
     passes_on: ClassVar[tuple[str, ...]] = ("gate",)
     """Options that are handed to an ansatz which has them: `--set gate=xyz` means this model's, and the ansatz's."""
 
-    qubits: Annotated[int, Field(ge=1, le=20, description="qubits of the circuit")] = 10
+    qubits: Annotated[int, Field(ge=1, description="qubits of the circuit")] = 10
     layers: Annotated[int, Field(ge=1, le=256, description="layers of the circuit")] = 4
     ansatz: Annotated[str, Field(description="circuit family, see qrlsuite list ansatzes")] = "iqp"
     gate: Annotated[
@@ -298,6 +298,7 @@ class _Hybrid(nn.Module):
         """Return the circuit's final states (S, B, 2^n) for observations (S, B, in); qubit 0 is the highest bit."""
         from qrlsuite.plugins.circuits.native import dense  # the state is no backend's business but native's
 
+        require_computable(self._runner.circuit, "native")
         inner = self._circuit_inputs(x, dict(self.named_parameters()))
         parameters = [value.reshape(len(value), -1) for value in self.circuit.values()]
         return dense.states(self._runner.circuit, inner, torch.cat(parameters, dim=1))
@@ -535,9 +536,7 @@ def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) ->
 
     Three of the simulator's working states, of 128 bytes per amplitude, come on top.
     """
-    if not _entangled(options):
-        return 0
-    amplitudes = 1 << options.qubits
+    amplitudes = _amplitudes(options)
     kept = agents * batch * amplitudes * (16 if options.dtype == "float64" else 8)
     return 3 * 128 * amplitudes + (kept if kept <= NATIVE_STATES else 0)
 
@@ -545,16 +544,17 @@ def _native_memory(options: VQCOptions, agents: int, batch: int, copies: int) ->
 def _pennylane_memory(options: Any, agents: int, batch: int, copies: int) -> int:
     """Return the bytes of the states behind every gate, 64 layers n 2^n per sample, where PennyLane backpropagates."""
     backprop = options.diff_method in ("auto", "backprop") and options.shots is None
-    if not (_entangled(options) and backprop and options.device == "default.qubit"):
+    if not (backprop and options.device == "default.qubit"):
         return 0
-    lane: int = 64 * (1 << options.qubits) * options.layers * options.qubits
+    lane: int = 64 * _amplitudes(options) * options.layers * options.qubits
     return min(agents * batch * lane, max(batch * lane, PENNYLANE_STATES))
 
 
-def _entangled(options: VQCOptions) -> bool:
-    """Return whether the circuit has a state of several qubits."""
+def _amplitudes(options: VQCOptions) -> int:
+    """Return how many amplitudes the states of connected qubits have; 0 where none are connected."""
     circuit = build_circuit(options)
-    return not circuit.mean_field and max(map(len, circuit.components())) > 1
+    sizes = [] if circuit.mean_field else map(len, circuit.components())
+    return sum(1 << size for size in sizes if size > 1)
 
 
 def _backend_options(options: VQCOptions) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 
 from qrlsuite.api.evaluation import find, the_task
 from qrlsuite.circuit import Circuit, ansatz
+from qrlsuite.circuit.api import require_computable
 from qrlsuite.diagnostics import circuits, fisher, fourier, gradients
 from qrlsuite.diagnostics.fisher import Information
 from qrlsuite.diagnostics.gradients import Estimate
@@ -383,7 +384,7 @@ def diagnose_ansatz(
                 f"{told} with {n} qubits has no parameters: diagnostics say how results change with them"
             )
         for readout in circuits.readouts(circuit).values():
-            readout.require_simulable()
+            require_computable(readout, "native")
     bar = Bar(Console(stderr=True, quiet=not progress, highlight=False))
     weights = [draws * 2.0**n * layer * n for n, _, layer, _ in made]
     sizes, found = [], []

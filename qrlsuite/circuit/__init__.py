@@ -6,13 +6,12 @@ Importing this package imports numpy and nothing heavier; registry, torch and si
 from __future__ import annotations
 
 from qrlsuite.circuit.api import CircuitBackend, ansatz, create_backend, expectations, options_on
-from qrlsuite.circuit.description import GATES, MAX_QUBITS, Angle, Circuit, Element, Operation, Parameter
+from qrlsuite.circuit.description import GATES, Angle, Circuit, Element, Operation, Parameter
 from qrlsuite.circuit.executions import ExecutionCounter
 from qrlsuite.circuit.model import CircuitModel
 
 __all__ = [
     "GATES",
-    "MAX_QUBITS",
     "Angle",
     "Circuit",
     "CircuitBackend",

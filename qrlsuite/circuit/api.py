@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 import numpy as np
 
 from qrlsuite.circuit.description import (
-    MAX_QUBITS,
     Circuit,
     Product,
+    apart,
     in_bases,
-    mean_field_refusal,
     without_products,
 )
 from qrlsuite.errors import OptionError, PluginError, QrlSuiteError, nearest
@@ -105,7 +104,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     name:
         Name of the ansatz: `qrlsuite list ansatzes`.
     qubits, layers:
-        Size of the circuit: 1 to 20 qubits, more where gates connect at most 20 of them; 1 layer or more.
+        Size of the circuit: 1 or more of each. How many qubits can be simulated is the backend's to say.
     options:
         Options of the ansatz, such as `gate="rot"`.
 
@@ -122,7 +121,7 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
     from qrlsuite import own, registry, specs
 
     if isinstance(qubits, bool) or not isinstance(qubits, int) or qubits < 1:
-        raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
+        raise OptionError(f"qubits = {qubits!r}: a circuit has 1 qubit or more")
     if isinstance(layers, bool) or not isinstance(layers, int) or layers < 1:
         raise OptionError(f"layers = {layers!r}: a circuit has 1 layer or more")
     spec = registry.get(specs.AnsatzSpec, name)
@@ -137,7 +136,6 @@ def ansatz(name: str, qubits: int, layers: int, **options: Any) -> Circuit:
         raise PluginError(f"ansatz '{name}' cannot be built: {own.failure(error)}") from error
     if not isinstance(circuit, Circuit):
         raise PluginError(f"ansatz '{name}' returns {type(circuit).__name__}, and must return a Circuit")
-    circuit.require_simulable()
     return circuit
 
 
@@ -208,14 +206,15 @@ def create_backend(name: str, circuit: Circuit, **options: Any) -> CircuitBacken
     OptionError
         For an option that it cannot have, a circuit that it cannot run, or a missing optional package.
     """
-    from qrlsuite import specs
-
     spec, chosen = _backend(name, circuit, options)
-    return _make(specs.resolve(spec.factory), circuit, chosen)
+    return _make(spec, circuit, chosen)
 
 
 class _Whole:
-    """A backend made of those of a circuit's measurement bases; products of inputs are further inputs of theirs."""
+    """A backend made of those of a circuit's parts; products of inputs are further inputs of theirs.
+
+    Parts are measurement bases and, where the backend takes no more at once, qubits that nothing connects.
+    """
 
     def __init__(
         self, parts: Sequence[CircuitBackend], places: Sequence[int], products: Sequence[Product]
@@ -232,7 +231,7 @@ class _Whole:
             self.gradient_circuits = sum(cast(Any, part).gradient_circuits for part in parts)
         if hasattr(first, "compile_for"):
             self.compile_for = self._compile_for
-        if hasattr(first, "states") and len(parts) == 1:  # other bases turn the state
+        if hasattr(first, "states") and len(parts) == 1:  # others turn the state, or have a part of it
             self.states = self._states
 
     def _compile_for(self, like: torch.Tensor) -> None:
@@ -256,15 +255,15 @@ class _Whole:
         import torch
 
         values = [
-            part(x, parameters, seeds if seeds is None else [_basis_seed(seed, k) for seed in seeds])
+            part(x, parameters, seeds if seeds is None else [_part_seed(seed, k) for seed in seeds])
             for k, part in enumerate(self.parts)
         ]
         return torch.cat(values, dim=-1)[..., list(self.places)]
 
 
-def _basis_seed(seed: int, basis: int) -> int:
-    """Return the seed of what is sampled in one basis: independent of the others'."""
-    return int(np.random.SeedSequence((seed, basis)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+def _part_seed(seed: int, part: int) -> int:
+    """Return the seed of what is sampled in one part: independent of the others'."""
+    return int(np.random.SeedSequence((seed, part)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
@@ -284,10 +283,20 @@ def extended(inputs: torch.Tensor, products: Sequence[Product]) -> torch.Tensor:
     return torch.cat([inputs, further], dim=-1)
 
 
-def _make(factory: Any, circuit: Circuit, chosen: Any) -> CircuitBackend:
+def _make(spec: CircuitBackendSpec, circuit: Circuit, chosen: Any) -> CircuitBackend:
     """Return the backend of a circuit."""
+    from qrlsuite import specs
+
+    factory = specs.resolve(spec.factory)
     plain, products = without_products(circuit)
     parts = in_bases(plain)
+    most = spec.max_qubits
+    if most is not None and circuit.qubits > most and not circuit.mean_field:
+        parts = [
+            (few, tuple(places[place] for place in some))
+            for part, places in parts
+            for few, some in apart(part)
+        ]
     backends: list[CircuitBackend] = [factory(part, chosen) for part, _ in parts]
     if len(parts) == 1 and not products:
         return backends[0]
@@ -313,13 +322,31 @@ def require_computable(circuit: Circuit, backend: str) -> None:
     UnknownNameError
         If no backend has that name.
     OptionError
-        For a mean-field approximation, or products of Paulis, where the backend has none; for both together.
+        For more qubits than the backend takes; for a mean-field approximation, or products of Paulis, where the backend
+        has none; for both together.
     """
     from qrlsuite import registry, specs
 
     spec = registry.get(specs.CircuitBackendSpec, backend)
     if circuit.mean_field and not spec.mean_field:
-        raise OptionError(mean_field_refusal(backend))
+        raise OptionError(
+            f"backend '{backend}' runs circuits, and the mean-field approximation of a circuit is none; backend "
+            "'native' computes it (model vqc-native)"
+        )
+    largest = 0 if circuit.mean_field else max(map(len, circuit.components()))
+    if spec.max_qubits is not None and largest > spec.max_qubits:
+        limits = {
+            name: each.spec.max_qubits for name, each in registry.load().of(specs.CircuitBackendSpec).items()
+        }
+        more = [
+            f"'{name}' takes {limit or 'any number'}"
+            for name, limit in limits.items()
+            if limit is None or limit >= largest
+        ]
+        raise OptionError(
+            f"qubits = {circuit.qubits}: gates or observables connect {largest} of them, and backend '{backend}' "
+            f"takes at most {spec.max_qubits}; {', '.join(more) or 'no backend that is installed takes so many'}"
+        )
     if circuit.measures_products and not spec.products:
         raise OptionError(f"backend '{backend}' measures Paulis of single qubits, and not products of them")
     if circuit.measures_products and circuit.mean_field:
@@ -342,8 +369,6 @@ PREPARED = 8
 
 def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> CircuitBackend:
     """Return a backend for a circuit: one made before if backend, options and the circuit's content are the same."""
-    from qrlsuite import specs
-
     spec, chosen = _backend(name, circuit, options)
     size = circuit.qubits, circuit.inputs, circuit.mean_field
     content = (*size, *circuit.parameters.values(), *circuit, circuit.observables)
@@ -353,7 +378,7 @@ def _prepare(name: str, circuit: Circuit, options: Mapping[str, Any]) -> Circuit
         kept.move_to_end(key)
         return kept[key]
     # A copy: a backend may read its circuit at every call, and the caller may append to it.
-    backend = _make(specs.resolve(spec.factory), copy.deepcopy(circuit), chosen)
+    backend = _make(spec, copy.deepcopy(circuit), chosen)
     kept[key] = backend
     if len(kept) > PREPARED:
         kept.popitem(last=False)

@@ -39,9 +39,6 @@ import numpy as np
 
 from qrlsuite.errors import CircuitError, OptionError, nearest
 
-MAX_QUBITS = 20
-"""How many qubits gates may connect, directly or through others: their state has 2^20 amplitudes."""
-
 
 class GateSignature(NamedTuple):
     """How many wires and angles a gate takes, and whether it may be controlled by one more qubit."""
@@ -269,7 +266,7 @@ class Circuit:
 
     def __init__(self, qubits: int, inputs: int | None = None, mean_field: bool = False) -> None:
         if not isinstance(qubits, int) or qubits < 1:
-            raise OptionError(f"qubits = {qubits!r}: a circuit has 1 to {MAX_QUBITS} qubits")
+            raise OptionError(f"qubits = {qubits!r}: a circuit has 1 qubit or more")
         self.qubits = qubits
         self.inputs = qubits if inputs is None else inputs
         if not isinstance(self.inputs, int) or self.inputs < 1:
@@ -466,36 +463,6 @@ class Circuit:
                         group[q] = group[first]
         return [sorted(qubits) for q, qubits in group.items() if q == min(qubits)]
 
-    def require_simulable(self, backend: str | None = None) -> None:
-        """Refuse a circuit whose state would be too large.
-
-        Parameters
-        ----------
-        backend:
-            Name of a backend that keeps one state of all qubits; None stands for a state per component.
-
-        Raises
-        ------
-        OptionError
-            If gates connect more than `MAX_QUBITS` qubits, or the backend would keep a state of more, or if this is
-            the mean-field approximation of a circuit, and the backend computes circuits.
-        """
-        if self.mean_field:
-            if backend is not None:
-                raise OptionError(mean_field_refusal(backend))
-            return
-        largest = max(map(len, self.components()))
-        if largest > MAX_QUBITS:
-            raise OptionError(
-                f"qubits = {self.qubits}: a circuit has 1 to {MAX_QUBITS} qubits, or more of which gates connect at "
-                f"most {MAX_QUBITS}; here they connect {largest}"
-            )
-        if backend is not None and self.qubits > MAX_QUBITS:
-            raise OptionError(
-                f"{self.qubits} qubits: backend '{backend}' keeps one state of all, of at most {MAX_QUBITS}; "
-                "'native' computes qubits apart that no gate connects"
-            )
-
     def __iter__(self) -> Iterator[Operation]:
         return iter(self._operations)
 
@@ -572,6 +539,33 @@ def in_bases(circuit: Circuit) -> list[tuple[Circuit, tuple[int, ...]]]:
     return divided
 
 
+def apart(circuit: Circuit) -> list[tuple[Circuit, tuple[int, ...]]]:
+    """Divide a circuit into the circuits of its components, see `Circuit.components`.
+
+    Returns
+    -------
+    list
+        Circuits with all inputs and parameters, and the places of their observables among the circuit's. One without
+        observables is left out.
+    """
+    divided = []
+    for component in circuit.components():
+        wire = {qubit: number for number, qubit in enumerate(component)}
+        places = tuple(k for k, qubits in enumerate(circuit.measured) if qubits[0] in wire)
+        if not places:
+            continue
+        part = Circuit(len(wire), circuit.inputs)
+        part.parameters = dict(circuit.parameters)
+        for operation in circuit:
+            if operation.wires[0] in wire:
+                control = None if operation.control is None else wire[operation.control]
+                wires = [wire[qubit] for qubit in operation.wires]
+                part.append(operation.gate, wires, *operation.angles, control=control)
+        part.measure([[wire[qubit] for qubit in circuit.measured[place]] for place in places])
+        divided.append((part, places))
+    return divided
+
+
 def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Product, ...]]:
     """Write products and multiples of inputs, and numbers before a parameter, as inputs behind the others.
 
@@ -596,14 +590,6 @@ def without_products(circuit: Circuit) -> tuple[Circuit, tuple[Product, ...]]:
         plain.append(operation.gate, operation.wires, *angles, control=operation.control)
     plain.measure(circuit.observables)
     return plain, products
-
-
-def mean_field_refusal(backend: str) -> str:
-    """Say why a backend that runs circuits cannot compute a mean-field approximation."""
-    return (
-        f"backend '{backend}' runs circuits, and the mean-field approximation of a circuit is none; backend 'native' "
-        "computes it (model vqc-native)"
-    )
 
 
 def canonical(circuit: Circuit) -> str:

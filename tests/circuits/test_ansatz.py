@@ -76,8 +76,7 @@ def test_one_qubit_has_no_ring():
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "message"),
     [
-        (("iqp", 0, 1), {}, OptionError, "qubits = 0: a circuit has 1 to 20 qubits"),
-        (("iqp", 21, 1), {}, OptionError, "qubits = 21: a circuit has 1 to 20 qubits"),
+        (("iqp", 0, 1), {}, OptionError, "qubits = 0: a circuit has 1 qubit or more"),
         (("iqp", True, 1), {}, OptionError, "qubits = True"),
         (("iqp", 2.0, 1), {}, OptionError, "qubits = 2.0"),
         (("iqp", 2, 0), {}, OptionError, "layers = 0: a circuit has 1 layer or more"),

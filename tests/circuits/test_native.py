@@ -274,21 +274,6 @@ def test_components_of_a_circuit() -> None:
     assert compile_circuit(circuit).amplitudes == 2 + 8 + 4
 
 
-@pytest.mark.parametrize("backend", ["native", "pennylane", "qiskit"])
-def test_more_connected_qubits_than_a_state_can_hold_are_refused(backend: str) -> None:
-    circuit = Circuit(30)
-    for q in range(21):
-        circuit.append("CNOT", (q, q + 1))
-    with pytest.raises(OptionError, match="gates connect at most 20; here they connect 22"):
-        expectations(circuit, [[0.0] * 30], {}, backend=backend)
-
-
-@pytest.mark.parametrize("backend", ["pennylane", "qiskit"])
-def test_backends_with_one_state_for_all_qubits_take_twenty(backend: str) -> None:
-    with pytest.raises(OptionError, match=r"21 qubits: backend '.*' keeps one state of all, of at most 20"):
-        expectations(Circuit(21), [[0.0] * 21], {}, backend=backend)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -250,7 +250,7 @@ show mpl => did you mean 'mlp'
 show mlp width=4 => model 'mlp': NAME=VALUE, --out and --format draw an ansatz
 show picture barz => nothing called 'barz'; did you mean 'bars'
 show ansatz iqp cx => ansatz iqp cx: give one name
-show ansatz iqp qubits=21 => qubits = 21: a circuit has 1 to 20 qubits
+show ansatz iqp qubits=0 => qubits = 0: a circuit has 1 qubit or more
 show ansatz iqp --out iqp.jpeg2 => must be .png, .pdf or .svg
 show ansatz iqp --qubits 4 => --qubits is gone: write it after the name
 show tiny.toml => tiny.toml: unknown key 'default_algorithm'

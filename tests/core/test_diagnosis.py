@@ -168,7 +168,7 @@ def test_functions_of_one_s_own_and_large_circuits() -> None:
         (("ansatz", "iqpp"), "iqp"),
         (("ansatz", "iqp", "--qubits", "4-12"), "qubits '4-12': write one number"),
         (("ansatz", "iqp", "--qubits", "12:4"), "qubits '12:4': write one number"),
-        (("ansatz", "iqp", "--qubits", "2:25"), "1 to 20 qubits"),
+        (("ansatz", "iqp", "--qubits", "2:25"), "backend 'native' takes at most 20"),
         (("ansatz", "iqp", "--layers", "0n"), "layers '0n': write one number"),
         (("ansatz", "iqp", "qubits=4"), "sizes are `--qubits` and `--layers`"),
         (("no-such-entry",), "no-such-entry"),

@@ -248,7 +248,6 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     ("values", "message"),
     [
         ({"qubits": 0}, "qubits = 0: .*greater than or equal to 1"),
-        ({"qubits": 21}, "qubits = 21: .*less than or equal to 20"),
         ({"gate": "rott"}, "gate = 'rott'"),
         ({"dtype": "float16"}, "dtype = 'float16'"),
         ({"activation": "relu"}, "no option 'activation'; did you mean 'activation_in'?"),

@@ -349,14 +349,7 @@ def _cycles(source: NDArray[np.int64]) -> list[int]:
 
 
 def compile_circuit(circuit: Circuit) -> Program:
-    """Compile a circuit description into a program.
-
-    Raises
-    ------
-    OptionError
-        If gates connect more than `MAX_QUBITS` qubits.
-    """
-    circuit.require_simulable()
+    """Compile a circuit description into a program."""
     compiler = Compiler(circuit.parameters)
     places: dict[int, int] = {}
     components = circuit.components()

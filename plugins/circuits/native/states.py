@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qrlsuite.circuit.description import MAX_QUBITS, Angle, Operation
+from qrlsuite.circuit.description import Angle, Operation
 from qrlsuite.compiled.cache import announce
+from qrlsuite.plugins.circuits import MAX_QUBITS
 from qrlsuite.plugins.circuits.native.program import compile_operations
 
 PASS_BYTES = 64 << 20
