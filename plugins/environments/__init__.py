@@ -9,11 +9,12 @@ from qrlsuite.specs import EnvironmentSpec, PictureSpec
 
 _HERE = "qrlsuite.plugins.environments"
 _BEAM6G = f"{_HERE}.beam6g"
+_QUANTUM = f"{_HERE}.quantum"
 
 
 @hookimpl
 def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
-    """Register BeamManagement6G, BeamAngle, CartPole, Planted, Room, and whatever else Gymnasium knows."""
+    """Register the built-in environments, and whatever else Gymnasium knows."""
     register(
         EnvironmentSpec(
             name="beam6g",
@@ -87,6 +88,31 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_HERE}.planted:PlantedOptions",
             gymnasium_id="qrlsuite/Planted-v1",
             entry_point=f"{_HERE}.planted:Planted",
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="pulse",
+            summary="Pulse: bring one or two qubits into a state by fields",
+            options=f"{_QUANTUM}.pulse:PulseOptions",
+            gymnasium_id="qrlsuite/Pulse-v1",
+            entry_point=f"{_QUANTUM}.pulse:Pulse",
+            vector=f"{_QUANTUM}.pulse:make_vector",
+            policies={"best pulse": f"{_QUANTUM}.pulse:BestPulse", "greedy": f"{_QUANTUM}.pulse:GreedyPulse"},
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="clifford",
+            summary="Clifford: write a Clifford operation as a circuit of few gates",
+            options=f"{_QUANTUM}.clifford:CliffordOptions",
+            gymnasium_id="qrlsuite/Clifford-v1",
+            entry_point=f"{_QUANTUM}.clifford:Clifford",
+            vector=f"{_QUANTUM}.clifford:make_vector",
+            policies={
+                "shortest circuit": f"{_QUANTUM}.clifford:ShortestCircuit",
+                "greedy": f"{_QUANTUM}.clifford:GreedyCircuit",
+            },
         )
     )
     register(
