@@ -404,7 +404,7 @@ def build_circuit(options: VQCOptions) -> Circuit:
         raise OptionError(f"gate = '{options.gate}': ansatz '{options.ansatz}' has no option 'gate'")
     circuit = ansatz(options.ansatz, options.qubits, options.layers, **ansatz_options)
     if options.readout != "ansatz":
-        circuit.measure(_observables(circuit.qubits, options.readout))
+        circuit.measure(_observables(options.qubits, options.readout))
     return circuit
 
 

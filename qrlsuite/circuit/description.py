@@ -9,6 +9,9 @@ input present counts as 1), and `input` may be a product of two inputs, a multip
 application order. Qubit 0 is the most significant bit of a basis state's index, as in PennyLane. The measured
 observables are Pauli Z on chosen qubits (default: every), or products of Pauli X, Y and Z.
 
+A qubit may be measured before the end, its outcome may control later gates, and a qubit may be reset. This is written
+with its measurement deferred to the end (Nielsen & Chuang 2010, section 4.4), so that every backend runs it.
+
 With `mean_field` the same description stands for a classical approximation, see `Circuit`.
 
 An ansatz is a function that writes such a circuit:
@@ -76,6 +79,14 @@ ISING: dict[str, tuple[tuple[str, tuple[float, ...]], ...]] = {
 """Rotations exp(-i a PP / 2) of two qubits, which `Circuit.append` writes as CNOT, RZ, CNOT (as one controlled rotation
 in a mean-field approximation): by what turns both qubits before, and back after."""
 
+CONTROLLED: dict[str, tuple[float, float, float]] = {
+    "Y": (math.pi, math.pi / 2, math.pi / 2),
+    "H": (math.pi / 2, 0.0, math.pi),
+    "S": (0.0, 0.0, math.pi / 2),
+    "T": (0.0, 0.0, math.pi / 4),
+}
+"""Gates without angles as U3, phase included: so they are written where they have a control."""
+
 COMPOSED = {f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"} | {
     f"ISING{axis}{axis}": f"R{axis}{axis}" for axis in "XYZ"
 }
@@ -94,6 +105,17 @@ _NUMBER = int, float, np.integer, np.floating
 
 Observable = int | tuple[int, ...] | str
 """A qubit for its Pauli Z, qubits for the product of theirs, or a product of other Paulis: `X0 Y2`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What `Circuit.measure_mid` finds in a qubit, 0 or 1: a control of later gates, or an observable (1 or -1)."""
+
+    number: int
+
+
+Word = tuple[tuple[str, int | Outcome], ...]
+"""The Paulis of an observable, and the qubits or outcomes they are of."""
 
 _FACTOR = re.compile(r"\s*([XYZ])(\d+)\s*")
 
@@ -258,6 +280,13 @@ class Circuit:
         vector) is kept. The result is no circuit, but a classical function of the same gates and parameters, whose
         cost is linear in the number of gates. Only some backends compute it (`CircuitBackendSpec.mean_field`).
 
+    Attributes
+    ----------
+    qubits:
+        How many there are, those included that stand for earlier measurements and resets.
+    deferred:
+        How many of them do, the last ones: one for every measured qubit that is used again, and one for every reset.
+
     Raises
     ------
     OptionError
@@ -268,13 +297,17 @@ class Circuit:
         if not isinstance(qubits, int) or qubits < 1:
             raise OptionError(f"qubits = {qubits!r}: a circuit has 1 qubit or more")
         self.qubits = qubits
+        self.deferred = 0
         self.inputs = qubits if inputs is None else inputs
         if not isinstance(self.inputs, int) or self.inputs < 1:
             raise OptionError(f"inputs = {inputs!r}: a circuit has at least one input")
         self.mean_field = mean_field
         self.parameters: dict[str, Parameter] = {}
         self._operations: list[Operation] = []
-        self._observables: tuple[Observable, ...] = tuple(range(qubits))
+        self._words: tuple[Word, ...] = tuple((("Z", q),) for q in range(qubits))
+        self._wires = list(range(qubits))  # of every qubit: resets move it
+        self._outcomes: list[int] = []  # of every outcome the wire that has it
+        self._measured: set[int] = set()  # wires with outcomes that nothing has acted on since
 
     @property
     def operations(self) -> tuple[Operation, ...]:
@@ -284,17 +317,17 @@ class Circuit:
     @property
     def observables(self) -> tuple[Observable, ...]:
         """What is measured, in output order, as `measure` takes it."""
-        return self._observables
+        return tuple(map(_observable, self._resolved()))
 
     @property
     def measured(self) -> tuple[tuple[int, ...], ...]:
         """The qubits of every observable, in output order: it is the product of their Paulis, see `axes`."""
-        return tuple(tuple(qubit for _, qubit in _factors(o)) for o in self._observables)
+        return tuple(tuple(wire for _, wire in word) for word in self._resolved())
 
     @property
     def axes(self) -> tuple[str, ...]:
         """The Paulis of every observable, in the order of its qubits in `measured`: `Z`, or `XY`."""
-        return tuple("".join(axis for axis, _ in _factors(o)) for o in self._observables)
+        return tuple("".join(axis for axis, _ in word) for word in self._words)
 
     @property
     def measures_products(self) -> bool:
@@ -306,15 +339,101 @@ class Circuit:
         """Whether every observable is a Pauli Z, or a product of them: what a backend is given."""
         return all(set(axes) == {"Z"} for axes in self.axes)
 
-    def measure(self, observables: Sequence[int | Sequence[int] | str]) -> None:
+    def _resolved(self) -> list[tuple[tuple[str, int], ...]]:
+        return [tuple((axis, self._wire(of)) for axis, of in word) for word in self._words]
+
+    def _wire(self, of: int | Outcome) -> int:
+        return self._outcomes[of.number] if isinstance(of, Outcome) else self._wires[of]
+
+    def _has(self, of: Any) -> bool:
+        """Return whether this is a qubit, or an outcome, of the circuit."""
+        if isinstance(of, Outcome):
+            return of.number < len(self._outcomes)
+        return isinstance(of, int | np.integer) and 0 <= int(of) < len(self._wires)
+
+    def measure_mid(self, qubit: int, postselect: None = None) -> Outcome:
+        """Measure a qubit now, and go on.
+
+        The measurement is deferred to the end: where the qubit is used again, a CNOT copies the outcome to a further
+        qubit first.
+
+        Parameters
+        ----------
+        qubit:
+            Which.
+        postselect:
+            Refused: of the runs that end otherwise there would be no result.
+
+        Returns
+        -------
+        Outcome
+            What is found. `append("X", 1, control=outcome)` applies a gate where it is 1, and `measure([outcome])`
+            measures it.
+
+        Raises
+        ------
+        CircuitError
+            If there is no such qubit, or for postselection.
+        """
+        if postselect is not None:
+            raise CircuitError(
+                f"postselect = {postselect!r}: no run may be thrown away, as a result is needed for every input; let "
+                "the outcome control gates"
+            )
+        wire = self._used(qubit, "measure_mid")
+        if wire in self._measured:  # again: what was found
+            return Outcome(self._outcomes.index(wire))
+        self._outcomes.append(wire)
+        self._measured.add(wire)
+        self._keep_for(self._words)
+        return Outcome(len(self._outcomes) - 1)
+
+    def reset(self, qubit: int) -> None:
+        """Put a qubit back into 0, whatever it is in: a further qubit takes its place if gates have acted on it.
+
+        Raises
+        ------
+        CircuitError
+            If there is no such qubit.
+        """
+        wire = self._used(qubit, "reset")
+        if any(wire in operation.qubits for operation in self._operations):
+            self._measured.discard(wire)
+            self._wires[qubit] = self._further()
+
+    def _used(self, qubit: int, what: str) -> int:
+        """Return the wire of a qubit."""
+        if not isinstance(qubit, int) or not self._has(qubit):
+            raise CircuitError(f"{what}({qubit!r}): this circuit has qubits 0..{len(self._wires) - 1}")
+        return self._wires[qubit]
+
+    def _further(self) -> int:
+        """Add a qubit for something deferred."""
+        self.qubits += 1
+        self.deferred += 1
+        return self.qubits - 1
+
+    def _keep(self, wires: Iterable[int]) -> None:
+        """Copy outcomes from wires that are used again to further ones."""
+        for wire in self._measured.intersection(wires):
+            copied = self._further()
+            self._operations.append(Operation("CNOT", (wire, copied)))
+            self._outcomes = [copied if each == wire else each for each in self._outcomes]
+            self._measured.remove(wire)
+
+    def _keep_for(self, words: Iterable[Word]) -> None:
+        """Copy outcomes from wires of which observables are another Pauli than Z."""
+        self._keep(self._wire(of) for word in words for axis, of in word if axis != "Z")
+
+    def measure(self, observables: Sequence[int | Outcome | Sequence[int | Outcome] | str]) -> None:
         """Measure these observables, in this order, instead of Pauli Z on every qubit.
 
         Parameters
         ----------
         observables:
-            A qubit stands for its Pauli Z, several qubits for the product of theirs, and a text for any product of
-            Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. What no common basis measures is
-            executed apart, see `in_bases`.
+            A qubit or an outcome stands for its Pauli Z, several for the product of theirs, and a text for any product
+            of Paulis: `measure([0, (1, 2), "X0 Y2"])` measures Z_0, Z_1 Z_2 and X_0 Y_2. What no common basis measures
+            is executed apart, see `in_bases`.
 
         Raises
         ------
@@ -330,15 +449,19 @@ class Circuit:
             not listed
             or len(set(map(frozenset, listed))) != len(listed)
             or any(
-                not word or len({q for _, q in word}) != len(word) or any(q >= self.qubits for _, q in word)
+                not word or len({q for _, q in word}) != len(word) or not all(self._has(q) for _, q in word)
                 for word in listed
             )
         ):
             raise CircuitError(
-                f"observables {observables!r}: distinct qubits 0..{self.qubits - 1}, distinct groups of them, or "
+                f"observables {observables!r}: distinct qubits 0..{len(self._wires) - 1}, distinct groups of them, or "
                 'products like "X0 Y1" are needed'
             )
-        self._observables = tuple(map(_observable, listed))
+        self._words = tuple(listed)
+        self._keep_for(listed)
+        if any(isinstance(of, Outcome) for word in listed for _, of in word):
+            # Not the qubit's own wire: it may be an observable, too.
+            self._keep(self._wire(of) for word in listed for _, of in word if isinstance(of, Outcome))
 
     def input(self, index: int) -> Angle:
         """Return input feature `index` as an angle (radians)."""
@@ -360,7 +483,11 @@ class Circuit:
         return self.parameters[name]
 
     def append(
-        self, gate: str, wires: int | Sequence[int], *angles: Angle | float, control: int | None = None
+        self,
+        gate: str,
+        wires: int | Sequence[int],
+        *angles: Angle | float,
+        control: int | Outcome | None = None,
     ) -> None:
         """Add a gate.
 
@@ -373,7 +500,7 @@ class Circuit:
         angles:
             As many as the gate takes, in radians.
         control:
-            Apply the gate only where this qubit is 1 (rotations only).
+            Apply the gate, which is on one qubit, only where this qubit, or what `measure_mid` found, is 1.
         """
         if gate in ISING:
             self._append_ising(gate, wires, angles, control)
@@ -383,27 +510,38 @@ class Circuit:
             known = f"; write it as {hint}" if hint else nearest(gate, [*GATES, *ISING])
             raise CircuitError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]
-        targets = (wires,) if isinstance(wires, int) else tuple(wires)
-        if control is not None and not signature.controllable:
-            raise CircuitError(f"{gate} takes no extra control; use CNOT or CZ, or a controlled rotation")
+        targets = (wires,) if isinstance(wires, int | Outcome) else tuple(wires)
+        if control is not None and not signature.controllable and signature.wires > 1:
+            raise CircuitError(
+                f"{gate} takes no extra control; use CNOT or CZ, or a controlled gate on one qubit"
+            )
         touched = targets if control is None else (control, *targets)
         if len(targets) != signature.wires or len(set(touched)) != len(touched):
             raise CircuitError(f"{gate} needs {signature.wires} distinct wire(s), got {touched}")
-        if not all(isinstance(w, int) and 0 <= w < self.qubits for w in touched):
-            raise CircuitError(f"{gate} on qubits {touched}: this circuit has qubits 0..{self.qubits - 1}")
+        if not all(map(self._has, touched)) or any(isinstance(w, Outcome) for w in targets):
+            raise CircuitError(
+                f"{gate} on qubits {touched}: this circuit has qubits 0..{len(self._wires) - 1}"
+            )
         if len(angles) != signature.angles:
             raise CircuitError(f"{gate} takes {signature.angles} angle(s), got {len(angles)}")
         exact = tuple(a if isinstance(a, Angle) else Angle(constant=float(a)) for a in angles)
         for angle in exact:
             self._check(angle)
-        self._operations.append(Operation(gate, targets, exact, control))
+        self._keep(self._wires[w] for w in touched if not isinstance(w, Outcome))
+        on = tuple(self._wires[w] for w in targets)
+        by = None if control is None else self._wire(control)
+        if by is not None and gate in ("X", "Z"):
+            gate, on, by = "CNOT" if gate == "X" else "CZ", (by, *on), None
+        elif by is not None and gate in CONTROLLED:
+            gate, exact = "U3", tuple(Angle(constant=number) for number in CONTROLLED[gate])
+        self._operations.append(Operation(gate, on, exact, by))
 
     def _append_ising(
         self,
         gate: str,
         wires: int | Sequence[int],
         angles: Sequence[Angle | float],
-        control: int | None,
+        control: int | Outcome | None,
     ) -> None:
         pair = (wires,) if isinstance(wires, int) else tuple(wires)
         if len(pair) != 2 or len(angles) != 1 or control is not None:
@@ -479,15 +617,15 @@ class Circuit:
         return f"Circuit(qubits={self.qubits}, gates={len(self)}, parameters={self.parameter_count}{kind})"
 
 
-def _factors(observable: Any) -> tuple[tuple[str, int], ...]:
-    """Return the Paulis of an observable and their qubits; none for what is no observable."""
+def _factors(observable: Any) -> Word:
+    """Return the Paulis of an observable and what they are of; none for what is no observable."""
     if isinstance(observable, str):
         found = [_FACTOR.fullmatch(part) for part in re.split(r"[*@]|(?<=\d)\s+(?=[XYZ])", observable)]
         return tuple((each[1], int(each[2])) for each in found if each) if all(found) else ()
     qubits = tuple(observable) if isinstance(observable, Iterable) else (observable,)
-    if not all(isinstance(q, int | np.integer) and q >= 0 for q in qubits):
+    if not all(isinstance(q, Outcome | int | np.integer) for q in qubits):
         return ()
-    return tuple(("Z", int(q)) for q in qubits)
+    return tuple(("Z", q if isinstance(q, Outcome) else int(q)) for q in qubits)
 
 
 def _observable(word: tuple[tuple[str, int], ...]) -> Observable:
@@ -604,8 +742,8 @@ def canonical(circuit: Circuit) -> str:
         angles = "".join(f" {_written(angle)}" for angle in operation.angles)
         lines.append(f"{operation.gate} {' '.join(map(str, operation.wires))}{control}{angles}")
     measured = " ".join(
-        "*".join(f"{'' if axis == 'Z' else axis}{qubit}" for axis, qubit in _factors(o))
-        for o in circuit.observables
+        "*".join(f"{'' if axis == 'Z' else axis}{qubit}" for axis, qubit in zip(axes, qubits))
+        for axes, qubits in zip(circuit.axes, circuit.measured)
     )
     return "\n".join([*lines, f"measure {measured}", ""])
 

@@ -65,10 +65,15 @@ def readouts(circuit: Circuit) -> dict[str, Circuit]:
 
     A mean-field approximation, and a single qubit, have no product.
     """
-    of: dict[str, list[Any]] = {"local": [0], "global": [tuple(range(circuit.qubits))]}
-    if circuit.mean_field or circuit.qubits == 1:
+    of: dict[str, list[Any]] = {"local": [0], "global": [tuple(range(_named(circuit)))]}
+    if circuit.mean_field or _named(circuit) == 1:
         del of["global"]
     return {name: _measuring(circuit, observables) for name, observables in of.items()}
+
+
+def _named(circuit: Circuit) -> int:
+    """Return the number of qubits without those that stand for earlier measurements and resets."""
+    return circuit.qubits - circuit.deferred
 
 
 def _measuring(circuit: Circuit, observables: list[Any]) -> Circuit:
@@ -89,7 +94,7 @@ def gradients(
     """
     points = draw(circuit, draws, seed)
     names = list(readouts(circuit))
-    together = _measuring(circuit, [0, tuple(range(circuit.qubits))][: len(names)])
+    together = _measuring(circuit, [0, tuple(range(_named(circuit)))][: len(names)])
     found = jacobians(together, *points, report)
     return {name: found[:, place] for place, name in enumerate(names)}
 
@@ -193,7 +198,7 @@ def final_states(circuit: Circuit, points: Points) -> states.States:
     """
     import torch
 
-    backend: Any = create_backend("native", _measuring(circuit, list(range(circuit.qubits))))
+    backend: Any = create_backend("native", _measuring(circuit, [0]))
     with torch.no_grad():
         found = backend.states(
             torch.from_numpy(points.inputs).float()[:, None],

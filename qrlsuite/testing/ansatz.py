@@ -73,8 +73,8 @@ def _builds(build: Any, options: Any, circuits: Circuits) -> None:
             f"build returned {type(circuit).__name__}, not a qrlsuite.circuit.Circuit: is `return circuit` there?",
         )
         require(
-            circuit.qubits == qubits,
-            f"with qubits = {qubits} the circuit has {circuit.qubits}: write Circuit(qubits)",
+            circuit.qubits - circuit.deferred == qubits,
+            f"with qubits = {qubits} the circuit has {circuit.qubits - circuit.deferred}: write Circuit(qubits)",
         )
         require(bool(circuit.operations), f"{size}: the circuit has no gate; append some before `return`")
         if qubits != LARGEST:

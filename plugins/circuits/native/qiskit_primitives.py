@@ -2,11 +2,13 @@
 
 All parameter values of a circuit run as lanes of one pass. Gates that the kernels know run in them, gates without
 parameters on few qubits by their matrix, and all others by Qiskit's own definitions. With a seed, the numbers drawn are
-those that Qiskit's primitives draw.
+those that Qiskit's primitives draw. What a circuit measures before its end is measured at its end, on a further qubit
+where that one is used again; gates that depend on it are controlled gates, and a reset takes a further qubit.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from qiskit.circuit import ControlFlowOp, ParameterExpression, QuantumCircuit
+from qiskit.circuit import Clbit, ControlFlowOp, Gate, ParameterExpression, QuantumCircuit
+from qiskit.circuit.library import CXGate
 from qiskit.primitives import (
     BaseEstimatorV2,
     BaseSamplerV2,
@@ -81,12 +84,15 @@ class Plan:
     program, samples:
         The compiled gates, and angles of all B parameter values.
     bits:
-        Of every register by its name the qubit that is measured into each of its bits, None where none is.
+        Of every register by its name the wire that is measured into each of its bits, None where none is.
+    wires:
+        Of every qubit its wire: resets move it.
     """
 
     program: StateProgram
     samples: Samples
     bits: dict[str, list[int | None]]
+    wires: list[int]
 
 
 class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
@@ -110,10 +116,12 @@ class EstimatorV2(BaseEstimatorV2):  # type: ignore[misc]  # Qiskit has no types
         Raises
         ------
         CircuitError
-            If a circuit has an operation without a definition, is measured or reset, or has too many qubits.
+            If a circuit has an operation without a definition, or too many qubits; for loops.
         """
         wanted = self.default_precision if precision is None else precision
-        work = [(pub, _plan(pub)) for pub in (EstimatorPub.coerce(each, wanted) for each in pubs)]
+        work = [
+            (pub, _plan(pub, _turned(pub))) for pub in (EstimatorPub.coerce(each, wanted) for each in pubs)
+        ]
         job = PrimitiveJob(lambda: PrimitiveResult(list(map(self._result, work)), metadata={"version": 2}))
         job._submit()
         return job
@@ -149,7 +157,7 @@ class SamplerV2(BaseSamplerV2):  # type: ignore[misc]
         Raises
         ------
         CircuitError
-            If a circuit has an operation without a definition, acts on measured qubits, or has too many qubits.
+            If a circuit has an operation without a definition, or too many qubits; for loops.
         """
         wanted = self.default_shots if shots is None else shots
         work = [(pub, _plan(pub)) for pub in (SamplerPub.coerce(each, wanted) for each in pubs)]
@@ -175,50 +183,142 @@ class SamplerV2(BaseSamplerV2):  # type: ignore[misc]
         return SamplerPubResult(DataBin(**arrays, shape=pub.shape), metadata=metadata)
 
 
-def _plan(pub: Any) -> Plan:
-    """Translate a circuit and all its parameter values."""
+class _Deferred:
+    """Operations as they come, without measurements, resets and conditions in between.
+
+    Attributes
+    ----------
+    wires:
+        Of every qubit its wire.
+    count:
+        Number of wires.
+    bits:
+        Of every bit that is measured the wire that has it.
+    """
+
+    def __init__(self, circuit: QuantumCircuit) -> None:
+        self.wires = list(range(circuit.num_qubits))
+        self.count = circuit.num_qubits
+        self.bits: dict[int, int] = {}
+        self._measured: set[int] = set()  # wires that nothing has acted on since
+        self._touched: set[int] = set()
+
+    def operations(
+        self, circuit: QuantumCircuit, qubits: Sequence[int], clbits: Sequence[int]
+    ) -> Iterator[tuple[Any, tuple[int, ...]]]:
+        """Yield gates and their wires."""
+        for operation, on, into in _flat(circuit, qubits, clbits):
+            if operation.name == "measure":
+                self.bits[into[0]] = self.wires[on[0]]
+                self._measured.add(self.wires[on[0]])
+            elif operation.name == "reset":
+                if self.wires[on[0]] in self._touched:
+                    self._measured.discard(self.wires[on[0]])
+                    self.wires[on[0]] = self._further()
+            elif isinstance(operation, ControlFlowOp):
+                yield from self._conditional(operation, on, into)
+            else:
+                yield from self.keep(on)
+                self._touched.update(self.wires[q] for q in on)
+                yield operation, tuple(self.wires[q] for q in on)
+
+    def keep(self, qubits: Iterable[int]) -> Iterator[tuple[Any, tuple[int, ...]]]:
+        """Yield gates that copy what was measured to further wires, where qubits are used again."""
+        for wire in self._measured.intersection(self.wires[q] for q in qubits):
+            copied = self._further()
+            self._measured.remove(wire)
+            self.bits = {bit: copied if each == wire else each for bit, each in self.bits.items()}
+            yield CXGate(), (wire, copied)
+
+    def _further(self) -> int:
+        self.count += 1
+        return self.count - 1
+
+    def _conditional(
+        self, operation: Any, on: tuple[int, ...], asked: tuple[int, ...]
+    ) -> Iterator[tuple[Any, tuple[int, ...]]]:
+        """Yield the gates of an `if_else`, each controlled by the measured bits."""
+        if operation.name != "if_else" or not asked:
+            raise CircuitError(
+                f"'{operation.name}' cannot be written with controlled gates: write out loops, and compare a measured "
+                "bit or register with a number"
+            )
+        value = int(operation.condition[1])
+        for body, holds in zip(operation.blocks, (True, False)):
+            yield from self.keep(on)
+            for found in range(1 << len(asked)):
+                if (found == value) == holds:
+                    yield from self._controlled(
+                        body, on, {bit: found >> k & 1 for k, bit in enumerate(asked)}
+                    )
+
+    def _controlled(
+        self, body: QuantumCircuit, on: tuple[int, ...], found: dict[int, int]
+    ) -> Iterator[tuple[Any, tuple[int, ...]]]:
+        """Yield gates that act where bits have been found so."""
+        if any(bit not in self.bits and value for bit, value in found.items()):
+            return  # it was not measured, so it is 0
+        controls = {self.bits[bit]: value for bit, value in found.items() if bit in self.bits}
+        state = sum(value << k for k, value in enumerate(controls.values()))
+        for item in body.data:
+            operation = item.operation
+            if not isinstance(operation, Gate):
+                raise CircuitError(f"'{operation.name}' depends on measured bits: only gates may")
+            inner = QuantumCircuit(len(controls) + operation.num_qubits)
+            gate = (
+                operation.control(len(controls), ctrl_state=state, annotated=False) if controls else operation
+            )
+            inner.append(gate, range(inner.num_qubits))
+            wires = [self.wires[on[body.find_bit(q).index]] for q in item.qubits]
+            self._touched.update(wires)
+            for each, where, _ in _flat(inner, [*controls, *wires], ()):
+                yield each, where
+
+
+def _turned(pub: Any) -> set[int]:
+    """Return the qubits on which an observable has another Pauli than Z."""
+    labels = {label for each in pub.observables.ravel().tolist() for label in each}
+    return {q for label in labels for q, pauli in enumerate(reversed(label)) if pauli in "XY"}
+
+
+def _plan(pub: Any, turned: Iterable[int] = ()) -> Plan:
+    """Translate a circuit and all its parameter values; outcomes on turned qubits are copied before these turn."""
     circuit = pub.circuit
-    try:
-        refuse_width(circuit.num_qubits)
-    except ValueError as error:
-        raise CircuitError(str(error)) from None
+    _refuse_width(circuit.num_qubits)
     values = pub.parameter_values
     table = values.as_array(circuit.parameters).reshape(math.prod(values.shape), circuit.num_parameters)
     known = {parameter: table[:, i] for i, parameter in enumerate(circuit.parameters)}
     gates: list[tuple[Rule | None, tuple[int, ...]]] = []
     angles: list[Any] = []
     matrices: list[NDArray[np.complex128]] = []
-    measured: dict[int, int] = {}
-    touched: set[int] = set()
-    for operation, qubits, clbits in _flat(circuit, range(circuit.num_qubits), range(circuit.num_clbits)):
-        if operation.name == "measure":
-            measured[clbits[0]] = qubits[0]
-            continue
-        if operation.name == "reset" and qubits[0] not in touched:
-            continue
-        again = set(qubits) & set(measured.values())
-        if again or operation.name == "reset":
-            raise CircuitError(
-                f"'{operation.name}' on qubit {qubits[0]} comes after a measurement or gates: circuits are measured at "
-                "their end, and reset at their beginning; use another qubit"
-            )
-        touched.update(qubits)
+    deferred = _Deferred(circuit)
+    every = deferred.operations(circuit, range(circuit.num_qubits), range(circuit.num_clbits))
+    for operation, wires in itertools.chain(every, deferred.keep(turned)):
         rule = RULES.get(operation.name)
         if rule is None:
-            gates.append((None, tuple(reversed(qubits))))
+            gates.append((None, tuple(reversed(wires))))
             matrices.append(Operator(operation).data)
         else:
-            gates.append((rule, qubits))
+            gates.append((rule, wires))
             if rule.gate and any(isinstance(a, int) for a in rule.angles):
                 angles += [_angle(value, known) for value in operation.params]
+    _refuse_width(deferred.count)
     columns = np.empty((len(table), len(angles)))
     for column, angle in enumerate(angles):
         columns[:, column] = angle
     bits: dict[str, list[int | None]] = {
-        register.name: [measured.get(circuit.find_bit(bit).index) for bit in register]
+        register.name: [deferred.bits.get(circuit.find_bit(bit).index) for bit in register]
         for register in circuit.cregs
     }
-    return Plan(compiled(circuit.num_qubits, False, tuple(gates)), Samples(columns, matrices), bits)
+    program = compiled(deferred.count, False, tuple(gates))
+    return Plan(program, Samples(columns, matrices), bits, deferred.wires)
+
+
+def _refuse_width(qubits: int) -> None:
+    try:
+        refuse_width(qubits)
+    except ValueError as error:
+        raise CircuitError(str(error)) from None
 
 
 def _flat(
@@ -226,10 +326,12 @@ def _flat(
 ) -> Iterator[tuple[Any, tuple[int, ...], tuple[int, ...]]]:
     """Yield operations that run as they are, with qubits and bits; all others by their definitions.
 
+    The bits of a condition are those that it compares.
+
     Raises
     ------
     CircuitError
-        If an operation has no definition, or depends on measured bits.
+        If an operation has no definition.
     """
     for item in circuit.data:
         operation = item.operation
@@ -238,9 +340,11 @@ def _flat(
         on = tuple(qubits[circuit.find_bit(q).index] for q in item.qubits)
         into = tuple(clbits[circuit.find_bit(c).index] for c in item.clbits)
         if isinstance(operation, ControlFlowOp):
-            raise CircuitError(
-                f"'{operation.name}' depends on measured bits, which this simulator cannot follow"
-            )
+            condition = getattr(operation, "condition", None)
+            asked = condition[0] if isinstance(condition, tuple) else ()
+            bits = [asked] if isinstance(asked, Clbit) else asked  # the lowest first
+            yield operation, on, tuple(clbits[circuit.find_bit(bit).index] for bit in bits)
+            continue
         plain = all(not isinstance(value, ParameterExpression) for value in operation.params)
         positive = getattr(operation, "ctrl_state", None) in (None, 1)
         known = operation.name in ("measure", "reset") or (operation.name in RULES and positive)
@@ -274,7 +378,7 @@ def _means(pub: Any, plan: Plan) -> NDArray[np.float64]:
     """Return the means of a pub, in its shape."""
     shape = pub.shape
     given = pub.observables.ravel()
-    sums = [_words(given[(i,)], pub.circuit.num_qubits) for i in range(given.size)]
+    sums = [_words(given[(i,)], plan.wires) for i in range(given.size)]
     count = len(plan.samples.angles)
     rows = np.broadcast_to(np.arange(count).reshape(pub.parameter_values.shape), shape).reshape(-1)
     columns = np.broadcast_to(np.arange(len(sums)).reshape(pub.observables.shape), shape).reshape(-1)
@@ -292,8 +396,8 @@ def _means(pub: Any, plan: Plan) -> NDArray[np.float64]:
     return means.reshape(shape)
 
 
-def _words(observable: Any, qubits: int) -> list[tuple[dict[int, str], float]]:
-    """Return Pauli words by qubit with their coefficients.
+def _words(observable: Any, wires: Sequence[int]) -> list[tuple[dict[int, str], float]]:
+    """Return Pauli words by wire with their coefficients.
 
     Raises
     ------
@@ -306,7 +410,7 @@ def _words(observable: Any, qubits: int) -> list[tuple[dict[int, str], float]]:
             raise CircuitError(
                 f"observable '{label}': write projectors as sums of the Pauli matrices I, X, Y and Z"
             )
-        paulis = {q: pauli for q, pauli in enumerate(reversed(label)) if pauli != "I"}
+        paulis = {wires[q]: pauli for q, pauli in enumerate(reversed(label)) if pauli != "I"}
         words.append((paulis, float(np.real(coefficient))))
     return words
 
