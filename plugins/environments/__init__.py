@@ -117,6 +117,31 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
     )
     register(
         EnvironmentSpec(
+            name="vqe",
+            summary="VQE: grow a circuit whose state has a low energy",
+            options=f"{_QUANTUM}.vqe:VQEOptions",
+            gymnasium_id="qrlsuite/VQE-v1",
+            entry_point=f"{_QUANTUM}.vqe:VQE",
+            vector=f"{_QUANTUM}.vqe:make_vector",
+            policies={"best circuit": f"{_QUANTUM}.vqe:BestCircuit", "greedy": f"{_QUANTUM}.vqe:GreedyGate"},
+        )
+    )
+    register(
+        EnvironmentSpec(
+            name="channel",
+            summary="Channel: find out by experiments which error a qubit suffers",
+            options=f"{_QUANTUM}.channel:ChannelOptions",
+            gymnasium_id="qrlsuite/Channel-v1",
+            entry_point=f"{_QUANTUM}.channel:Channel",
+            vector=f"{_QUANTUM}.channel:make_vector",
+            policies={
+                "most informative": f"{_QUANTUM}.channel:Informative",
+                "in turn": f"{_QUANTUM}.channel:InTurn",
+            },
+        )
+    )
+    register(
+        EnvironmentSpec(
             name="gym",
             summary="any environment of Gymnasium, by its id",
             options=f"{_HERE}.gym:GymOptions",

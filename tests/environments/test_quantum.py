@@ -14,7 +14,13 @@ from scipy.linalg import expm
 
 from qrlsuite.actions import draw
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.plugins.environments.quantum import clifford, pulse
+from qrlsuite.plugins.environments.quantum import channel, clifford, pulse, vqe
+from qrlsuite.plugins.environments.quantum.channel import (
+    ChannelLanes,
+    ChannelOptions,
+    Informative,
+    InTurn,
+)
 from qrlsuite.plugins.environments.quantum.clifford import (
     Clifford,
     CliffordLanes,
@@ -30,6 +36,7 @@ from qrlsuite.plugins.environments.quantum.pulse import (
     PulseLanes,
     PulseOptions,
 )
+from qrlsuite.plugins.environments.quantum.vqe import VQE, BestCircuit, GreedyGate, VQELanes, VQEOptions
 
 SINGLE: list[Drawn] = [
     Pulse(steps=9, render_mode="rgb_array"),
@@ -174,6 +181,69 @@ def test_operations_are_written_and_by_no_circuit_that_is_shorter() -> None:
         ShortestCircuit(CliffordLanes(CliffordOptions(qubits=4), 1))
 
 
+@pytest.mark.parametrize(
+    ("options", "at", "known"),
+    [
+        (
+            VQEOptions(),
+            3,
+            0.2252 - 0.5716 - np.hypot(0.3435 + 0.4347, 2 * 0.0910),
+        ),  # 0.75 Angstrom: |01> and |10>
+        (VQEOptions(model="ising", steps=3), 5, -np.hypot(1, 2)),  # g = 1: the two states that are symmetric
+    ],
+)
+def test_energies_are_those_of_dense_matrices(options: VQEOptions, at: int, known: float) -> None:
+    """Exact ones by hand, in the block of two states that matters; those of a circuit by matrices; angles are best."""
+    lanes = VQELanes(options, 1)
+    _, exact = vqe.energies(options)
+    assert exact[at] == pytest.approx(known, abs=1e-12)
+    lanes.reset(seed=0)
+    for action in (0, 2, 1):
+        lanes.autoreset = False
+        lanes.step(np.array([action]))
+    h, y, cx = lanes.matrices[lanes.which[0]], pauli("Y"), np.eye(4)[[0, 1, 3, 2]]
+
+    def energy(first: float, second: float) -> float:
+        state = np.eye(4)[0]
+        for gate in (
+            np.kron(expm(-0.5j * first * y), np.eye(2)),
+            cx,
+            np.kron(np.eye(2), expm(-0.5j * second * y)),
+        ):
+            state = gate @ state
+        return float((state.conj() @ h @ state).real)
+
+    first, _, second = lanes.angles[0, :3]
+    assert energy(first, second) == pytest.approx(lanes.energy[0], abs=1e-12)
+    assert all(energy(first, second + turn) >= lanes.energy[0] - 1e-12 for turn in np.linspace(0, 6, 30))
+
+
+def test_circuits_of_six_gates_reach_the_ground_states_of_hydrogen() -> None:
+    lanes = VQELanes(VQEOptions(), 64)
+    np.testing.assert_allclose(scores(lanes, BestCircuit), 1, atol=1e-6)
+    assert np.abs(lanes.above()).max() < 1e-8
+    assert scores(lanes, GreedyGate).max() < 1e-6, "greedy circuits never entangle here"
+    with pytest.raises(OptionError, match='the model "h2" has 2'):
+        VQE(qubits=3)
+
+
+def test_outcomes_are_those_of_kraus_operators() -> None:
+    """Every channel and experiment; and who asks what is informative is right more often."""
+    p, paulis = 0.3, [pauli(letter) for letter in "XYZ"]
+    flips = [[np.sqrt(1 - p) * np.eye(2), np.sqrt(p) * one] for one in (paulis[0], paulis[1], paulis[2])]
+    mixed = [np.sqrt(1 - 3 * p / 4) * np.eye(2), *(np.sqrt(p / 4) * one for one in paulis)]
+    damped = [np.diag([1, np.sqrt(1 - p)]), np.array([[0, np.sqrt(p)], [0, 0]])]
+    states = np.array([[1, 0], [0, 1], [1 / np.sqrt(2), 1 / np.sqrt(2)], [1 / np.sqrt(2), 1j / np.sqrt(2)]])
+    for row, kraus in zip(channel.probabilities(p), [*flips, mixed, damped], strict=True):
+        for k, (state, basis) in enumerate(product(states, paulis)):
+            rho = sum(each @ np.outer(state, state.conj()) @ each.conj().T for each in kraus)
+            assert row[k] == pytest.approx((1 + np.trace(rho @ basis).real) / 2)
+    informed, in_turn = (
+        scores(ChannelLanes(ChannelOptions(), 400), policy) for policy in (Informative, InTurn)
+    )
+    assert informed.mean() > 0.9 > in_turn.mean() > 0.4
+
+
 @each
 def test_states_that_cannot_be(env: Drawn) -> None:
     lanes: Any = env.lanes
@@ -188,4 +258,4 @@ def test_states_that_cannot_be(env: Drawn) -> None:
 
 
 def test_registered_by_import() -> None:
-    assert {pulse.ID, clifford.ID} <= set(gymnasium.registry)
+    assert {each.ID for each in (channel, clifford, pulse, vqe)} <= set(gymnasium.registry)

@@ -90,6 +90,10 @@ class QuantumLanes(LaneEnv):
         """Return what each lane's episode is worth if it ends now, (L,) in [0, 1]."""
         raise NotImplementedError
 
+    def _metrics(self) -> dict[str, FloatArray]:
+        """Return what else is measured at an episode's end, (L,) by name."""
+        return {}
+
     def _possible(self, state: Mapping[str, NDArray[Any]]) -> bool:
         """Return whether arrays of the right shapes are a state."""
         return True
@@ -138,6 +142,10 @@ class QuantumLanes(LaneEnv):
         infos: dict[str, Any] = {}
         if done.any():
             infos = endings(done, seen, score=self._scores())
+            if metrics := self._metrics():
+                infos["final_info"]["metrics"] = {
+                    name: np.where(done, values, np.nan) for name, values in metrics.items()
+                }
             self._ended |= done
             if self.autoreset:
                 self._restart(np.flatnonzero(done))

@@ -127,3 +127,66 @@ def clifford(
     done = (left == np.eye(len(left))).all()
     narrow.set_title("done" if done else "remains", fontsize=9, color=INK)
     return pixels(drawn)
+
+
+def vqe(
+    gates: Sequence[tuple[str, tuple[int, ...]]],
+    angles: Sequence[float],
+    above: Sequence[float],
+    options: Any,
+    title: str,
+    gap: float,
+) -> NDArray[np.uint8]:
+    """Draw a circuit with its angles, and below it the energy above the ground state's after each gate."""
+    drawn = figure(1.6 + 0.62 * options.steps, 2.6 + 0.5 * options.qubits)
+    top, below = drawn.subplots(2, 1, height_ratios=(0.5 * options.qubits, 1.8))
+    shown = [
+        (name if len(at) == 2 else f"RY\n{angle / np.pi:+.2f}$\\pi$", at)
+        for (name, at), angle in zip(gates, angles)
+    ]
+    circuit(top, shown, options.qubits, options.steps)
+    top.set_title(f"{options.model}, {title}", fontsize=9, color=INK, loc="left")
+    steps = np.arange(len(above))
+    shown_above = np.maximum(above, 1e-8)  # zero but for rounding
+    below.semilogy(steps, shown_above, "o-", color=COLORS[2], lw=1.2, ms=4)
+    below.axhline(gap, color=COLORS[1], lw=1, ls="--")
+    below.text(options.steps, gap, "without CX ", fontsize=7, color=COLORS[1], ha="right", va="bottom")
+    below.set(xlim=(-0.3, options.steps + 0.1), ylim=(min(shown_above.min(), gap) / 3, None))
+    unit = "Hartree" if options.model == "h2" else "coupling"
+    below.set_ylabel(f"energy error, {unit}", fontsize=8)
+    below.set_xlabel("gates", fontsize=8)
+    _plain(below)
+    return pixels(drawn)
+
+
+def channel(
+    counts: NDArray[np.int64],
+    believed: NDArray[np.float64],
+    inputs: Sequence[str],
+    channels: Sequence[str],
+    kind: int,
+    named: int,
+) -> NDArray[np.uint8]:
+    """Draw how often +1 and -1 were measured, and how probable each channel is; the true one is bold."""
+    drawn = figure(7.2, 3.0)
+    left, right = drawn.subplots(1, 2, width_ratios=(3, 4))
+    tried = counts.sum(1).reshape(len(inputs), 3)
+    left.imshow(tried, cmap="Blues", vmin=0, vmax=max(6, int(tried.max()) * 1.5))
+    for k, (minus, plus) in enumerate(counts.tolist()):
+        if minus + plus:
+            left.text(k % 3, k // 3, f"+{plus} -{minus}", ha="center", va="center", fontsize=8, color=INK)
+    left.set_xticks(range(3), ["X", "Y", "Z"])
+    left.set_yticks(range(len(inputs)), [f"|{state}>" for state in inputs])
+    left.tick_params(length=0, labelsize=8)
+    left.set_title(f"{int(counts.sum())} experiments", fontsize=9, color=INK, loc="left")
+    right.barh(
+        range(len(channels)), believed, color=[COLORS[2] if k == kind else PALE for k in range(len(channels))]
+    )
+    right.set_yticks(range(len(channels)), channels)
+    right.get_yticklabels()[kind].set_fontweight("bold")
+    right.invert_yaxis()
+    right.set(xlim=(0, 1))
+    _plain(right)
+    said = f"named: {channels[named]}" if named >= 0 else "probability"
+    right.set_title(said, fontsize=9, color=INK, loc="left")
+    return pixels(drawn)

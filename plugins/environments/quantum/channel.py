@@ -1,0 +1,265 @@
+"""Channel: find out by experiments which kind of error a qubit suffers, and name it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from qrlsuite import options as option_words
+from qrlsuite.environment import LaneEnv
+from qrlsuite.plugins.environments.quantum import pictures
+from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes
+
+ID = "qrlsuite/Channel-v1"
+IntArray = NDArray[np.int64]
+CHANNELS = ("bit flip", "bit-phase flip", "phase flip", "depolarizing", "amplitude damping")
+INPUTS: dict[str, tuple[int, int, int]] = {"0": (0, 0, 1), "1": (0, 0, -1), "+": (1, 0, 0), "+i": (0, 1, 0)}
+"""Input states and their Bloch vectors."""
+EXPERIMENTS = [(state, basis) for state in INPUTS for basis in "XYZ"]
+"""Input state and basis of measurement, in the order of the actions."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class ChannelOptions:
+    """Options of Channel."""
+
+    strength: Annotated[
+        float,
+        Field(gt=0, le=1, description="probability p of the error, or damping, which the agent may learn"),
+    ] = 0.4
+    steps: Annotated[
+        int, Field(ge=2, le=1000, description="steps of an episode: experiments, and naming the channel")
+    ] = 20
+
+
+def probabilities(strength: float) -> FloatArray:
+    """Return the probability of the outcome +1 for each channel and experiment, (5, 12).
+
+    A channel maps a Bloch vector r to T r + t; names and formulas are those of Nielsen and Chuang, "Quantum Computation
+    and Quantum Information", section 8.3, with p as the probability that the error happens.
+    """
+    p = strength
+    flips = [np.full(3, 1 - 2 * p) for _ in range(3)]
+    for axis, shrunk in enumerate(flips):  # X, Y, Z leave the axis of their own as it is
+        shrunk[axis] = 1.0
+    damped = np.array([np.sqrt(1 - p), np.sqrt(1 - p), 1 - p])
+    shrinks = np.array([*flips, np.full(3, 1 - p), damped])
+    moved = np.zeros((5, 3))
+    moved[4, 2] = p
+    vectors = np.array(list(INPUTS.values()))
+    after = shrinks[:, None, :] * vectors + moved[:, None, :]
+    result: FloatArray = ((1.0 + after) / 2.0).reshape(5, -1)
+    return result
+
+
+class Channel(Drawn):
+    """Find out by experiments which error a qubit suffers.
+
+    ## Description
+
+    A qubit goes through one of five channels, each equally likely: with probability p a bit flip (X), a bit-phase flip
+    (Y) or a phase flip (Z), a state that is replaced by the mixed one (depolarizing), or amplitude damping with gamma =
+    p. An experiment prepares |0>, |1>, |+> or |+i>, sends it through the channel, and measures X, Y or Z. The agent
+    chooses experiments one by one, and names the channel when it knows enough.
+
+    ## Action Space
+
+    `Discrete(17)`: experiments 0 to 11, (input, basis) = (0, X), (0, Y), (0, Z), (1, X), ..., (+i, Z); then the names:
+    bit flip, bit-phase flip, phase flip, depolarizing, amplitude damping.
+
+    ## Observation Space
+
+    `Box(0, 1, (25,), float32)`: for each experiment how often +1 and how often -1 was measured, divided by `steps`;
+    then the part of the steps that is over. Nothing else that was seen says more about the channel.
+
+    ## Rewards
+
+    1 for the right name, else 0.
+
+    ## Episode End
+
+    The episode is *terminated* when a channel is named, and after `steps` steps. `info["score"]` is 1 where the name
+    was right, else 0.
+
+    ## Arguments
+
+    | Argument   | Default | Meaning                                        |
+    |------------|---------|------------------------------------------------|
+    | `strength` | 0.4     | p, in (0, 1]                                   |
+    | `steps`    | 20      | experiments, and the step that names           |
+
+    ## Version History
+
+    * v1: first version.
+
+    Raises
+    ------
+    qrlsuite.errors.OptionError
+        If an argument cannot be used.
+    """
+
+    lanes: ChannelLanes
+
+    def __init__(self, strength: float = 0.4, steps: int = 20, render_mode: str | None = None) -> None:
+        values = {"strength": strength, "steps": steps}
+        super().__init__(
+            ChannelLanes(option_words.build(ChannelOptions, values, "environment 'channel'"), 1), render_mode
+        )
+
+    def moment(self) -> FloatArray:
+        """Return the probability of each channel after what was measured, (5,)."""
+        believed: FloatArray = self.lanes.posterior()[0]
+        return believed
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return what was measured, and how probable each channel is by that, (height, width, 3) uint8."""
+        lanes = self.lanes
+        named = int(lanes.named[0])
+        return pictures.channel(
+            lanes.counts[0], self.shown[-1], list(INPUTS), CHANNELS, int(lanes.kind[0]), named
+        )
+
+
+class ChannelLanes(QuantumLanes):
+    """Vector form of `Channel`; see there for spaces and rewards.
+
+    An episode begins with uniform numbers of the lane's stream: one for the channel, and one for each outcome.
+
+    Parameters
+    ----------
+    options:
+        Common to all lanes.
+    num_envs:
+        Number of lanes L, at least 1.
+
+    Attributes
+    ----------
+    kind, named:
+        The channel, and the one that was named, -1 where none was yet, (L,).
+    counts:
+        How often -1 and +1 were measured, (L, 12, 2).
+    """
+
+    name = "channel"
+
+    def __init__(self, options: ChannelOptions, num_envs: int) -> None:
+        observation = Box(0.0, 1.0, (2 * len(EXPERIMENTS) + 1,), np.float32)
+        super().__init__(options, num_envs, observation, Discrete(len(EXPERIMENTS) + len(CHANNELS)))
+        self.plus = probabilities(options.strength)
+        self.kind = np.zeros(num_envs, np.int64)
+        self.named = np.full(num_envs, -1, np.int64)
+        self.counts = np.zeros((num_envs, len(EXPERIMENTS), 2), np.int64)
+        self._luck = np.zeros((num_envs, options.steps))
+
+    def posterior(self) -> FloatArray:
+        """Return how probable each channel is after what was measured, by Bayes' rule, (L, 5)."""
+        likelihood = np.ones((self.num_envs, len(CHANNELS)))
+        for k in range(len(EXPERIMENTS)):
+            for outcome, chance in enumerate((1.0 - self.plus[:, k], self.plus[:, k])):
+                likelihood *= chance ** self.counts[:, k, outcome, None]
+        result: FloatArray = likelihood / likelihood.sum(1, keepdims=True)
+        return result
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"kind": self.kind, "named": self.named, "counts": self.counts, "luck": self._luck}
+
+    def _draw(self, stream: np.random.Generator, count: int) -> FloatArray:
+        return stream.random((count, 1 + self.options.steps))
+
+    def _begin(self, lanes: NDArray[np.intp], drawn: FloatArray) -> None:
+        self.kind[lanes] = (drawn[:, 0] * len(CHANNELS)).astype(np.int64)
+        self._luck[lanes] = drawn[:, 1:]
+        self.named[lanes], self.counts[lanes] = -1, 0
+
+    def _act(self, actions: NDArray[Any], running: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.bool_]]:
+        names = actions >= len(EXPERIMENTS)
+        tried = np.flatnonzero(running & ~names)
+        chance = self.plus[self.kind[tried], actions[tried]]
+        outcome = self._luck[tried, self.step_count[tried] - 1] < chance
+        self.counts[tried, actions[tried], outcome.astype(np.int64)] += 1
+        self.named = np.where(running & names, actions - len(EXPERIMENTS), self.named)
+        return self._scores(), names
+
+    def _seen(self) -> NDArray[np.float32]:
+        parts = self.counts[:, :, ::-1].reshape(self.num_envs, -1), self.step_count
+        seen: NDArray[np.float32] = (np.column_stack(parts) / self.options.steps).astype(np.float32)
+        return seen
+
+    def _scores(self) -> FloatArray:
+        result: FloatArray = (self.named == self.kind).astype(np.float64)
+        return result
+
+    def _possible(self, state: Mapping[str, NDArray[Any]]) -> bool:
+        kinds = range(len(CHANNELS))
+        return bool(
+            np.isin(state["kind"], kinds).all()
+            and np.isin(state["named"], (-1, *kinds)).all()
+            and state["counts"].min() >= 0
+            and (state["counts"].sum((1, 2)) <= state["step"]).all()
+            and ((state["luck"] >= 0) & (state["luck"] < 1)).all()
+        )
+
+
+class Informative:
+    """The reference policy that makes the experiment from which most is learned, and then names the likeliest channel.
+
+    What is learned is the mutual information of outcome and channel, after what was measured: greedy, one step ahead.
+    The name is the best one that this data allows; whether other experiments would be better still is not known.
+    """
+
+    def __init__(self, envs: LaneEnv) -> None:
+        if not isinstance(envs, ChannelLanes):
+            raise TypeError(f"a policy of channel needs its lanes, not {type(envs).__name__}")
+        self.envs = envs
+
+    def __call__(self, observations: NDArray[np.float32]) -> IntArray:
+        """Return actions (L,)."""
+        believed = self.envs.posterior()
+        last = self.envs.step_count >= self.envs.options.steps - 1
+        named = len(EXPERIMENTS) + believed.argmax(1)
+        result: IntArray = np.where(last, named, self.experiments(believed)).astype(np.int64)
+        return result
+
+    def experiments(self, believed: FloatArray) -> IntArray:
+        """Return an experiment for each lane, given how probable the channels are (L, 5)."""
+        plus = self.envs.plus
+        learned = _entropy(believed @ plus) - believed @ _entropy(plus)
+        chosen: IntArray = learned.round(9).argmax(1)
+        return chosen
+
+
+class InTurn(Informative):
+    """The reference policy that makes the experiments in turn, and at last names what is most probable."""
+
+    def experiments(self, believed: FloatArray) -> IntArray:
+        """Return an experiment for each lane."""
+        result: IntArray = self.envs.step_count % len(EXPERIMENTS)
+        return result
+
+
+def _entropy(plus: FloatArray) -> FloatArray:
+    """Return the entropy, in nats, of outcomes that are +1 with these probabilities."""
+    p = np.stack([plus, 1.0 - plus])
+    result: FloatArray = -(p * np.log(np.maximum(p, 1e-300))).sum(0)
+    return result
+
+
+def make_vector(options: ChannelOptions, num_envs: int) -> LaneEnv:
+    """Return the vector environment of `options` with `num_envs` lanes."""
+    return ChannelLanes(options, num_envs)
+
+
+def register() -> None:
+    """Register `qrlsuite/Channel-v1` with Gymnasium; a second call does nothing."""
+    if ID not in gymnasium.registry:
+        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.quantum.channel:Channel")
+
+
+register()
