@@ -96,8 +96,11 @@ def main(states: int) -> None:
         launch(name, *arguments)  # type: ignore[arg-type]
 
     gpu._launch = listening  # type: ignore[assignment]
+    with torch.no_grad():
+        right = gpu.computes_right("cpu")
+    launched.clear()
     found = {f"{name}, {kind}": differences(circuits()[name], kind) for name, kind in sorted(chosen, key=str)}
-    print(json.dumps({"launched": sorted(set(launched)), "differences": found}))
+    print(json.dumps({"right": right, "launched": sorted(set(launched)), "differences": found}))
 
 
 @pytest.mark.parametrize(
@@ -120,6 +123,7 @@ def test_simulated_kernels_equal_the_cpus(states: int, kernels: list[str]) -> No
     )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
+    assert result["right"], "the check of a GPU, also where gradients are off"
     assert result["launched"] == kernels
     for name, differences in result["differences"].items():
         limit = 1e-12 if "float64" in name else 1e-5

@@ -153,11 +153,12 @@ def _view(tensor: Tensor) -> Any:
     return cuda.as_cuda_array(tensor, sync=False) if tensor.is_cuda else tensor.numpy()
 
 
-def computes_right() -> bool:
+@torch.enable_grad()  # the first circuit may be one of an agent that only acts
+def computes_right(device: str = "cuda") -> bool:
     """Compute <Z> = cos(x + w) and its slopes on torch's current GPU; return whether they are right."""
     circuit = Circuit(1)
     circuit.append("RX", 0, circuit.input(0) + circuit.parameter("w", (1,))[0])
-    x, w = (torch.full(shape, 0.25, device="cuda", requires_grad=True) for shape in ((1, 1, 1), (1, 1)))
+    x, w = (torch.full(shape, 0.25, device=device, requires_grad=True) for shape in ((1, 1, 1), (1, 1)))
     value = GPUSimulator(compile_circuit(circuit))(x, w)
     slopes = torch.autograd.grad(value.sum(), [x, w])
     found = [float(number) for number in (value, *slopes)]
