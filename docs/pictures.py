@@ -122,6 +122,8 @@ PICTURES: dict[str, Picture] = {
         for kind in ("pairs", "entries")
     },
     "study-ppo-bars.png": Plot("study draw ppo --published --seeds 20", ("unranked/beam6g/ppo-*",)),
+    "episode-pulse.png": Plot("plot episode seed=2 --task pulse", ()),
+    "episode-vqe.png": Plot("plot episode seed=2 --task vqe-ising", ()),
 }
 
 CAPTIONS = {
@@ -146,6 +148,8 @@ CAPTIONS = {
     "study-deploy-errors.png": "Trained agents that act with gate errors",
     "study-shots-costs.png": "Training with shots, by steps, executions and shots",
     "study-shots-curves.png": "Training with shots, learning curves",
+    "episode-pulse.png": "A quantum task: the best switched field, and the path of the qubit",
+    "episode-vqe.png": "A quantum task: the best known circuit for a ground state",
     "report-wide.png": "The board as a page",
     "report-pairs.png": "The page: who outperforms whom",
     "report-narrow.png": "The page on a phone",

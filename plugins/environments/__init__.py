@@ -11,6 +11,13 @@ _HERE = "qrlsuite.plugins.environments"
 _BEAM6G = f"{_HERE}.beam6g"
 _QUANTUM = f"{_HERE}.quantum"
 
+_EPISODE = PictureSpec(
+    name="episode",
+    summary="an episode of a quantum task, as its best known policy plays it",
+    draw=f"{_QUANTUM}.episode:episode",
+    options=f"{_QUANTUM}.episode:EpisodeOptions",
+)
+
 
 @hookimpl
 def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
@@ -98,6 +105,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/Pulse-v1",
             entry_point=f"{_QUANTUM}.pulse:Pulse",
             vector=f"{_QUANTUM}.pulse:make_vector",
+            pictures=(_EPISODE,),
             policies={"best pulse": f"{_QUANTUM}.pulse:BestPulse", "greedy": f"{_QUANTUM}.pulse:GreedyPulse"},
         )
     )
@@ -109,6 +117,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/Clifford-v1",
             entry_point=f"{_QUANTUM}.clifford:Clifford",
             vector=f"{_QUANTUM}.clifford:make_vector",
+            pictures=(_EPISODE,),
             policies={
                 "shortest circuit": f"{_QUANTUM}.clifford:ShortestCircuit",
                 "greedy": f"{_QUANTUM}.clifford:GreedyCircuit",
@@ -123,6 +132,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/VQE-v1",
             entry_point=f"{_QUANTUM}.vqe:VQE",
             vector=f"{_QUANTUM}.vqe:make_vector",
+            pictures=(_EPISODE,),
             policies={"best circuit": f"{_QUANTUM}.vqe:BestCircuit", "greedy": f"{_QUANTUM}.vqe:GreedyGate"},
         )
     )
@@ -134,6 +144,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             gymnasium_id="qrlsuite/Channel-v1",
             entry_point=f"{_QUANTUM}.channel:Channel",
             vector=f"{_QUANTUM}.channel:make_vector",
+            pictures=(_EPISODE,),
             policies={
                 "most informative": f"{_QUANTUM}.channel:Informative",
                 "in turn": f"{_QUANTUM}.channel:InTurn",

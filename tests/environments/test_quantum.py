@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from qrlsuite.actions import draw
 from qrlsuite.errors import OptionError, StoreError
-from qrlsuite.plugins.environments.quantum import channel, clifford, pulse, vqe
+from qrlsuite.plugins.environments.quantum import channel, clifford, episode, pulse, vqe
 from qrlsuite.plugins.environments.quantum.channel import (
     Channel,
     ChannelLanes,
@@ -244,6 +244,20 @@ def test_outcomes_are_those_of_kraus_operators() -> None:
         scores(ChannelLanes(ChannelOptions(), 400), policy) for policy in (Informative, InTurn)
     )
     assert informed.mean() > 0.9 > in_turn.mean() > 0.4
+
+
+@pytest.mark.parametrize("policy", ["best", "greedy"])
+def test_a_picture_of_an_episode_of_every_task(policy: Any) -> None:
+    worlds = [make(steps=4) for make in (PulseOptions, CliffordOptions, VQEOptions, ChannelOptions)]
+    drawn = episode.episode(dict(zip("abcd", worlds)), episode.EpisodeOptions(policy=policy))
+    assert [len(axes.images) for axes in drawn.axes] == [1] * 4
+    shown = (
+        episode.episode({"pulse": worlds[0]}, episode.EpisodeOptions(policy=policy))
+        .axes[-1]
+        .lines[-1]
+        .get_ydata()
+    )
+    assert (len(shown), shown[-1] <= 1) == (5, True)  # type: ignore[arg-type, index]
 
 
 @each

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,9 @@ from qrlsuite import options as option_words
 from qrlsuite.environment import LaneEnv
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ID = "qrlsuite/Channel-v1"
 IntArray = NDArray[np.int64]
@@ -118,8 +121,8 @@ class Channel(Drawn):
         believed: FloatArray = self.lanes.posterior()[0]
         return believed
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return what was measured, and how probable each channel is by that, (height, width, 3) uint8."""
+    def figure(self) -> Figure:
+        """Return what was measured, and how probable each channel is by that."""
         lanes = self.lanes
         named = int(lanes.named[0])
         return pictures.channel(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,9 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ID = "qrlsuite/Clifford-v1"
 Coupling = Literal["line", "ring", "all"]
@@ -153,8 +156,8 @@ class Clifford(Drawn):
         left: IntArray = self.lanes.left[0].copy()
         return left
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return the circuit so far and what remains, (height, width, 3) uint8."""
+    def figure(self) -> Figure:
+        """Return the circuit so far and what remains."""
         options = self.lanes.options
         circuit = [self.lanes.gates[int(action)] for action in self.done]
         return pictures.clifford(circuit, self.shown[-1], options.qubits, options.steps)

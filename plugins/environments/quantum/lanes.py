@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from qrlsuite.actions import check_actions
 from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings, require_state
 from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.plugins.environments.quantum.pictures import pixels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -209,6 +213,14 @@ class Drawn(OneLane):
     def moment(self) -> Any:
         """Return what the picture needs of this moment."""
         raise NotImplementedError
+
+    def figure(self) -> Figure:
+        """Return the picture of this moment."""
+        raise NotImplementedError
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return the picture of this moment, (height, width, 3) uint8."""
+        return pixels(self.figure())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -33,18 +33,31 @@ def pixels(drawn: Figure) -> NDArray[np.uint8]:
     return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
-def pulse(shown: Sequence[Any], fields: Sequence[NDArray[np.float64]], options: Any) -> NDArray[np.uint8]:
-    """Draw the qubits' paths in their Bloch spheres, and below them the fields and the fidelity."""
+def pulse(
+    vectors: NDArray[np.float64],
+    paths: NDArray[np.float64],
+    fidelity: NDArray[np.float64],
+    fields: Sequence[NDArray[np.float64]],
+    options: Any,
+) -> Figure:
+    """Draw the qubits' paths in their Bloch spheres, and below them the fields and the fidelity.
+
+    Parameters
+    ----------
+    vectors, paths:
+        Bloch vectors after each step (K + 1, qubits, 3), and as many more as make a path smooth.
+    fidelity, fields:
+        After each step, (K + 1,), and in each, K of (qubits,).
+    """
     qubits, steps = options.qubits, options.steps
     drawn = figure(3.6 * qubits, 5.4)
     grid = drawn.add_gridspec(2, qubits, height_ratios=(3.6, 1.8))
-    paths = np.array([vectors for vectors, _ in shown])
     for q in range(qubits):
         axes: Any = drawn.add_subplot(grid[0, q], projection="3d")
         _sphere(axes)
         axes.plot(*paths[:, q].T, color=COLORS[q], lw=1.4)
-        axes.scatter(*paths[:, q].T, color=COLORS[q], s=9, depthshade=False)
-        axes.scatter(*paths[-1:, q].T, color=INK, s=34, depthshade=False)
+        axes.scatter(*vectors[:, q].T, color=COLORS[q], s=9, depthshade=False)
+        axes.scatter(*vectors[-1:, q].T, color=INK, s=34, depthshade=False)
         if qubits == 1:
             axes.scatter([0], [0], [-1], marker="*", color=COLORS[2], s=120, depthshade=False)
         else:
@@ -55,13 +68,13 @@ def pulse(shown: Sequence[Any], fields: Sequence[NDArray[np.float64]], options: 
         values = [each[q] for each in fields]
         name = f"field {q}" if qubits > 1 else "field"
         below.stairs(values, times[: len(values) + 1], color=COLORS[q], lw=1.4, label=name)
-    below.plot(times[: len(shown)], [f for _, f in shown], ".-", color=COLORS[2], lw=1, label="fidelity")
+    below.plot(times[: len(fidelity)], fidelity, ".-", color=COLORS[2], lw=1, label="fidelity")
     below.set(xlim=(0, times[-1]), ylim=(-0.05, 1.05))
     below.set_xlabel("time, hbar / h", fontsize=8)
     below.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=3)
     _plain(below)
-    below.set_title(f"F = {shown[-1][1]:.3f}", fontsize=9, color=INK, loc="right")
-    return pixels(drawn)
+    below.set_title(f"F = {fidelity[-1]:.3f}", fontsize=9, color=INK, loc="right")
+    return drawn
 
 
 def _sphere(axes: Any) -> None:
@@ -110,7 +123,7 @@ def circuit(axes: Axes, gates: Sequence[tuple[str, tuple[int, ...]]], qubits: in
 
 def clifford(
     gates: Sequence[tuple[str, tuple[int, ...]]], left: NDArray[np.int64], qubits: int, steps: int
-) -> NDArray[np.uint8]:
+) -> Figure:
     """Draw a circuit, and the matrix that remains beside it; the identity is what it should be."""
     drawn = figure(2.2 + 0.3 * steps, 0.9 + 0.45 * qubits)
     wide, narrow = drawn.subplots(1, 2, width_ratios=(0.3 * steps, 1.8))
@@ -126,7 +139,7 @@ def clifford(
     narrow.tick_params(length=0)
     done = (left == np.eye(len(left))).all()
     narrow.set_title("done" if done else "remains", fontsize=9, color=INK)
-    return pixels(drawn)
+    return drawn
 
 
 def vqe(
@@ -136,7 +149,7 @@ def vqe(
     options: Any,
     title: str,
     gap: float,
-) -> NDArray[np.uint8]:
+) -> Figure:
     """Draw a circuit with its angles, and below it the energy above the ground state's after each gate."""
     drawn = figure(1.6 + 0.62 * options.steps, 2.6 + 0.5 * options.qubits)
     top, below = drawn.subplots(2, 1, height_ratios=(0.5 * options.qubits, 1.8))
@@ -156,7 +169,7 @@ def vqe(
     below.set_ylabel(f"energy error, {unit}", fontsize=8)
     below.set_xlabel("gates", fontsize=8)
     _plain(below)
-    return pixels(drawn)
+    return drawn
 
 
 def channel(
@@ -166,7 +179,7 @@ def channel(
     channels: Sequence[str],
     kind: int,
     named: int,
-) -> NDArray[np.uint8]:
+) -> Figure:
     """Draw how often +1 and -1 were measured, and how probable each channel is; the true one is bold."""
     drawn = figure(7.2, 3.0)
     left, right = drawn.subplots(1, 2, width_ratios=(3, 4))
@@ -189,4 +202,4 @@ def channel(
     _plain(right)
     said = f"named: {channels[named]}" if named >= 0 else "probability"
     right.set_title(said, fontsize=9, color=INK, loc="left")
-    return pixels(drawn)
+    return drawn

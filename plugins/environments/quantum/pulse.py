@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -25,6 +25,9 @@ from qrlsuite.plugins.environments.quantum.lanes import (
     pauli,
     words,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ID = "qrlsuite/Pulse-v1"
 EXHAUSTED = 4096
@@ -182,16 +185,27 @@ class Pulse(Drawn):
             PulseLanes(option_words.build(PulseOptions, values, "environment 'pulse'"), 1), render_mode
         )
 
-    def moment(self) -> tuple[FloatArray, float]:
-        """Return the qubits' Bloch vectors (qubits, 3), and the fidelity."""
-        values = self.lanes.expectations()[0]
-        alone = [[values[self.lanes.words.index(word)] for word in one] for one in self.lanes.alone]
-        return np.array(alone), float(self.lanes.fidelity()[0])
+    def moment(self) -> ComplexArray:
+        """Return the density matrix (d, d)."""
+        rho: ComplexArray = self.lanes.rho[0].copy()
+        return rho
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return the paths of the Bloch vectors, the fields and the fidelity, (height, width, 3) uint8."""
-        fields = [self.lanes.fields(np.asarray(action)[None])[0] for action in self.done]
-        return pictures.pulse(self.shown, fields, self.lanes.options)
+    def figure(self) -> Figure:
+        """Return the paths of the Bloch vectors, the fields and the fidelity."""
+        lanes, shown = self.lanes, np.stack(self.shown)
+        fields = [lanes.fields(np.asarray(action)[None])[0] for action in self.done]
+        between = [shown[:1]]
+        for rho, after, field in zip(shown, shown[1:], fields):
+            parts = np.linspace(0.1, 0.9, 9)
+            turned = lanes.rotations(np.tile(field, (9, 1)), lanes.error.repeat(9), parts)
+            between += [turned @ rho @ turned.conj().swapaxes(1, 2), after[None]]
+        return pictures.pulse(
+            lanes.bloch(shown),
+            lanes.bloch(np.concatenate(between)),
+            lanes.fidelity(shown),
+            fields,
+            lanes.options,
+        )
 
 
 class PulseLanes(QuantumLanes):
@@ -214,7 +228,6 @@ class PulseLanes(QuantumLanes):
         super().__init__(options, num_envs, Box(-1.0, 1.0, (4**n,), np.float32), action)
         self.drift, self.controls, self.target, self.kept = physics(options)
         self.words = words(n)
-        self.alone = [["I" * q + letter + "I" * (n - 1 - q) for letter in "XYZ"] for q in range(n)]
         self.levels = np.array(list(product([0.0, 1.0], repeat=n)))
         """(2^qubits, qubits): what the fields are at each discrete action."""
         self._transposed = np.stack([pauli(word).T for word in self.words])
@@ -236,13 +249,22 @@ class PulseLanes(QuantumLanes):
         result: FloatArray = (1.0 + actions.astype(np.float64)) / 2.0
         return result
 
-    def rotations(self, fields: FloatArray, error: FloatArray) -> ComplexArray:
-        """Return the unitary matrices (L, d, d) of a step with fields u (L, qubits) and the relative errors (L,)."""
+    def rotations(
+        self, fields: FloatArray, error: FloatArray, part: float | FloatArray = 1.0
+    ) -> ComplexArray:
+        """Return the unitary matrices (L, d, d) of a step, or of a part of it (L,).
+
+        Parameters
+        ----------
+        fields, error:
+            Fields u (L, qubits) and their relative errors (L,).
+        """
         total = np.broadcast_to(self.drift, (len(fields), *self.drift.shape)).copy()
         for q, control in enumerate(self.controls):
             total += (fields[:, q] * (1.0 + error))[:, None, None] * control
         energies, vectors = np.linalg.eigh(total)
-        phases = np.exp(-1j * energies * (self.options.duration / self.options.steps))
+        times = part * np.full(len(fields), self.options.duration / self.options.steps)
+        phases = np.exp(-1j * energies * times[:, None])
         result: ComplexArray = (vectors * phases[:, None, :]) @ vectors.conj().swapaxes(1, 2)
         return result
 
@@ -258,13 +280,21 @@ class PulseLanes(QuantumLanes):
         result: FloatArray = np.clip(values.reshape(len(values), -1).sum(1), 0.0, 1.0)
         return result
 
-    def expectations(self) -> FloatArray:
-        """Return the expectation values of the Pauli words, (L, 4^qubits - 1)."""
+    def expectations(self, rho: ComplexArray | None = None) -> FloatArray:
+        """Return the expectation values (L, 4^qubits - 1) of the Pauli words, by default of the lanes' own."""
+        rho = self.rho if rho is None else rho
         shown = np.stack(
-            [(self.rho * word).real.reshape(self.num_envs, -1).sum(1) for word in self._transposed], axis=1
+            [(rho * word).real.reshape(len(rho), -1).sum(1) for word in self._transposed], axis=1
         )
         result: FloatArray = np.clip(shown, -1.0, 1.0)
         return result
+
+    def bloch(self, rho: ComplexArray) -> FloatArray:
+        """Return the qubits' Bloch vectors (L, qubits, 3) of density matrices (L, d, d)."""
+        n = self.options.qubits
+        alone = ["I" * q + letter + "I" * (n - 1 - q) for q in range(n) for letter in "XYZ"]
+        places = [self.words.index(word) for word in alone]
+        return self.expectations(rho)[:, places].reshape(-1, n, 3)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {"rho": self._rho, "error": self.error}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,9 @@ from qrlsuite.environment import LaneEnv
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.compiled import optimize
 from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes, pauli
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ID = "qrlsuite/VQE-v1"
 IntArray = NDArray[np.int64]
@@ -170,8 +173,8 @@ class VQE(Drawn):
         """Return the energy above that of the ground state."""
         return float(self.lanes.above()[0])
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return the circuit so far, and the energy after each gate, (height, width, 3) uint8."""
+    def figure(self) -> Figure:
+        """Return the circuit so far, and the energy after each gate."""
         lanes = self.lanes
         names = [lanes.word(int(gate)) for gate in self.done]
         angles = lanes.angles[0, : len(names)].tolist()
