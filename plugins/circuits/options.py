@@ -20,7 +20,8 @@ class PennyLaneOptions:
         str,
         Field(
             min_length=1,
-            description="PennyLane device: default.qubit, qrlsuite.native (fast), lightning.qubit, or a plugin's",
+            description="PennyLane device: default.qubit, qrlsuite.native (fast), lightning.qubit, a plugin's, or the "
+            "ARN of one of Amazon Braket's",
         ),
     ] = "default.qubit"
     diff_method: Annotated[
@@ -33,6 +34,11 @@ class PennyLaneOptions:
     shots: Annotated[
         int | None, Field(ge=1, description="repetitions per expectation value; absent: exact")
     ] = None
+    mitigation: Annotated[
+        Literal["none", "zero-noise"],
+        Field(description="zero-noise: every circuit with 1, 3 and 5 times the noise, extrapolated to none"),
+        Since("0.2.0"),
+    ] = "none"
 
 
 NOISE_RATE = "depolarizing probability of a two-qubit gate; a tenth of it of one-qubit gates"
@@ -104,3 +110,25 @@ class QiskitOptions:
     ] = None
     noise_rate: Annotated[float, Field(ge=0.0, le=1.0, description=NOISE_RATE)] = 0.01
     readout_error: Annotated[float, Field(ge=0.0, le=0.5, description=READOUT_ERROR), Since("0.2.0")] = 0.0
+    device: Annotated[
+        str | None,
+        Field(
+            min_length=1,
+            description="IBM device that Qiskit Runtime executes circuits on, such as ibm_fez; a fake one, such as "
+            "FakeManilaV2, is simulated. Absent: Aer",
+        ),
+        Since("0.2.0"),
+    ] = None
+    runtime: Annotated[
+        Literal["batch", "session", "job"],
+        Field(description="how jobs share the device: in a batch, in a session, or each for itself"),
+        Since("0.2.0"),
+    ] = "batch"
+    mitigation: Annotated[
+        Literal["none", "readout", "zero-noise"],
+        Field(
+            description="Runtime's error mitigation. readout: of wrongly read bits (TREX); zero-noise: of these, and "
+            "of gates, extrapolated from 1, 3 and 5 times the noise"
+        ),
+        Since("0.2.0"),
+    ] = "none"

@@ -13,6 +13,7 @@ broadcast axis here: one execution for the gradient of all angles of all samples
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -62,8 +63,11 @@ SIMULATORS = (
 )
 """Words in the names of devices that only simulate; any other device is taken for hardware."""
 
+NOISE_FACTORS = (1, 3, 5)
+"""How many times the noise is there where it is extrapolated to zero: the circuit is folded."""
+
 PACKAGES = {
-    "braket": "amazon-braket-pennylane-plugin",
+    "braket": "'qrlsuite[braket]'",
     "cirq": "pennylane-cirq",
     "ionq": "pennylane-ionq",
     "lightning.gpu": "pennylane-lightning-gpu",
@@ -99,11 +103,15 @@ class PennyLaneBackend:
         self.circuit = circuit
         self.options = options
         self.shots: int | None = options.shots
-        self.simulator = any(word in options.device for word in SIMULATORS)
+        self.simulator = not _on_braket(options) and any(word in options.device for word in SIMULATORS)
         self.table = AngleTable(circuit)
         self.diff_method = _diff_method(options)
         self._device = _device(options, circuit.qubits, None)
         self._qnode = self._compile()
+        if _on_braket(options):
+            self.terms = functools.partial(braket_terms, self._device.target_device._device, self.shots)
+        if options.mitigation == "zero-noise":
+            self.repeats = len(NOISE_FACTORS)
 
     def __call__(
         self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None = None
@@ -209,7 +217,13 @@ class PennyLaneBackend:
         # The shift rule is applied outside, so that the QNode need not be differentiable.
         method = None if self.diff_method == "parameter-shift" else self.diff_method
         qnode = qml.QNode(measure, device, interface="torch", diff_method=method, shots=self.shots)
-        return qnode if self.options.device in BROADCASTING else qml.transforms.broadcast_expand(qnode)
+        if self.options.device in BROADCASTING:
+            return qnode
+        alone = qml.transforms.broadcast_expand(qnode)
+        if self.options.mitigation == "none":
+            return alone
+        noise = qml.noise
+        return noise.mitigate_with_zne(alone, NOISE_FACTORS, noise.fold_global, noise.richardson_extrapolate)
 
     def _device_arguments(self) -> set[str]:
         return set(inspect.signature(type(self._device)).parameters)
@@ -283,6 +297,8 @@ def _apply(operation: Operation, angles: list[Any]) -> None:
 def _diff_method(options: PennyLaneOptions) -> str:
     """Choose how to differentiate, or say why it cannot be done."""
     backprop = options.device == BACKPROP
+    if options.mitigation != "none" and (backprop or options.device.startswith(ADJOINT)):
+        raise OptionError(f"mitigation = '{options.mitigation}': device '{options.device}' has no noise")
     if options.diff_method == "auto":
         if options.shots is not None:
             return "parameter-shift"
@@ -304,23 +320,44 @@ def _diff_method(options: PennyLaneOptions) -> str:
 
 def _device(options: PennyLaneOptions, qubits: int, seed: int | None) -> Any:
     """Open a device by name."""
-    seeded = {} if seed is None else {"seed": seed}
+    seeded: dict[str, Any] = {} if seed is None else {"seed": seed}
+    name = options.device
+    if _on_braket(options):
+        name, seeded = "braket.aws.qubit", {**seeded, "device_arn": options.device}
     state = np.random.get_state()  # noqa: NPY002 - without a seed, a device draws one from this generator
     try:
-        return qml.device(options.device, wires=qubits, **seeded)
+        return qml.device(name, wires=qubits, **seeded)
     except Exception as error:
         known = sorted(qml.plugin_devices)
         message = f"device = {options.device!r} cannot be opened"
-        if options.device in known:
-            raise OptionError(f"{message} with {qubits} qubits: {_one_line(error)}") from error
+        if name in known:
+            reason = _one_line(error)
+            if _on_braket(options):
+                reason += " (`aws configure` sets region and account)"
+            raise OptionError(f"{message} with {qubits} qubits: {reason}") from error
         for prefix, package in PACKAGES.items():
-            if options.device == prefix or options.device.startswith(f"{prefix}."):
+            if name == prefix or name.startswith(f"{prefix}."):
                 raise OptionError(f"{message}: its package is missing; pip install {package}") from error
         raise OptionError(
             f"{message}: PennyLane knows no such device{nearest(options.device, known)}"
         ) from error
     finally:
         np.random.set_state(state)  # noqa: NPY002
+
+
+def _on_braket(options: PennyLaneOptions) -> bool:
+    """Return whether the device is one of Amazon's, of which simulators cost money, too."""
+    return options.device.startswith("arn:")
+
+
+def braket_terms(device: Any, shots: int | None, circuits: int) -> str:
+    """Say how many tasks wait at an `AwsDevice`, and what a number of circuits costs there."""
+    cost = device.properties.service.deviceCost
+    waiting = ", ".join(
+        f"{kind.value}: {count}" for kind, count in device.queue_depth().quantum_tasks.items()
+    )
+    whole = f", ${cost.price * circuits * (shots or 0):,.2f} in all" if cost.unit == "shot" else ""
+    return f"tasks that wait: {waiting}; ${cost.price:g} a {cost.unit}{whole}, and Amazon's price of {circuits:,} tasks"
 
 
 def _one_line(error: Exception) -> str:

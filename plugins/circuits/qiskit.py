@@ -35,6 +35,7 @@ from qrlsuite.circuit.shifts import measured, random_signs, shift_rule, spsa_rul
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.plugins.circuits.native import NativeBackend
 from qrlsuite.plugins.circuits.options import QiskitOptions
+from qrlsuite.plugins.circuits.runtime import NOISE_FACTORS, Runtime, fake_device, open_device
 
 DENSITY_QUBITS = 12
 """Qubits up to which noise is simulated exactly, as a density matrix; beyond, shots are needed."""
@@ -81,7 +82,7 @@ class QiskitBackend:
         self._circuit = quantum_circuit(self.elementary, circuit.qubits)
         self._products = circuit.measured
         self._measured = sorted({q for qubits in self._products for q in qubits})
-        self._simulator = _simulator(options, circuit.qubits)
+        self._simulator: Any = None if options.device else _simulator(options, circuit.qubits)
         self._samples = self.shots is not None and options.estimator == "aer"
         self.observables = [
             SparsePauliOp.from_sparse_list([("Z" * len(qubits), qubits, 1.0)], circuit.qubits)
@@ -97,6 +98,13 @@ class QiskitBackend:
                 self._executed, self._simulator, seed_transpiler=0, optimization_level=1
             )
             self.observables = [o.apply_layout(self._executed.layout) for o in self.observables]
+        self._runtime: Runtime | None = None
+        if options.device:
+            device = _device(options.device, circuit.qubits)
+            self._runtime = Runtime(options, device, self._circuit, self.observables)
+            self.simulator = fake_device(options.device)
+            self.terms = self._runtime.terms
+            self.repeats = len(NOISE_FACTORS) if options.mitigation == "zero-noise" else 1
 
     def __call__(
         self, inputs: Tensor, parameters: Mapping[str, Tensor], seeds: Sequence[int] | None = None
@@ -112,7 +120,7 @@ class QiskitBackend:
         if self.gradient in ("reverse", "lin-comb"):
             values = _Network.apply(rotations.reshape(-1, S * B), self.network())  # type: ignore[no-untyped-call]
             values = values.reshape(S, B, -1)
-        elif self.draws:
+        elif self.draws and (self._runtime is None or rotations.requires_grad):
             entropy: Sequence[int | None] = [None] * S if seeds is None else seeds
             values = torch.stack([self._sampled(rotations[:, s], seed) for s, seed in enumerate(entropy)])
         else:
@@ -176,6 +184,8 @@ class QiskitBackend:
         from qiskit_aer.primitives import EstimatorV2
 
         number = int(stream.generate_state(1)[0] >> 1)
+        if self._runtime is not None:
+            return self._runtime(rotations, number)
         if self._samples:
             return self._count(rotations, number)
         precision = 0.0 if self.shots is None else 1.0 / math.sqrt(self.shots)
@@ -250,6 +260,7 @@ class _Network(torch.autograd.Function):
 
 def _gradient(options: QiskitOptions) -> str:
     """Choose the fastest way to differentiate, or say why the one asked for cannot be done."""
+    _check_device(options)
     if options.noise_model is not None and options.estimator != "aer":
         raise OptionError(f"noise_model = '{options.noise_model}' needs estimator = 'aer'")
     if options.readout_error > 0 and options.noise_model != "depolarizing":
@@ -265,6 +276,30 @@ def _gradient(options: QiskitOptions) -> str:
     if options.gradient == "reverse":
         _package("qiskit_algorithms", "gradient = 'reverse'", "qiskit-algorithms")
     return options.gradient
+
+
+def _check_device(options: QiskitOptions) -> None:
+    """Refuse what a device does not do, or only a device does."""
+    if options.device is None:
+        if options.mitigation != "none":
+            raise OptionError(
+                f"mitigation = '{options.mitigation}' needs a device, such as device=FakeManilaV2"
+            )
+        return
+    if options.shots is None:
+        raise OptionError(f"device = '{options.device}' measures: say how often, such as shots=1000")
+    if options.noise_model is not None or options.estimator != "statevector":
+        raise OptionError(
+            f"device = '{options.device}' has its own noise: leave out noise_model and estimator, which are Aer's"
+        )
+
+
+def _device(name: str, qubits: int) -> Any:
+    """Return an IBM device, or a fake one, by its name."""
+    _package("qiskit_ibm_runtime.executor_estimator", f"device = '{name}'", "'qrlsuite[ibm]'")
+    if fake_device(name):
+        return _fake_backend(name, qubits, "device")
+    return open_device(name)
 
 
 def _is_fake(options: QiskitOptions) -> bool:
@@ -305,7 +340,7 @@ def _needs_shots(options: QiskitOptions, qubits: int, setting: str) -> None:
         )
 
 
-def _fake_backend(name: str, qubits: int) -> Any:
+def _fake_backend(name: str, qubits: int, option: str = "noise_model") -> Any:
     """Return a snapshot of a device by the name of its class."""
     if name == "GenericBackendV2":
         from qiskit.providers.fake_provider import GenericBackendV2
@@ -313,12 +348,12 @@ def _fake_backend(name: str, qubits: int) -> Any:
         size = max(2, qubits)
         line = [[q + up, q + 1 - up] for q in range(size - 1) for up in (0, 1)]
         return GenericBackendV2(size, coupling_map=line, seed=0)
-    setting = f"noise_model = '{name}' (not 'depolarizing' or 'GenericBackendV2', hence a fake backend)"
+    setting = f"{option} = '{name}' (not 'depolarizing' or 'GenericBackendV2', hence a fake backend)"
     fake_provider = _package("qiskit_ibm_runtime.fake_provider", setting, "qiskit-ibm-runtime")
     known = [n for n in dir(fake_provider) if n.startswith("Fake") and n != "FakeProviderForBackendV2"]
     if name not in known:
-        choices = ["depolarizing", "GenericBackendV2", *known]
-        raise OptionError(f"noise_model = '{name}' is unknown{nearest(name, choices)}")
+        choices = [*(["depolarizing"] if option == "noise_model" else []), "GenericBackendV2", *known]
+        raise OptionError(f"{option} = '{name}' is unknown{nearest(name, choices)}")
     return getattr(fake_provider, name)()
 
 

@@ -211,8 +211,10 @@ class _Runner:
             self._backend = create_backend(
                 self.options.backend, self.circuit, **_backend_options(self.options)
             )
+            repeats = getattr(self._backend, "repeats", 1)
+            self.executions.bases *= repeats
             if self.draws:
-                self.executions.per_gradient = getattr(
+                self.executions.per_gradient = repeats * getattr(
                     self._backend, "gradient_circuits", self.executions.per_gradient
                 )
         return self._backend
@@ -287,6 +289,11 @@ class _Hybrid(nn.Module):
     def simulator(self) -> bool:
         """Whether the circuits are only simulated; else executions may cost money."""
         return bool(getattr(self._runner.backend, "simulator", True))
+
+    def terms(self, circuits: int) -> str:
+        """Say what waits at the circuit's device, and what a number of circuits costs; nothing for a simulator."""
+        said = getattr(self._runner.backend, "terms", None)
+        return "" if said is None else said(circuits)
 
     def compile_circuits(self) -> None:
         """Let the circuit's backend compile what the first pass would, if it has a way to."""

@@ -60,6 +60,11 @@ class CircuitBackend(Protocol):
         counted where `draws` is true; of an exact simulator the rule's are, so that entries can be compared.
     simulator (bool):
         False where circuits run on a device, whose executions may cost money; by default true.
+    terms (callable):
+        Of a device: `terms(circuits)` says in words what waits there, and what a number of circuits costs. It
+        executes nothing.
+    repeats (int):
+        Circuits that are executed in place of each, to mitigate errors; by default 1.
     states (callable):
         Of a simulator: `states(inputs, parameters)` returns the final states (S, B, 2^n), up to a global phase, without
         shots and noise; qubit 0 is the highest bit of a basis state's index.
@@ -224,7 +229,7 @@ class _Whole:
         self.products = products
         first = parts[0]
         self.shots = first.shots
-        for name in ("draws", "simulator"):
+        for name in ("draws", "simulator", "repeats", "terms"):
             if hasattr(first, name):
                 setattr(self, name, getattr(first, name))
         if hasattr(first, "gradient_circuits"):

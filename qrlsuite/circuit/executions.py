@@ -24,7 +24,7 @@ class ExecutionCounter:
     mean_field:
         Whether the model is a mean-field approximation, which is no circuit and executes none.
     bases:
-        Measurement bases of the circuit.
+        Circuits per input: measurement bases, each as often as it is repeated to mitigate errors.
     """
 
     def __init__(

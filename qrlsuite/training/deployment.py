@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -100,6 +100,8 @@ class Cost:
         Circuits to execute, about: one per step, agent and episode that is not kept from before.
     shots:
         Repetitions of each; None where the backend computes expectation values exactly.
+    terms:
+        What the device says of that many.
     kept:
         Episodes of each agent that were played before.
     """
@@ -109,6 +111,7 @@ class Cost:
     kept: int
     circuits: int
     shots: int | None
+    terms: str = ""
 
     def __str__(self) -> str:
         """Say it in a line."""
@@ -116,7 +119,9 @@ class Cost:
             "" if self.shots is None else f", {self.shots} shots each: {self.shots * self.circuits:,} shots"
         )
         kept = f" ({self.kept} of them are kept from before)" if self.kept else ""
-        return f"{self.agents} agents, {self.episodes} episodes each{kept}: about {self.circuits:,} circuits{shots}"
+        terms = f"; {self.terms}" if self.terms else ""
+        played = f"{self.agents} agents, {self.episodes} episodes each{kept}"
+        return f"{played}: about {self.circuits:,} circuits{shots}{terms}"
 
 
 class Deployment:
@@ -148,6 +153,8 @@ class Deployment:
         # Not the agents yet: what builds a population tries it out, which on a device executes circuits.
         network = cast(CircuitModel, first_network(self.entry))
         self.simulator, self.shots = network.simulator, network.executions.shots
+        self._circuits = network.executions.bases
+        self._terms: Callable[[int], str] = getattr(network, "terms", lambda circuits: "")
         self._store, self._device = store, device
         chosen = " ".join(f"{name}={value}" for name, value in values.items())
         self.name = f"{policy_name(store, on)} on {backend}{' ' if chosen else ''}{chosen}"
@@ -176,8 +183,9 @@ class Deployment:
         lanes = min(LANES, episodes)
         rounds = -(-episodes // lanes)
         done = sum(1 for block in range(rounds) if self.kept(seed).get(block, lanes) is not None)
-        circuits = round(len(self.seeds) * (rounds - done) * lanes * steps)
-        return Cost(len(self.seeds), episodes, min(done * lanes, episodes), circuits, self.shots)
+        circuits = round(len(self.seeds) * (rounds - done) * lanes * steps * self._circuits)
+        kept = min(done * lanes, episodes)
+        return Cost(len(self.seeds), episodes, kept, circuits, self.shots, self._terms(circuits))
 
     def play(self, episodes: int, seed: int, report: Report = lambda name, done, total: None) -> Played:
         """Play episodes, those of `qrlsuite.training.evaluation.trained`; finished rounds are kept.
