@@ -125,6 +125,14 @@ class VQCOptions:
         ),
         Since("0.2.0"),
     ] = "ansatz"
+    input_reuse: Annotated[
+        bool,
+        Field(
+            description="without linear layers, where the circuit has more inputs than there are observations: it is "
+            "given these again, in their order"
+        ),
+        Since("0.2.0"),
+    ] = False
     output_reuse: Annotated[
         int,
         Field(ge=1, le=64, description="how many times the expectation values are given to what is behind"),
@@ -188,6 +196,10 @@ class VQCOptions:
             raise OptionError(
                 f"init_scale = {self.init_scale:g}: the circuit of ansatz '{self.ansatz}' multiplies no input by a "
                 "parameter"
+            )
+        if self.input_reuse and self.linear:
+            raise OptionError(
+                "input_reuse = true needs linear = false: a linear layer gives the circuit all its inputs"
             )
         require_computable(circuit, self.backend)
 
@@ -315,6 +327,8 @@ class _Hybrid(nn.Module):
         inner = x.to(state["output.weight"].dtype)
         if self._runner.options.linear:
             inner = linear(inner, state["input.weight"], state["input.bias"])
+        elif self._runner.options.input_reuse:
+            inner = inner[..., torch.arange(self._runner.circuit.inputs) % inner.shape[-1]]
         return ACTIVATIONS[self._runner.options.activation_in](inner)
 
     def quantum_parameters(self) -> set[str]:
@@ -511,11 +525,14 @@ def _require_fit(runner: _Runner, inputs: int, outputs: int, role: str) -> None:
     """Refuse a circuit that cannot stand without linear layers."""
     circuit = runner.circuit
     values = len(circuit.observables) * runner.options.output_reuse
-    if circuit.inputs == inputs and values >= outputs:
+    enough = circuit.inputs >= inputs if runner.options.input_reuse else circuit.inputs == inputs
+    if enough and values >= outputs:
         return
     advice = (
         "choose qubits, or options of the ansatz, so that inputs are as many, and expectation values no fewer"
     )
+    if circuit.inputs > inputs and values >= outputs:
+        advice = "choose fewer qubits, or set input_reuse=true, and observations are given several times"
     if role == "critic":
         advice = "set critic=mlp, which takes a perceptron for it, or linear=true"
     raise OptionError(

@@ -235,7 +235,7 @@ def test_options_of_a_model_are_those_of_its_backend_and_the_circuit():
     own = set(options.field_names(VQCOptions))
     assert own == {
         "qubits", "layers", "ansatz", "gate", "ansatz_options", "activation_in", "activation_out", "dtype", "train",
-        "init_scale", "linear", "output_rate", "critic", "readout", "output_reuse", "output_scale",
+        "init_scale", "linear", "output_rate", "critic", "readout", "input_reuse", "output_reuse", "output_scale",
     }  # fmt: skip
     for name in BACKENDS:
         theirs = specs.resolve(registry.get(specs.CircuitBackendSpec, name).options)
@@ -316,10 +316,30 @@ def test_without_linear_layers_the_circuit_stands_alone(backend):
     assert all(bool((parameter.grad != 0).any()) for parameter in together.parameters())
 
 
-@pytest.mark.parametrize(("obs", "out"), [(4, 2), (3, 4)])
-def test_without_linear_layers_sizes_must_fit(obs, out):
-    with pytest.raises(OptionError, match=f"3 expectation values, the network {obs} inputs and {out} out"):
+@pytest.mark.parametrize("structure", sorted(registry.load().of(specs.AnsatzSpec)))
+def test_an_ansatz_may_have_more_qubits_than_inputs_and_outputs(structure):
+    """Without linear layers the circuit is given the observations again, and the first values are the outputs."""
+    given = {"qubits": 4, "layers": 2, "ansatz": structure, "linear": False, "readout": "single"}
+    options = small("native", **given, dtype="float64", input_reuse=True)
+    made = vqc.population(agents(2, options, obs=3, out=2), options)
+    x = observations(2, 5, 3, dtype=torch.float64)
+    circuit = made.description
+    quantum = {name: made.circuit[name] for name in circuit.parameters}
+    several = torch.cat([x, x], dim=-1)[..., : circuit.inputs]
+    expected = create_backend("native", circuit)(several, quantum)[..., :2]
+    torch.testing.assert_close(made(x), expected, atol=1e-12, rtol=0)
+    assert (circuit.qubits, len(circuit.observables)) == (4, 4)
+
+
+@pytest.mark.parametrize(
+    ("obs", "out", "advice"), [(4, 2, "choose"), (3, 4, "choose"), (2, 2, "input_reuse=true")]
+)
+def test_without_linear_layers_sizes_must_fit(obs, out, advice):
+    message = f"3 expectation values, the network {obs} inputs and {out} out.*{advice}"
+    with pytest.raises(OptionError, match=message):
         agents(1, small(qubits=3, linear=False), obs=obs, out=out)
+    with pytest.raises(OptionError, match="input_reuse = true needs linear = false"):
+        small(input_reuse=True).check()
 
 
 @pytest.mark.parametrize(
