@@ -45,8 +45,9 @@ class ChannelOptions:
 def probabilities(strength: float) -> FloatArray:
     """Return the probability of the outcome +1 for each channel and experiment, (5, 12).
 
-    A channel maps a Bloch vector r to T r + t; names and formulas are those of Nielsen and Chuang, "Quantum Computation
-    and Quantum Information", section 8.3, with p as the probability that the error happens.
+    A channel maps a Bloch vector r to T r + t. Flips by X, Y or Z happen with probability p and shrink the two other
+    components by 1 - 2p. Depolarizing replaces the state by the mixed one with probability p, and shrinks all by 1 - p.
+    Amplitude damping has the Kraus operators diag(1, sqrt(1 - p)) and sqrt(p) |0><1|.
     """
     p = strength
     flips = [np.full(3, 1 - 2 * p) for _ in range(3)]

@@ -102,9 +102,9 @@ class Pulse(Drawn):
         H(u)      = (J u Z + X) / 2                                     (one qubit)
         H(u1, u2) = (J u1 Z1 + J u2 Z2 + X1 + X2 + c Z1 Z2) / 2         (two qubits)
 
-    The first, J = 4, T = 2 pi, 20 steps and the target |1> are those of the published code of Zhang et al., "When does
-    reinforcement learning stand out in quantum control?" (arXiv 1902.02157). Two qubits, their target (|00> + |11>) /
-    sqrt(2) and random starts are ours.
+    The first, J = 4, T = 2 pi, 20 steps and the target |1> are those of Zhang et al., "When does reinforcement learning
+    stand out in quantum control?" (arXiv 1902.02157), in the code at github.com/93xiaoming/RL_state_preparation. Two
+    qubits, their target (|00> + |11>) / sqrt(2) and random starts are ours.
 
     With `dephasing` g, the coherence of each qubit decays by exp(-g t): half of a step's decay comes before its
     rotation, half after (the symmetric splitting of the Lindblad equation). With `miscalibration`, J is J (1 + e)
@@ -413,8 +413,7 @@ class BestPulse:
 def grape(envs: PulseLanes, lane: int, starts: int = STARTS) -> FloatArray:
     """Return the best fields (steps, qubits) that gradient ascent finds for a lane, from where it is.
 
-    Khaneja et al., "Optimal control of coupled spin dynamics: design of NMR pulse sequences by gradient ascent
-    algorithms" (2005), are the source of name and idea. Here gradients are exact, and L-BFGS-B makes the steps.
+    Gradients are exact, and L-BFGS-B of scipy makes the steps.
 
     Parameters
     ----------
