@@ -523,6 +523,7 @@ class Adam:
         for name, factor in factors.items():
             if name in self._lr:
                 self._lr[name] = self._lr[name] * factor
+        self._quantum = quantum
         self.betas = betas
         self.eps = eps
         self._population = population
@@ -615,6 +616,31 @@ class Adam:
         beta1, beta2 = self.betas
         constants = [np.float32(each) for each in (1.0 - beta1, beta2, 1.0 - beta2, self.eps)]
         return [p.data_ptr() for p in parameters], *blocks, sizes, rates, constants
+
+    def gradient_norms(self) -> dict[str, NDArray[np.float64]]:
+        """Return the norms of each agent's gradients, for the metrics of an epoch.
+
+        A norm is the root of the mean square over the last steps, about a thousand, by the second moments: it takes no
+        part in training.
+
+        Returns
+        -------
+        dict
+            `gradient_norm_classical` and `gradient_norm_quantum` (S,), as far as there are such parameters; NaN before
+            the first step.
+        """
+        squares: dict[str, NDArray[np.float64]] = {}
+        for name, square in self.square.items():
+            rows = square.detach().cpu().double().reshape(len(self.steps), -1).numpy()
+            own = np.array(
+                [row.sum() for row in rows]
+            )  # each alone: the bits of an agent do not depend on others
+            part = "gradient_norm_quantum" if name in self._quantum else "gradient_norm_classical"
+            squares[part] = squares.get(part, 0.0) + own
+        weight = 1.0 - self.betas[1] ** self.steps.double().numpy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            norms = {part: np.sqrt(total / weight) for part, total in squares.items()}
+        return {part: np.where(np.isfinite(norm), norm, np.nan) for part, norm in norms.items()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return step counts (S,) and both moments of every parameter (S, ...)."""

@@ -108,7 +108,7 @@ class DDQN:
             self._interact(torch.where(explore, uniform, greedy))  # (S, E)
             losses += self._learn(draws)
         self.epoch += 1
-        return {"loss": (losses / rounds).cpu().numpy()}
+        return {"loss": (losses / rounds).cpu().numpy(), **self.adam.gradient_norms()}
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
         """Draw an epoch's exploration (rounds, S, E), twice, and replay positions (rounds, S, batch) in [0, 1)."""

@@ -144,7 +144,8 @@ class DRQN:
                 losses += self._learn(self._sequences(draws[:, u]))
                 steps += 1
         self.epoch += 1
-        return {"loss": losses.cpu().numpy() / steps if steps else np.full(self.S, np.nan)}
+        loss = losses.cpu().numpy() / steps if steps else np.full(self.S, np.nan)
+        return {"loss": loss, **self.adam.gradient_norms()}
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
         """Draw an epoch's exploration (S, rounds, E), twice, and sequences (S, steps, 2, batch) in [0, 1)."""

@@ -364,7 +364,8 @@ class PPO:
         self.epoch += 1
         self._validation = []
         means = (total.to(torch.float64) / steps).cpu().numpy()
-        return dict(zip(("policy_loss", "value_loss", "entropy", "kl"), means))
+        metrics = dict(zip(("policy_loss", "value_loss", "entropy", "kl"), means))
+        return metrics | self.actor_adam.gradient_norms()
 
     def _sequences(self, rounds: int) -> Tensor:
         """Return the samples of all sequences (S x n, length), numbered through the flattened S x N samples."""

@@ -179,7 +179,8 @@ class Reinforce:
             self.lengths += rounds
             self.epoch += 1
             names = ("loss",) if self.value is None else ("loss", "value_loss")
-            return {"learned_steps": np.zeros(self.S), **{name: np.full(self.S, np.nan) for name in names}}
+            nothing = {name: np.full(self.S, np.nan) for name in names}
+            return {"learned_steps": np.zeros(self.S), **nothing, **self.adam.gradient_norms()}
         filled = np.arange(memory + rounds) >= memory - lengths[..., None]
         metrics = self._learn(rows[..., :-1], returns, known & filled)
         if each == 1:
@@ -284,7 +285,7 @@ class Reinforce:
             names.append("value_loss")
         for name, loss in zip(names, total.cpu().numpy()):
             metrics[name] = np.where(count > 0, loss, np.nan)
-        return metrics
+        return metrics | self.adam.gradient_norms()
 
     def _accumulate(self, states: Tensor, actions: Tensor, weights: Tensor, advantages: Tensor) -> Tensor:
         """Add a block's part of both losses to the gradients; returns the parts (2, S).

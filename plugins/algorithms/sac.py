@@ -194,7 +194,8 @@ class SAC:
                 steps += 1
         self.epoch += 1
         means = total.cpu().numpy() / steps if steps else np.full((4, self.S), np.nan)
-        return dict(zip(("value_loss", "value", "entropy", "temperature"), means))
+        metrics = dict(zip(("value_loss", "value", "entropy", "temperature"), means))
+        return metrics | self.adams["actor_adam"].gradient_norms()
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Draw an epoch's random numbers.

@@ -143,7 +143,7 @@ class TD3:
         self.epoch += 1
         means = [total.cpu().numpy() / count if count else np.full(self.S, np.nan)
                  for total, count in zip(totals, counts)]  # fmt: skip
-        return dict(zip(("value_loss", "value"), means))
+        return dict(zip(("value_loss", "value"), means)) | self.actor_adam.gradient_norms()
 
     def _epoch_numbers(self, rounds: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Draw an epoch's random numbers.

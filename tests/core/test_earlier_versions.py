@@ -84,7 +84,8 @@ def test_runs_end_as_they_did(run: Path, begun: bool, tmp_path: Path) -> None:
     for seed in SEEDS:
         ended = EntryStore(folder).seed(seed)
         expected = version / "finished" / run.parent.name / run.name / ended.path.name
-        lines = b"".join(map(json_line, ended.epochs()))
+        stated = json.loads((expected / "epochs.jsonl").read_bytes().splitlines()[0])
+        lines = b"".join(json_line(_without_later(row, stated)) for row in ended.epochs())
         if same_bits:
             assert lines == (expected / "epochs.jsonl").read_bytes()
             trained = (ended.path / "final.safetensors").read_bytes()
@@ -94,6 +95,11 @@ def test_runs_end_as_they_did(run: Path, begun: bool, tmp_path: Path) -> None:
         assert {name: array.shape for name, array in agent.items()} == {
             name: array.shape for name, array in stated.items()
         }
+
+
+def _without_later(row: dict[str, Any], stated: dict[str, Any]) -> dict[str, Any]:
+    """Return what is recorded of an epoch without gradient norms, where they were not."""
+    return {name: value for name, value in row.items() if name in stated or "gradient_norm" not in name}
 
 
 def require_alike(lines: bytes, expected: Path) -> None:

@@ -116,6 +116,26 @@ def test_adam_is_torchs_and_leaves_agents_that_rest_alone() -> None:
     assert all((before[name][[0, 2]] != after[name][[0, 2]]).any() for name in before)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_gradient_norms_are_the_mean_over_steps_of_each_kind_of_parameter(compiled: bool) -> None:
+    population = torch.nn.Module()
+    population.compiled = compiled
+    population.quantum_parameters = lambda: {"angles"}
+    population.w, population.angles = (torch.nn.Parameter(torch.zeros(2, *shape)) for shape in ((3, 4), (5,)))
+    adam = Adam(population, 0.01, 0.01)
+    assert all(np.isnan(norms).all() for norms in adam.gradient_norms().values())
+    for size in (3.0, 4.0):
+        population.w.grad = torch.full((2, 3, 4), size)
+        population.angles.grad = torch.tensor([[size], [2 * size]]).expand(2, 5).contiguous()
+        adam.step(torch.tensor([True, size == 3.0]))
+    both = np.sqrt((0.999 * 9 + 16) / 1.999)  # the later step weighs more
+    norms = adam.gradient_norms()
+    np.testing.assert_allclose(
+        norms["gradient_norm_classical"], np.sqrt(12) * np.array([both, 3.0]), rtol=1e-5
+    )
+    np.testing.assert_allclose(norms["gradient_norm_quantum"], np.sqrt(5) * np.array([both, 6.0]), rtol=1e-5)
+
+
 def test_an_agent_makes_the_same_step_alone_and_at_any_place() -> None:
     def step(agents: slice) -> list[Tensor]:
         population = torch.nn.Module()
