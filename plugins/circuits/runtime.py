@@ -92,7 +92,12 @@ class Runtime:
         seconds = circuits * (self.options.shots or 0) * (delay + duration * np.mean(longer))
         status = self._status()
         waiting = "" if status is None else f"{status.pending_jobs} jobs wait at {self.options.device}; "
-        return f"{waiting}about {seconds:,.0f} s of the device's time, which is what IBM charges for"
+        charged = (
+            "and it charges for an open session"
+            if self.options.runtime == "session"
+            else "which it charges for"
+        )
+        return f"{waiting}about {seconds:,.0f} s of the time of IBM's device, {charged}"
 
     def _status(self) -> Any:
         asked = getattr(self.device, "status", None)

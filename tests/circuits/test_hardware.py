@@ -5,16 +5,23 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import pennylane as qml
 import pytest
 import torch
+from qiskit import QuantumCircuit
+from qiskit.circuit import Parameter
+from qiskit.providers.fake_provider import GenericBackendV2
+from qiskit.quantum_info import SparsePauliOp
 from torch import Tensor
 
 from qrlsuite.circuit import Circuit, create_backend, expectations
 from qrlsuite.errors import OptionError
+from qrlsuite.plugins.circuits.options import QiskitOptions
 from qrlsuite.plugins.circuits.pennylane import braket_terms
+from qrlsuite.plugins.circuits.runtime import Runtime
 
 IBM = pytest.mark.skipif(
     importlib.util.find_spec("qiskit_ibm_runtime") is None, reason="pip install 'qrlsuite[ibm]'"
@@ -137,6 +144,41 @@ def test_what_amazon_s_device_says_before() -> None:
     assert said == (
         "tasks that wait: Normal: 12, Priority: 1; $0.03 a shot, $6,000.00 in all, and Amazon's price of 2,000 tasks"
     )
+
+
+class Off(GenericBackendV2):  # type: ignore[misc, unused-ignore]
+    """A device that is not there today."""
+
+    def status(self) -> Any:
+        return SimpleNamespace(operational=False, status_msg="maintenance", pending_jobs=7)
+
+
+class Away(GenericBackendV2):  # type: ignore[misc, unused-ignore]
+    """A device that does not answer."""
+
+    def status(self) -> Any:
+        raise ConnectionError("the service\nhung up")
+
+
+@pytest.mark.parametrize(
+    ("device", "sentence"),
+    [
+        (Off(2, seed=0), "device = 'ibm_x' is out of service: maintenance"),
+        (Away(2, seed=0), "device = 'ibm_x' does not answer: the service hung up"),
+        (
+            GenericBackendV2(2, basis_gates=["x", "rz", "cx"], seed=0),
+            "device = 'ibm_x' cannot run this circuit: ",
+        ),
+    ],
+)
+def test_a_device_that_cannot_run_a_circuit_is_refused_before_anything_is_executed(
+    device: Any, sentence: str
+) -> None:
+    circuit = QuantumCircuit(2)
+    circuit.ry(Parameter("angle"), 0)
+    circuit.cx(0, 1)
+    with pytest.raises(OptionError, match=sentence):
+        Runtime(QiskitOptions(device="ibm_x", shots=9), device, circuit, [SparsePauliOp("ZZ")])
 
 
 def test_without_their_packages_devices_name_them() -> None:
