@@ -66,8 +66,8 @@ class Tuned:
 
         lr: Annotated[float, Field(gt=0, description="..."), Tuned(2e-4, 1e-2)] = 5e-4
 
-    Values are drawn log-uniformly. Where the best one lies at an end of the range, the search goes on beyond it, as far
-    as the option admits.
+    Values are drawn log-uniformly, in steps of a factor of two where agents of one population cannot differ in them.
+    Where the best one lies at an end of the range, the search goes on beyond it, as far as the option admits.
 
     With `per_agent=True`, agents of one population may have different values of the option, and a search trains many
     of its settings side by side in one population. `build` of a model gets each agent's own options. An algorithm's

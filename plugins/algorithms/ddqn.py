@@ -54,14 +54,20 @@ class DDQNOptions:
         Field(gt=0, description="learning rate of quantum parameters"),
         Tuned(2e-4, 1e-2, "quantum", per_agent=True),
     ] = 1e-3
-    epsilon: Annotated[float, Field(ge=0, le=1, description="probability of a random action in training")] = (
-        0.1
-    )
-    buffer: Annotated[int, Field(ge=1, description="transitions held by the replay buffer, per seed")] = 2000
-    batch: Annotated[int, Field(ge=1, description="transitions per gradient step")] = 64
-    target_steps: Annotated[int, Field(ge=1, description="gradient steps between copies to the target")] = (
-        2000
-    )
+    epsilon: Annotated[
+        float,
+        Field(ge=0, le=1, description="probability of a random action in training"),
+        Tuned(0.02, 0.5, per_agent=True),
+    ] = 0.1
+    buffer: Annotated[
+        int, Field(ge=1, description="transitions held by the replay buffer, per seed"), Tuned(1000, 32_000)
+    ] = 2000
+    batch: Annotated[int, Field(ge=1, description="transitions per gradient step"), Tuned(16, 256)] = 64
+    target_steps: Annotated[
+        int,
+        Field(ge=1, description="gradient steps between copies to the target"),
+        Tuned(125, 8000, per_agent=True),
+    ] = 2000
 
 
 class DDQN:
@@ -83,6 +89,9 @@ class DDQN:
         self.online = build_model(self.actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online, options.lr, options.quantum_lr)
+        self.epsilon, self.target_steps = (  # (S,)
+            np.broadcast_to(np.asarray(each), self.S) for each in (options.epsilon, options.target_steps)
+        )
         self.epoch = 0
         self._hold(torch.zeros((self.S, self.E, self.obs_dim), device=device))
 
@@ -117,7 +126,7 @@ class DDQN:
         draws = np.empty((rounds, self.S, self.options.batch))
         for s, streams in enumerate(self.streams):
             exploration = streams.numpy("exploration", self.epoch)
-            explore[:, s] = exploration.random((rounds, self.E)) < self.options.epsilon
+            explore[:, s] = exploration.random((rounds, self.E)) < self.epsilon[s]
             action[:, s] = exploration.integers(self.actions, size=(rounds, self.E))
             draws[:, s] = streams.numpy("replay", self.epoch).random((rounds, self.options.batch))
         return tuple(torch.from_numpy(a).to(self.device) for a in (explore, action, draws))  # type: ignore[return-value]
@@ -146,8 +155,11 @@ class DDQN:
         )
         errors = chosen_errors(self.online, seen, action.long(), y)  # Q(s, a) - y; sets gradients
         self.adam.step()
-        if int(self.adam.steps[0]) % self.options.target_steps == 0:
-            self.target.load_state_dict(self.online.state_dict())
+        due = int(self.adam.steps[0]) % self.target_steps == 0
+        if due.any():
+            agents, online = torch.from_numpy(np.flatnonzero(due)).to(self.device), self.online.state_dict()
+            for name, held in self.target.state_dict().items():
+                held[agents] = online[name][agents]
         return errors.square().mean(1)
 
     def _greedy(self, seen: Tensor) -> Tensor:

@@ -90,9 +90,13 @@ class PPOOptions:
         Field(gt=0, description="learning rate of quantum parameters"),
         Tuned(2e-4, 1e-2, "quantum", per_agent=True),
     ] = 1e-3
-    clip: Annotated[float, Field(gt=0, description="ratios beyond 1 - clip and 1 + clip earn nothing")] = 0.1
-    repeats: Annotated[int, Field(ge=1, description="passes over an epoch's samples")] = 10
-    batch: Annotated[int, Field(ge=2, description="samples per gradient step")] = 64
+    clip: Annotated[
+        float,
+        Field(gt=0, description="ratios beyond 1 - clip and 1 + clip earn nothing"),
+        Tuned(0.05, 0.5, per_agent=True),
+    ] = 0.1
+    repeats: Annotated[int, Field(ge=1, description="passes over an epoch's samples"), Tuned(5, 40)] = 10
+    batch: Annotated[int, Field(ge=2, description="samples per gradient step"), Tuned(16, 256)] = 64
     length: Annotated[
         int,
         Field(ge=1, description="steps of a sequence that models that remember learn from"),
@@ -301,6 +305,10 @@ class PPO:
         self.actor_adam = Adam(self.actor, options.lr, options.quantum_lr)
         self.critic_adam = Adam(self.critic, options.lr, options.quantum_lr)
         self.adams = [self.actor_adam, self.critic_adam]
+        clip: Any = options.clip
+        self.clip: tuple[Any, Any] = (1.0 - clip, 1.0 + clip)
+        if isinstance(clip, Tensor):  # each agent's own, (S, 1)
+            self.clip = tuple(end.to(device, torch.float32)[:, None] for end in self.clip)  # type: ignore[assignment]
         if isinstance(self.policy, Gaussian):
             self.spread_adam = Adam(self.policy, options.lr, options.quantum_lr)
             self.adams.append(self.spread_adam)
@@ -510,7 +518,7 @@ class PPO:
         log_ratio = log_probs - old_log_probs
         ratio = log_ratio.exp()
         a = _normalized(advantages)
-        policy_loss = -torch.minimum(ratio * a, ratio.clamp(1.0 - o.clip, 1.0 + o.clip) * a).mean(1)
+        policy_loss = -torch.minimum(ratio * a, ratio.clamp(*self.clip) * a).mean(1)
         value_loss = (_outputs(self.critic, plain, *memory[::2]).squeeze(2) - returns).square().mean(1)
         entropy = entropies.mean(1)
         losses = policy_loss + o.value_coefficient * value_loss - o.entropy_coefficient * entropy

@@ -23,7 +23,7 @@ from qrlsuite.results.store import plugins_in
 from qrlsuite.training import trackers
 from qrlsuite.tuning import runner as tuning_runner
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.search import Search, preset_path, read_requests, tuning_seeds
+from qrlsuite.tuning.search import Search, preset_path, read_requests
 
 if TYPE_CHECKING:
     from qrlsuite.api.evaluation import Evaluation
@@ -182,7 +182,7 @@ def tune(
     *,
     vary: str | Sequence[str] | Mapping[str, Any] | None = None,
     sampler: str | None = None,
-    seeds: Seeds = 20,
+    seeds: Seeds | None = None,
     epochs: int | None = None,
     objective: Literal["time", "cell", "area"] = "time",
     budget: str | None = None,
@@ -207,13 +207,14 @@ def tune(
         What is tuned: `"mlp width=16"`, or several, which get equal budgets. Options that are written are not varied.
     vary:
         What is varied: lists of values, or ranges, `{"lr": [1e-3, 5e-4], "gamma": {"low": 0.9, "high": 0.99}}`; or
-        words as on the command line: a grid's name (`"paper"`), a grid file's path, `"lr=1e-3,5e-4"`. Without it
-        `halving` varies the options that models and algorithms mark as `Tuned`.
+        words as on the command line: a grid's name (`"paper"`), a grid file's path, `"lr=1e-3,5e-4"`; settings that
+        `bayesian` tries first, `"lr=.002 buffer=10000"`. `bayesian` also varies the options that models and algorithms
+        mark as `Tuned`.
     sampler:
-        `halving`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`.
-        None takes all combinations of what `vary` lists, and halving without it.
+        `bayesian`, `grid`, `one-at-a-time`, `random` or `tpe`, with options `trials` and `seed`: `"random trials=50"`;
+        `"bayesian regret=.03"`. None takes all combinations of what `vary` lists, and `bayesian` without lists.
     seeds:
-        Runs of each trial, with `halving` of each in the last rung: a number counts from seed 1,000,000.
+        Runs of each trial: a number counts from seed 1,000,000. None takes 20, with `bayesian` 4.
     epochs:
         Of each trial; None takes the task's protocol.
     objective:
@@ -221,7 +222,7 @@ def tune(
         mean over the ranking grid (`area`).
     budget:
         `"30min"`: begin no trial that would not end within this time; every call gets it anew. `"2core-hours"` with
-        `halving`: as many settings as this much of each model's time holds.
+        `bayesian`: as many trials as this holds, for each entry.
     out:
         The preset file, ending in .toml; None takes one below `runs`.
     progress:
@@ -281,7 +282,7 @@ def plan_tuning(
     entries: Sequence[str],
     vary: str | Sequence[str] | Mapping[str, Any] | None,
     sampler: str | None,
-    seeds: Seeds,
+    seeds: Seeds | None,
     epochs: int | None,
     objective: Literal["time", "cell", "area"],
     budget: str | None,
@@ -292,9 +293,7 @@ def plan_tuning(
 ) -> Tuning:
     """Build the searches that `tune` and the command run, and show them; the arguments are those of `tune`."""
     check_positive("epochs", epochs)
-    requests = read_requests(
-        task, entries, vary or (), sampler, tuning_seeds(seeds), epochs, objective, budget
-    )
+    requests = read_requests(task, entries, vary or (), sampler, seeds, epochs, objective, budget)
     path = preset_path(out, requests)
     searches = tuning_runner.build(requests, Path(runs))
     display = TuneDisplay(searches, where, not progress)

@@ -21,6 +21,19 @@ TUNING_SEEDS = 1_000_000
 """Seeds from here on are for tuning; protocol seeds lie below."""
 
 
+class RegretRecord(options.Table):
+    """How much longer than at the best settings learning takes at the settings found, as shares: 0.05 for 5 percent.
+
+    As the search estimated it, by a surrogate (`qrlsuite.tuning.surrogate`).
+    """
+
+    goal: Annotated[float, Field(gt=0, description="the expected regret at which the search was to end")]
+    expected: Annotated[float, Field(ge=0)]
+    low: Annotated[float, Field(ge=0, description="5th percentile")]
+    high: Annotated[float, Field(ge=0, description="95th percentile")]
+    near: Annotated[float, Field(ge=0, le=1, description="probability of a regret of at most 0.03")]
+
+
 class TuningRecord(options.Table):
     """How settings were found, and what it took; None is what is not known."""
 
@@ -41,8 +54,9 @@ class TuningRecord(options.Table):
     ] = None
     rungs: Annotated[
         tuple[tuple[int, int], ...] | None,
-        Field(description="successive halving: settings and seeds of each rung, the last one's seeds fresh"),
+        Field(description="successive halving, in older records: settings and seeds of each rung"),
     ] = None
+    regret: RegretRecord | None = None
     epochs: Annotated[int | None, Field(ge=1, description="of every trial")] = None
     steps: Annotated[int | None, Field(ge=0, description="environment steps of all trials together")] = None
     space: Annotated[dict[str, Any] | None, Field(description="what every option was chosen from")] = None
@@ -77,7 +91,7 @@ class EntryTuning(TuningRecord):
 
     def plain(self) -> dict[str, Any]:
         """Return what `entry.json` stores."""
-        unknown = {name for name in ("runs", "budget", "rungs") if getattr(self, name) is None}
+        unknown = {name for name in ("runs", "budget", "rungs", "regret") if getattr(self, name) is None}
         return self.model_dump(mode="json", exclude=unknown)  # 0.1.0 reads records without these keys only
 
 

@@ -3,6 +3,6 @@
 - `space`: search grids, and the settings that they span.
 - `samplers`: in which order settings are tried: a whole grid, parts of it, or a model's proposals.
 - `objective`: what a trial is worth.
-- `halving`: the same setting on few seeds, then on more: models' budgets made equal.
 - `search`: trial by trial, each an ordinary set of runs; and the preset file that comes out.
+- `bayesian`: until the expected regret is small, by a `surrogate`: models' searches made equal.
 """

@@ -37,6 +37,7 @@ class TuneDisplay:
         """Seconds of one seed of a trial, by the pace of the trials that are trained now or were last."""
         self._done = 0
         """Trials before those that are trained now."""
+        self._said: set[str] = set()
 
     def begin(self) -> None:
         """Say how large each search is, and what it will cost as far as that is known."""
@@ -132,13 +133,19 @@ class TuneDisplay:
             return
         best = "  best so far" if search.best is trial else ""
         several = f"{search.base.label}  " if len(self.searches) > 1 else ""
-        rung = f"rung {trial.rung + 1} " if search.request.sampler == "halving" else ""
         self.console.print(
-            f"{several}{rung}trial {search.trials.index(trial) + 1}/{search.planned}  {text(trial.point)}: "
+            f"{several}trial {search.trials.index(trial) + 1}/{search.planned}  {text(trial.point)}: "
             f"{merit_text(trial)}{best}",
             markup=False,
             soft_wrap=True,
         )
+
+    def regret(self, search: Search) -> None:
+        """Show how good the best settings are, where that is known and has changed."""
+        said = f"{search.base.label}: {search.regret_text}"
+        if search.regret_text and said not in self._said:
+            self._said.add(said)
+            self.console.print(said, markup=False, soft_wrap=True)
 
     def close(self) -> None:
         """Take the live bar away."""

@@ -15,24 +15,31 @@ from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry
 from qrlsuite.results import codes
 from qrlsuite.results.store import EntryStore
+from qrlsuite.tuning.bayesian import Bayesian
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.halving import Halving
 from qrlsuite.tuning.search import FOLDER, Request, Search
 
 
 def build(requests: Sequence[Request], runs: Path) -> list[Search]:
     """Build searches; of several grids, larger ones are sampled down to the number of combinations of the smallest.
 
-    By `halving` each has as many settings per varied option, or as many core-hours.
+    By `bayesian` each goes on until the same expected regret, or for as many trials per option or core-hours.
 
     Parameters
     ----------
     runs:
         The results folder.
     """
-    built = [Halving(r, runs) if r.sampler == "halving" else Search(r, runs) for r in requests]
-    if any(isinstance(search, Halving) for search in built):
-        return built
+    if requests[0].sampler == "bayesian":
+        searches = [Bayesian(request, runs) for request in requests]
+        for row in requests[0].rows:
+            if not any(row in search.taken for search in searches):
+                raise OptionError(
+                    f"--vary '{row}': no entry has all of these options among those that are varied, which are "
+                    f"{', '.join(dimension.name for dimension in searches[0].space)}"
+                )
+        return [*searches]
+    built = [Search(request, runs) for request in requests]
     fewest = min(search.planned for search in built)
     for i, search in enumerate(built):
         if search.planned == fewest:
@@ -129,6 +136,7 @@ def _run(
             room = max(1, where.room // search.next_seeds)
             for trial in search.step(train, room if most is None else min(room, most)):
                 display.told(search, trial)
+            display.regret(search)
             if trained > before:
                 pace[i] = (time.monotonic() - started) / (trained - before)
     return not any(search.pending for search in searches)

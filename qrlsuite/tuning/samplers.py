@@ -19,12 +19,15 @@ from qrlsuite.errors import OptionError, QrlSuiteError, UnknownNameError, neares
 from qrlsuite.tuning.space import Dimension, Point, Space
 
 NAMES = {
-    "halving": "successive halving: many settings on few seeds, the best of them on more, the last on fresh ones",
+    "bayesian": "settings that may be the best by a smooth surrogate, until the expected regret is small",
     "grid": "every combination",
     "one-at-a-time": "each option through its values, the others as they are without tuning",
     "random": "combinations drawn at random, none twice",
     "tpe": "proposals of Optuna's tree-structured Parzen estimator, after what was seen",
 }
+
+REGRET = 0.05
+"""The expected regret at which a `bayesian` search ends, unless told otherwise."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -33,10 +36,11 @@ class SamplerOptions:
 
     trials: Annotated[int | None, pydantic.Field(ge=1, le=100_000)] = None
     seed: Annotated[int, pydantic.Field(ge=0)] = 0
+    regret: Annotated[float | None, pydantic.Field(gt=0, allow_inf_nan=False)] = None
 
 
 def read(text: str) -> tuple[str, SamplerOptions]:
-    """Read a sampler with its options: `random trials=50 seed=1`; for `halving`, trials per varied option."""
+    """Read a sampler with its options: `random trials=50 seed=1`; `bayesian`'s trials are per varied option."""
     name, values = notation.parse_named(text, "--sampler ")
     if name not in NAMES:
         raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
@@ -68,7 +72,7 @@ def create(name: str, space: Space, trials: int | None, seed: int, base: Point) 
     base:
         The point of settings without tuning, from which `one-at-a-time` starts.
     """
-    if name not in NAMES or name == "halving":  # which is a search of its own, and goes back to known points
+    if name not in NAMES or name == "bayesian":  # which is a search of its own, and goes back to known points
         raise UnknownNameError(f"unknown sampler '{name}'{nearest(name, NAMES)}")
     ranges = [dimension.name for dimension in space if dimension.range is not None]
     if name in ("grid", "one-at-a-time"):

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from qrlsuite import notation, options, registry
@@ -37,6 +39,9 @@ SHOWN = 10
 
 FOLDER = "tuning"
 """Trials lie in a results folder of their own, so that leaderboards do not rank them."""
+
+SEEDS = (20, 4)
+"""Runs of each trial, and of each in a `bayesian` search, where settings that may be the best get further trials."""
 
 Train = Callable[[Sequence[Entry], Sequence[int], int], Sequence[EntryStore]]
 """Trains the missing ones of some seeds of each entry to an epoch; returns the entries' folders, finished or not."""
@@ -67,11 +72,15 @@ class Request:
     grid, varied:
         What is varied: a grid file, and options with lists of values of their own.
     trials, sampler_seed:
-        See `qrlsuite.tuning.samplers`, and for `halving` `qrlsuite.tuning.halving`.
+        See `qrlsuite.tuning.samplers`, and for `bayesian` `qrlsuite.tuning.bayesian`.
+    regret:
+        With `bayesian`, the expected regret at which the search ends.
+    rows:
+        With `bayesian`, settings that are tried first: `lr=.002 buffer=10000` or `preset=FILE.toml`.
     budget:
-        Of time; or of core-hours: with `halving`, instead of `trials`, as many settings as these hold.
+        Of time; or of core-hours, with `bayesian`: as many trials as these hold.
     seeds:
-        Tuning seeds; with `halving` those of the last rung, in number.
+        Tuning seeds of every trial; with `bayesian` of the first ones, and others as many numbers on.
     epochs:
         Of every trial; None for the task's protocol.
     """
@@ -85,14 +94,16 @@ class Request:
     trials: int | None = None
     budget: Budget | None = None
     sampler_seed: int = 0
+    regret: float = samplers.REGRET
+    rows: tuple[str, ...] = ()
     seeds: tuple[int, ...] = ()
     epochs: int | None = None
     objective: Objective = "time"
 
     @property
     def core_hours(self) -> float | None:
-        """With `halving`, the core-hours that decide how many settings are tried."""
-        return self.budget.core_hours if self.budget is not None and self.sampler == "halving" else None
+        """With `bayesian`, the core-hours that limit the search."""
+        return self.budget.core_hours if self.budget is not None and self.sampler == "bayesian" else None
 
     def seconds(self, workers: int) -> float | None:
         """Return the time that the search may take; None for no limit."""
@@ -104,7 +115,7 @@ def read_requests(
     entries: Sequence[str],
     vary: str | Sequence[str] | Mapping[str, Any],
     sampler: str | None,
-    seeds: tuple[int, ...],
+    seeds: int | str | Iterable[int] | None,
     epochs: int | None,
     objective: Objective,
     budget: str | None,
@@ -116,10 +127,15 @@ def read_requests(
     vary:
         See `qrlsuite.tuning.space.read_varied`.
     sampler:
-        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else halving.
+        A name with options, `random trials=50 seed=1`; None takes all combinations of what is listed, else `bayesian`.
+    seeds:
+        As `tuning_seeds` reads them; None takes `SEEDS`.
     """
-    grid, varied = space.read_varied(vary)
-    name, chosen = samplers.read(sampler or ("grid" if vary else "halving"))
+    grid, varied, rows = space.read_varied(vary)
+    name, chosen = samplers.read(sampler or ("grid" if grid or varied else "bayesian"))
+    if name != "bayesian" and (rows or chosen.regret is not None):
+        what = f"--vary '{rows[0]}'" if rows else "regret"
+        raise OptionError(f"{what} is for --sampler bayesian, and not for {name}")
     shared = Request(
         task,
         "",
@@ -129,7 +145,9 @@ def read_requests(
         trials=chosen.trials,
         sampler_seed=chosen.seed,
         budget=None if budget is None else Budget.parse(budget),
-        seeds=seeds,
+        regret=samplers.REGRET if chosen.regret is None else chosen.regret,
+        rows=rows,
+        seeds=tuning_seeds(SEEDS[name == "bayesian"] if seeds is None else seeds),
         epochs=epochs,
         objective=objective,
     )
@@ -148,12 +166,13 @@ def preset_path(out: str | PathLike[str] | None, requests: Sequence[Request]) ->
 
 @dataclass(frozen=True)
 class Proposal:
-    """Settings to be tried: their number, and the seeds of a rung."""
+    """Settings to be tried: their number, the seeds to be trained, and those of the same settings' earlier trials."""
 
     number: int
     point: space.Point
     seeds: tuple[int, ...]
-    rung: int = 0
+    round: int = 0
+    before: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -165,9 +184,11 @@ class Trial:
     number:
         Of its settings, in the order in which they were first tried.
     core_seconds:
-        Of its runs, those that an earlier rung trained too.
-    seeds, rung:
-        What it was tried on; rungs count from 0 and are those of `halving`.
+        Of its runs, those of earlier trials of the same settings too.
+    seeds, round:
+        All that the settings were tried on so far; rounds of `bayesian` count from 0.
+    spread:
+        Standard deviation of a run in units of the mean, by leaving out one at a time; 0 of a single one.
     """
 
     number: int
@@ -176,7 +197,8 @@ class Trial:
     merit: Merit
     core_seconds: float
     seeds: tuple[int, ...]
-    rung: int = 0
+    round: int = 0
+    spread: float = 0.0
 
 
 class Search(Shown):
@@ -269,7 +291,7 @@ class Search(Shown):
 
     @property
     def best(self) -> Trial | None:
-        """The best finished trial, of the latest rung, the earliest of equals; None before any."""
+        """The best finished trial, the earliest of equals; None before any."""
         return next(iter(self.ordered), None)
 
     @property
@@ -285,9 +307,13 @@ class Search(Shown):
     @property
     def _per_agent(self) -> bool:
         """Whether agents of one population may differ in all that is varied."""
+        return all(self._free.issuperset(dimension.name.split("+")) for dimension in self.space)
+
+    @property
+    def _free(self) -> set[str]:
+        """The options in which agents of one population may differ, by full name."""
         sides = {"algorithm": self.base.algorithm_options, "model": self.base.model_options}
-        free = {f"{side}.{name}" for side, own in sides.items() for name in options.per_agent(type(own))}
-        return all(free.issuperset(dimension.name.split("+")) for dimension in self.space)
+        return {f"{side}.{name}" for side, own in sides.items() for name in options.per_agent(type(own))}
 
     @property
     def next_seeds(self) -> int:
@@ -326,20 +352,30 @@ class Search(Shown):
         stores = train(entries, proposals[0].seeds, self.epochs)
         return [self._judge(*each) for each in zip(proposals, entries, stores)]
 
+    def _spread(self, curves: NDArray[np.float64], worth: Callable[[NDArray[np.float64]], Merit]) -> float:
+        """Return the spread of a trial, see `Trial`, where the search needs it."""
+        return 0.0
+
     def _judge(self, proposal: Proposal, entry: Entry, store: EntryStore) -> Trial | None:
         """Look at the curves of settings; None where some are left to others."""
-        request, seeds = self.request, proposal.seeds
+        request, seeds = self.request, (*proposal.before, *proposal.seeds)
         if store.finished(seeds, self.epochs) != set(seeds):
             self.pending.append(entry)
             return None
         curves = np.stack([store.seed(seed).read().curve[: self.epochs] for seed in seeds])
-        worth = merit(
-            curves, entry.task.file.ranking, entry.task.file.protocol.interactions, request.objective
+        worth = partial(
+            merit,
+            ranking=entry.task.file.ranking,
+            steps_per_epoch=entry.task.file.protocol.interactions,
+            objective=request.objective,
         )
         own = {(entry.hash, seed): store.seed(seed).seconds() for seed in seeds}
         self._seconds |= own
         spent = sum(own.values())
-        trial = Trial(proposal.number, proposal.point, entry, worth, spent, seeds, proposal.rung)
+        spread = self._spread(curves, worth)
+        trial = Trial(
+            proposal.number, proposal.point, entry, worth(curves), spent, seeds, proposal.round, spread
+        )
         self.trials.append(trial)
         return trial
 
@@ -429,7 +465,7 @@ class Search(Shown):
                     "number": trial.number,
                     "settings": trial.point,
                     "entry": trial.entry.name,
-                    "rung": trial.rung,
+                    "round": trial.round,
                     "seeds": format_seeds(trial.seeds),
                     "value": trial.merit.value,
                     "mean_time": trial.merit.time,
@@ -455,9 +491,14 @@ class Search(Shown):
         self.written = path
 
     @property
+    def regret_text(self) -> str:
+        """Say how good the best settings are, where the search knows it."""
+        return ""
+
+    @property
     def ordered(self) -> list[Trial]:
-        """The finished trials from best to worst; those of a later rung before those of an earlier one."""
-        return sorted(self.trials, key=lambda trial: (-trial.rung, trial.merit.order, trial.number))
+        """The finished trials from best to worst."""
+        return sorted(self.trials, key=lambda trial: (trial.merit.order, trial.number))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Show the best trials, a row each."""

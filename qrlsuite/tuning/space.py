@@ -35,6 +35,9 @@ from qrlsuite.experiment.entry import Entry
 from qrlsuite.options import Setting, Table
 
 FOLDER = "search"
+_WORD = r"[^\s={\[]+=[^\s={\[]+"
+ROW = re.compile(rf"preset=\S+(\s+{_WORD})*|{_WORD}(\s+{_WORD})+")
+"""Settings given by hand."""
 Point = dict[str, Any]
 """A value for every dimension, by its full name (`algorithm.lr`)."""
 
@@ -237,22 +240,28 @@ def parse_varied(word: str) -> Setting:
     return Setting(side, name, value) if dot else Setting(None, side, value)
 
 
-def read_varied(vary: str | Sequence[str] | Mapping[str, Any]) -> tuple[GridFile | None, tuple[Setting, ...]]:
-    """Return a grid and the options with values of their own.
+def read_varied(
+    vary: str | Sequence[str] | Mapping[str, Any],
+) -> tuple[GridFile | None, tuple[Setting, ...], tuple[str, ...]]:
+    """Return a grid, the options with values of their own, and settings given by hand.
 
     Parameters
     ----------
     vary:
-        Words, each a grid's name, a grid file's path or `NAME=VALUES`; or a mapping of option names to values.
+        Words, each a grid's name, a grid file's path, `NAME=VALUES`, or settings: `NAME=VALUE NAME=VALUE` or
+        `preset=NAME`; or a mapping of option names to values.
     """
     if isinstance(vary, Mapping):
         varied = {name: list(v) if isinstance(v, tuple) else v for name, v in vary.items()}
-        return None, tuple(options.from_mapping(varied))
+        return None, tuple(options.from_mapping(varied)), ()
     words = [vary] if isinstance(vary, str) else list(vary)
+    rows = tuple(word.strip() for word in words if ROW.fullmatch(word.strip()))
+    words = [word for word in words if word.strip() not in rows]
     grids = [word for word in words if "=" not in word]
     if len(grids) > 1:
         raise OptionError(f"--vary {grids[0]} --vary {grids[1]}: give one grid")
-    return load(grids[0]) if grids else None, tuple(parse_varied(word) for word in words if "=" in word)
+    given = tuple(parse_varied(word) for word in words if "=" in word)
+    return load(grids[0]) if grids else None, given, rows
 
 
 def _values(name: str, value: Any) -> list[Any] | Range:

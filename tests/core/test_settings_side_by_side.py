@@ -31,11 +31,11 @@ from qrlsuite.specs import ModelSpec
 from qrlsuite.training import group
 from qrlsuite.training.trainer import Trainer
 from qrlsuite.tuning import search
+from qrlsuite.tuning.bayesian import Bayesian
 from qrlsuite.tuning.display import TuneDisplay
-from qrlsuite.tuning.halving import Halving
 from qrlsuite.tuning.runner import run as run_searches
 from tests.conftest import results
-from tests.core.test_halving import OWN
+from tests.core.test_bayesian import OWN
 from tests.core.test_tuning import finish, request, varied, without_hours
 
 NETWORK = ("width=4", "depth=1")
@@ -236,8 +236,9 @@ def test_what_cannot_be_together_is_trained_in_turn(tiny_task: str, tmp_path: Pa
     assert (len(lists), elsewhere.room) == (3, 1)
 
 
-def halving(task: str, folder: Path) -> Halving:
-    return Halving(request(task, varied=(), settings=OWN, sampler="halving", trials=4), folder)
+def bayesian(task: str, folder: Path) -> Bayesian:
+    """Five trials, then two rounds of as many."""
+    return Bayesian(request(task, varied=(), settings=OWN, sampler="bayesian", trials=20), folder)
 
 
 def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -> None:
@@ -245,18 +246,18 @@ def test_how_many_settings_can_be_side_by_side(tiny_task: str, tmp_path: Path) -
     for words, sampler, beside in (
         (("lr=1e-3,1e-2",), "grid", 2),
         (("lr=1e-3,1e-2", "gamma=.9,.99"), "grid", 1),
-        (("lr+quantum_lr=1e-3,1e-2",), "halving", 3),
-        (("gamma=.9,.99",), "halving", 1),
+        (("lr+quantum_lr=1e-3,1e-2",), "bayesian", 12),
+        (("gamma=.9,.99",), "bayesian", 1),
     ):
         fixed = (*OWN, *([parse_setting("lr=1e-3")] * (words == ("gamma=.9,.99",))))
         wanted = request(tiny_task, settings=fixed, varied=varied(*words), sampler=sampler)
-        found = Halving(wanted, tmp_path) if sampler == "halving" else search.Search(wanted, tmp_path)
+        found = Bayesian(wanted, tmp_path) if sampler == "bayesian" else search.Search(wanted, tmp_path)
         assert found.beside == beside, words
 
 
 def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp_path: Path) -> None:
     by = where.Where(local.LocalEngine(), 1)
-    found = halving(tiny_task, tmp_path)
+    found = bayesian(tiny_task, tmp_path)
     shown = io.StringIO()
     display = TuneDisplay([found], by)
     display.console = Console(force_terminal=True, width=120, file=shown)
@@ -271,7 +272,7 @@ def test_progress_names_the_trials_that_are_trained_together(tiny_task: str, tmp
     with pytest.raises(KeyboardInterrupt):
         found.step(train, by.room)
     display.interrupted()
-    assert "trials 1-2/7  epoch 0/1" in shown.getvalue()
+    assert "trials 1-5/20  epoch 0/1" in shown.getvalue()
     assert "every finished epoch is saved" in shown.getvalue()
 
 
@@ -282,7 +283,7 @@ def test_what_is_left_of_a_search_is_known_after_the_second_epoch(
     clock = [100.0]
     monkeypatch.setattr("qrlsuite.tuning.display.time.monotonic", lambda: clock[0])
     by = where.Where(local.LocalEngine(), 1)
-    found = halving(tiny_task, tmp_path)
+    found = bayesian(tiny_task, tmp_path)
     display = TuneDisplay([found], by, quiet=True)
     begun = [missing.find(found.runs, entry, by, [0, 1], 10) for entry in entries(tiny_task)]
     display.training(begun)
@@ -297,7 +298,7 @@ def test_what_is_left_of_a_search_is_known_after_the_second_epoch(
     assert display._left(0, 10) == pytest.approx(25 + 2 * 25), "by the pace of the batch before"
 
 
-def preset(found: Halving) -> str:
+def preset(found: Bayesian) -> str:
     found.write(found.path)
     return without_hours(found.path.read_text())
 
@@ -306,8 +307,8 @@ def preset(found: Halving) -> str:
 def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_path: Path) -> None:
     """Begun the one way it continues the other way."""
     folder = tmp_path / "in turn"
-    in_turn = halving(tiny_task, folder)
-    assert in_turn.beside == 3
+    in_turn = bayesian(tiny_task, folder)
+    assert in_turn.beside == 12
     finish(in_turn)
     expected = preset(in_turn)
 
@@ -315,8 +316,8 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
     for name, begun in (("straight", 0), ("begun", 2)):
         if begun:
             with pytest.raises(KeyboardInterrupt):
-                finish(halving(tiny_task, tmp_path / name), stop_before=begun)
-        found = halving(tiny_task, tmp_path / name)
+                finish(bayesian(tiny_task, tmp_path / name), stop_before=begun)
+        found = bayesian(tiny_task, tmp_path / name)
         assert run_searches([found], tmp_path / name, by, TuneDisplay([found], by, quiet=True))
         assert preset(found) == expected
         assert [trial.merit for trial in found.trials] == [trial.merit for trial in in_turn.trials]
@@ -325,9 +326,9 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
             for trial in found.trials
             for line in read_lines(EntryStore.find(found.runs, trial.entry).seed(trial.seeds[0]).timings)
         }
-        assert sizes == ({1, 6} if begun else {2, 1, 6}), "2, 1, 1 settings on a seed; the last 3 on two"
+        assert sizes == ({2, 6, 24} if begun else {10, 24}), "5 settings on two seeds, then 12"
 
-    stopped = halving(tiny_task, tmp_path / "stopped")
+    stopped = bayesian(tiny_task, tmp_path / "stopped")
 
     class Stopping(TuneDisplay):
         def told(self, *given: Any) -> None:
@@ -335,6 +336,6 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
 
     with pytest.raises(KeyboardInterrupt):
         run_searches([stopped], tmp_path / "stopped", by, Stopping([stopped], by, quiet=True))
-    again = halving(tiny_task, tmp_path / "stopped")
+    again = bayesian(tiny_task, tmp_path / "stopped")
     finish(again)
     assert preset(again) == expected

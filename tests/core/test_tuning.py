@@ -23,6 +23,11 @@ from qrlsuite.tuning import objective, samplers, search, space
 from tests.conftest import TINY
 
 SETTINGS = (parse_setting("width=4"), parse_setting("depth=1"))
+FIXED = tuple(
+    parse_setting(word)
+    for word in ("input_scale=1", "epsilon=.1", "buffer=2000", "batch=64", "target_steps=2000")
+)
+"""What else is tuned than the learning rate."""
 RANKING = RankingSection.model_validate(
     {
         "epsilons": [0.5, 0.2],
@@ -317,7 +322,7 @@ def test_what_another_process_trains_is_waited_for(tiny_task: str, tmp_path: Pat
     [
         ({"varied": ()}, "algorithm.lr is a range, which sampler 'grid' cannot go through"),
         (
-            {"varied": (), "settings": (*SETTINGS, *map(parse_setting, ("lr=1e-3", "input_scale=1")))},
+            {"varied": (), "settings": (*SETTINGS, *FIXED, parse_setting("lr=1e-3"))},
             "nothing is varied",
         ),
         ({"varied": varied("widht=1,2")}, "did you mean 'width'"),

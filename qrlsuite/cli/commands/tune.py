@@ -56,7 +56,8 @@ def tune(
             "--vary",
             metavar="NAME=VALUES",
             help="What is varied: 'lr=1e-3,5e-4', 'lr={low=1e-4, high=1e-2, log=true}', or a grid: `paper`, or a "
-            "file's path. Default: the options that models and algorithms name for tuning.",
+            "file's path; or settings to be tried first, 'lr=.002 buffer=10000' or preset=FILE.toml. Default: the "
+            "options that models and algorithms name for tuning.",
         ),
     ] = None,
     sampler: Annotated[
@@ -64,19 +65,19 @@ def tune(
         typer.Option(
             "--sampler",
             metavar="NAME",
-            help="Successive halving (`halving`), all combinations (`grid`), `one-at-a-time`, `random` or Optuna's "
-            "`tpe`, with `trials` and `seed`: 'random trials=50', 'halving trials=16' (per varied option). Default: "
-            "halving, or all combinations of a --vary.",
+            help="Until the expected regret is small (`bayesian`), all combinations (`grid`), `one-at-a-time`, "
+            "`random` or Optuna's `tpe`, with `trials` and `seed`: 'random trials=50', 'bayesian regret=.03 "
+            "trials=50' (per varied option). Default: bayesian, or all combinations of a --vary.",
         ),
     ] = None,
     seeds: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--seeds",
-            help="Runs of each trial (halving: of each in the last rung), numbered from 1,000,000: protocol seeds "
-            "stay unseen.",
+            help="Runs of each trial, numbered from 1,000,000: protocol seeds stay unseen. Default: 20; bayesian: 4, "
+            "and 4 more in each further trial of the same settings.",
         ),
-    ] = "20",
+    ] = None,
     epochs: Annotated[
         int | None,
         typer.Option("--epochs", min=1, help="Epochs of each trial; default: the task's protocol."),
@@ -94,8 +95,8 @@ def tune(
         typer.Option(
             "--budget",
             metavar="TIME",
-            help="Time for all trials, 30min or 8h: one that would take longer is not begun. For halving, 2core-hours: "
-            "as many settings as that holds, for each entry.",
+            help="Time for all trials, 30min or 8h: one that would take longer is not begun. For bayesian, "
+            "2core-hours: as many trials as that holds, for each entry.",
         ),
     ] = None,
     out: Annotated[
@@ -149,7 +150,9 @@ def tune(
 
 
 def _require_few(searches: Sequence[Search]) -> None:
-    planned = sum(each.planned for each in searches)
+    planned = sum(
+        each.planned for each in searches if each.request.sampler != "bayesian"
+    )  # which ends by itself
     if planned > LARGE:
         raise OptionError(
             f"{planned} trials are many: --yes starts them all, --budget 2h as many as that holds, "

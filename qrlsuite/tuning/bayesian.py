@@ -1,0 +1,352 @@
+"""The search that says how good its settings are: it goes on until the expected regret is small, or the budget ends.
+
+Settings are chosen by `qrlsuite.tuning.surrogate`. First come the untuned setting, those given by hand, and a few that
+are spread over the ranges (a Halton sequence); then, twelve at a time, those that may be the best, new or tried before.
+Each time they are trained on seeds that no setting had before, to the whole horizon: poor settings get fewer seeds, and
+never fewer epochs, which would favor settings that begin fast.
+
+Regret is how much longer than at the best settings learning takes at the chosen ones. Several models that are searched
+until the same regret are compared fairly, though one may need more trials than another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from qrlsuite import notation
+from qrlsuite.errors import OptionError
+from qrlsuite.experiment import preset
+from qrlsuite.experiment.entry import resolve
+from qrlsuite.results.seeds import format_seeds
+from qrlsuite.results.text import counted
+from qrlsuite.tuning import space, surrogate
+from qrlsuite.tuning.objective import Merit
+from qrlsuite.tuning.search import Proposal, Search, Train, Trial
+from qrlsuite.tuning.space import Dimension, Point, Range
+
+PER_OPTION = 40
+"""Trials for each varied option, at most, unless told otherwise."""
+
+
+class Bayesian(Search):
+    """One search; see the module.
+
+    Attributes
+    ----------
+    searched:
+        The ranges as far as they were extended, by option.
+    taken:
+        Settings that were given by hand and have no option that is not varied, as they were given.
+    """
+
+    def _begin(self) -> None:
+        request = self.request
+        untuned = self._space(request.grid is None)
+        own = space.base(untuned, self.base)
+        self.space = tuple(
+            d
+            if d.range is not None or own[d.name] in d.values
+            else replace(d, values=(own[d.name], *d.values))
+            for d in untuned
+        )
+        self.searched = {d.name: d.range for d in self.space if d.range is not None}
+        first, *_ = seeds = request.seeds
+        if list(seeds) != list(range(first, first + len(seeds))):
+            raise OptionError(
+                f"--seeds {format_seeds(seeds)}: it takes seeds one after the other, such as --seeds {len(seeds)}"
+            )
+        free = self._free
+        self._coarse = {d.name for d in self.space if not free.issuperset(d.name.split("+"))}
+        self.taken = self._given()
+        given = {self._place(point).tobytes(): point for point in (own, *self.taken.values())}
+        self._exact = given
+        self._climb = surrogate.Climb(
+            [np.frombuffer(place) for place in given],
+            snap=lambda place: self._place(self._point(place)),
+            encode=self._encode,
+            extends=self._extends,
+            seed=request.sampler_seed,
+        )
+        self._latest: dict[int, Trial] = {}
+        self._steps = self._proposals()
+        self._next = next(self._steps)
+        self._tried_now: list[Trial | None] = []
+
+    def _given(self) -> dict[str, Point]:
+        points = {}
+        for row in self.request.rows:
+            try:
+                own = notation.parse_entry(f"{self.request.entry} {row}")
+                entry = resolve(self.request.task, own.given(settings=self.request.settings))
+                point = space.base(self.space, entry)
+                self._place(point)
+            except OptionError:
+                continue
+            if self._entry(point).hash == entry.hash:
+                points[row] = point
+        return points
+
+    def _point(self, place: surrogate.Floats) -> Point:
+        """Return the settings nearest to a place."""
+        exact = self._exact.get(place.tobytes())
+        return exact or {d.name: self._value(d, float(at)) for d, at in zip(self.space, place)}
+
+    def _value(self, dimension: Dimension, place: float) -> Any:
+        """Return an option's value: of a list the nearest, of a range a number of three digits.
+
+        Options in which agents of one population cannot differ go in steps of a factor of two, so that settings often
+        share a population.
+        """
+        ends = dimension.range
+        if ends is None:
+            count = len(dimension.values)
+            return dimension.values[min(max(int(place * count), 0), count - 1)]
+        if ends.log and dimension.name in self._coarse:
+            octave = math.log(2) / math.log(ends.high / ends.low)
+            place = round(place / octave) * octave
+        return value(ends, place)
+
+    def _place(self, point: Point) -> surrogate.Floats:
+        places = []
+        for d in self.space:
+            if d.range is not None:
+                places.append(place_of(d.range, point[d.name]))
+            elif point[d.name] in d.values:
+                places.append((d.values.index(point[d.name]) + 0.5) / len(d.values))
+            else:
+                raise OptionError(f"{d.name}: {point[d.name]!r} is missing in the list of values")
+        return np.array(places)
+
+    def _encode(self, place: surrogate.Floats) -> surrogate.Floats:
+        """Return places; of lists of other things than numbers, a number for each value, far from all others."""
+        numbers: list[float] = []
+        for d, at in zip(self.space, place):
+            if d.range is not None or all(isinstance(v, int | float) for v in d.values):
+                numbers.append(float(at))
+            else:
+                numbers += [float(v == self._value(d, float(at))) for v in d.values]
+        return np.array(numbers)
+
+    def _extends(self, d: int, low: float, high: float) -> bool:
+        """Extend a range, where the option admits it."""
+        dimension = self.space[d]
+        if dimension.range is None:
+            return False
+        further = Range(
+            low=value(dimension.range, low), high=value(dimension.range, high), log=dimension.range.log
+        )
+        if not space.admits(self.base, replace(dimension, range=further)):
+            return False
+        self.searched[dimension.name] = further
+        return True
+
+    @property
+    def planned(self) -> int:
+        """How many trials there are to be, at most; settings that get more seeds count again."""
+        pace = self._pace
+        if self.request.core_hours is not None and self.request.trials is None and pace:
+            return max(self.asked, int(3600 * self.request.core_hours / (pace * len(self.request.seeds))))
+        return (self.request.trials or PER_OPTION) * len(self.space)
+
+    @property
+    def _pace(self) -> float:
+        """Core-seconds of a run, by those so far; 0 before any."""
+        return self.core_seconds / self.runs_done if self.runs_done else 0.0
+
+    @property
+    def budget_text(self) -> str:
+        """Say what the search is allowed, in words that are equal for models with equal budgets."""
+        goal = f"expected regret {self.request.regret:.0%}"
+        if self._climb.regret is not None and self.regret_reached:
+            return goal
+        if self.request.core_hours is not None:
+            return f"{goal}, or {self.request.core_hours:g} core-hours"
+        return f"{goal}, or {counted(self.request.trials or PER_OPTION, 'trial')} per option"
+
+    @property
+    def plan_text(self) -> str:
+        """Say until when settings are tried."""
+        count, seeds = len(self.space), counted(len(self.request.seeds), "seed")
+        return (
+            f"{counted(count, 'option')}, until {self.budget_text}: at most {self.planned} trials of {seeds}"
+        )
+
+    @property
+    def regret_reached(self) -> bool:
+        """Whether the expected regret is small enough, and nothing speaks against the chosen settings."""
+        regret = self._climb.regret
+        return (
+            regret is not None
+            and regret.expected <= self.request.regret
+            and not (self._climb.moved or self.behind)
+        )
+
+    @property
+    def behind(self) -> bool:
+        """Whether the untuned settings were measured to be better than the chosen ones."""
+        untuned, best = self._latest.get(0), self.best
+        return untuned is not None and best is not None and untuned.merit.signal < best.merit.signal
+
+    @property
+    def over(self) -> bool:
+        """Whether no further trial is begun: the regret or the budget is reached, or some wait for others."""
+        return not self._next
+
+    @property
+    def beside(self) -> int:
+        """How many settings can be trained side by side in one population."""
+        return 1 if self._coarse else surrogate.BATCH
+
+    @property
+    def presentable(self) -> bool:
+        """Whether a regret is known, and no trial waits."""
+        return self._climb.regret is not None and not self.pending
+
+    def step(self, train: Train, most: int = 1) -> list[Trial | None]:
+        """Run the next trials, `most` at a time where they do not depend on each other, else fewer.
+
+        Returns
+        -------
+        list
+            A trial is None where some of its runs are left to another process or a queue.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C, with everything saved.
+        QrlSuiteError
+            If a trial cannot be run.
+        """
+        if not self._next:
+            raise RuntimeError("the search is over")
+        trials = self._try(self._next[:most], train)
+        self._next = self._next[most:]
+        self._tried_now += trials
+        if not self._next:
+            tried, self._tried_now = self._tried_now, []
+            self._next = next(self._steps) if None not in tried else []
+        return trials
+
+    def _proposals(self) -> Generator[list[Proposal], None, None]:
+        """Propose trials that do not depend on each other, until nothing more is to be tried."""
+        first, each, last = self.request.seeds[0], len(self.request.seeds), 0
+        while (wanted := self._climb.next()) and self._allowed(wanted):
+            seeds = tuple(range(first + last * each, first + (last + 1) * each))
+            yield [
+                Proposal(number, self._point(self._climb.tried[number]), seeds, last, self._seen(number))
+                for number in wanted
+            ]
+            self._latest |= {trial.number: trial for trial in self.trials}
+            latest = [*self._latest.values()]
+            self._climb.tell(
+                [trial.number for trial in latest],
+                np.array([max(trial.merit.signal, 1.0) for trial in latest]),
+                np.array([trial.spread for trial in latest]),
+                np.array([len(trial.seeds) for trial in latest], np.float64),
+            )
+            last += 1
+        yield []
+
+    def _seen(self, number: int) -> tuple[int, ...]:
+        return self._latest[number].seeds if number in self._latest else ()
+
+    def _allowed(self, wanted: Sequence[int]) -> bool:
+        """Tell whether the search goes on: the regret is not small enough yet, and the budget holds these trials."""
+        if self.regret_reached:
+            return False
+        spent, hours = self.core_seconds, self.request.core_hours
+        if hours is not None and spent + self._pace * len(wanted) * len(self.request.seeds) > 3600 * hours:
+            return self.asked == 0
+        limited = hours is None or self.request.trials is not None
+        return not limited or self.asked + len(wanted) <= self.planned or self.asked == 0
+
+    def _spread(self, curves: surrogate.Floats, worth: Callable[[surrogate.Floats], Merit]) -> float:
+        """Return the jackknife's standard deviation of a run, in units of the mean."""
+        count = len(curves)
+        if count == 1:
+            return 0.0
+        without = np.array([worth(np.delete(curves, i, axis=0)).signal for i in range(count)])
+        deviation = math.sqrt((count - 1) * float(np.square(without - without.mean()).sum()))
+        return deviation / max(float(without.mean()), 1.0)
+
+    @property
+    def ordered(self) -> list[Trial]:
+        """The settings from best to worst by the surrogate, each on all its seeds; those of this round last."""
+        known = [self._latest[number] for number in self._climb.order if number in self._latest]
+        return known or sorted(self.trials, key=lambda trial: (trial.merit.order, trial.number))
+
+    @property
+    def at_edge(self) -> list[str]:
+        """Options of which nothing was tried beyond the best value."""
+        edges = self._climb.edges([*self._latest]) if self._latest else []
+        return [self.space[d].name for d, _ in edges if self.space[d].range is not None]
+
+    @property
+    def regret_text(self) -> str:
+        """Say how good the chosen settings are, and what speaks against them; empty before anything is known."""
+        regret = self._climb.regret
+        if regret is None:
+            return ""
+        edges = ", ".join(name.partition(".")[2] for name in self.at_edge)
+        return "; ".join(
+            [
+                f"expected regret {regret.expected:.1%} (90 percent interval {regret.low:.1%} to {regret.high:.1%}), "
+                f"within {surrogate.NEAR:.0%} of the best with probability {regret.near:.0%}",
+                *([f"nothing was tried beyond the best {edges}"] if edges else []),
+                *(["the untuned settings were measured to be better"] if self.behind else []),
+            ]
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values: settings from best to worst, and the regret."""
+        regret = self._how()["regret"]
+        return {**super().as_dict(), "regret": None if regret is None else regret.model_dump()}
+
+    def _how(self) -> dict[str, Any]:
+        """Return what the record says of how settings were chosen."""
+        regret = self._climb.regret
+        return {
+            "trials": len(self.trials),
+            "planned": self.planned,
+            "space": {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space},
+            "budget": self.budget_text,
+            "regret": None
+            if regret is None
+            else preset.RegretRecord(
+                goal=self.request.regret,
+                expected=regret.expected,
+                low=regret.low,
+                high=regret.high,
+                near=regret.near,
+            ),
+            "note": self.regret_text,
+        }
+
+    def _sampler_key(self) -> list[Any]:
+        return [self.request.sampler, self.request.sampler_seed, list(self.request.rows)]
+
+    @property
+    def _warning(self) -> str:
+        said = f"First row: {self.regret_text}" if self.regret_text else "No regret is known yet"
+        return f"{said}. Rows are ordered by the surrogate, which knows all trials"
+
+
+def value(ends: Range, place: float) -> float:
+    """Return the number at a place of a range, 0 at its low end and 1 at its high one, with three digits."""
+    low, high = (math.log(ends.low), math.log(ends.high)) if ends.log else (ends.low, ends.high)
+    number = low + place * (high - low)
+    number = math.exp(number) if ends.log else number
+    return round(number) if ends.integer else float(f"{number:.3g}")
+
+
+def place_of(ends: Range, number: float) -> float:
+    """Undo `value`; outside of [0, 1] for numbers outside of the range."""
+    if ends.log and number <= 0:
+        return -math.inf
+    low, high, at = (math.log(x) if ends.log else x for x in (ends.low, ends.high, number))
+    return (at - low) / (high - low)
