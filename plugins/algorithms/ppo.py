@@ -308,7 +308,7 @@ class PPO:
         clip: Any = options.clip
         self.clip: tuple[Any, Any] = (1.0 - clip, 1.0 + clip)
         if isinstance(clip, Tensor):  # each agent's own, (S, 1)
-            self.clip = tuple(end.to(device, torch.float32)[:, None] for end in self.clip)  # type: ignore[assignment]
+            self.clip = tuple(end.to(device, torch.float32)[:, None] for end in self.clip)
         if isinstance(self.policy, Gaussian):
             self.spread_adam = Adam(self.policy, options.lr, options.quantum_lr)
             self.adams.append(self.spread_adam)

@@ -236,6 +236,8 @@ class Bayesian(Search):
         """Propose trials that do not depend on each other, until nothing more is to be tried."""
         first, each, last = self.request.seeds[0], len(self.request.seeds), 0
         while (wanted := self._climb.next()) and self._allowed(wanted):
+            if self.behind and 0 not in wanted:  # untuned settings that had luck get further seeds
+                wanted = [*wanted[:-1], 0]
             seeds = tuple(range(first + last * each, first + (last + 1) * each))
             yield [
                 Proposal(number, self._point(self._climb.tried[number]), seeds, last, self._seen(number))
@@ -312,7 +314,7 @@ class Bayesian(Search):
         regret = self._climb.regret
         return {
             "trials": len(self.trials),
-            "planned": self.planned,
+            "planned": self.planned if self.request.core_hours is None else None,
             "space": {d.name: replace(d, range=self.searched.get(d.name)).plain() for d in self.space},
             "budget": self.budget_text,
             "regret": None

@@ -15,7 +15,7 @@ from qrlsuite.engine.where import Where
 from qrlsuite.engine.work import Missing
 from qrlsuite.results import speed
 from qrlsuite.results.seeds import LARGEST_GROUP
-from qrlsuite.results.text import counted, duration, duration_range, hours_range, steps_text
+from qrlsuite.results.text import counted, duration, duration_range, hours_range, hours_text, steps_text
 from qrlsuite.tuning.objective import cell_text
 from qrlsuite.tuning.search import Search, Trial, merit_text
 from qrlsuite.tuning.space import text
@@ -141,11 +141,12 @@ class TuneDisplay:
         )
 
     def regret(self, search: Search) -> None:
-        """Show how good the best settings are, where that is known and has changed."""
+        """Show how good the best settings are and what that took, where it is known and has changed."""
         said = f"{search.base.label}: {search.regret_text}"
         if search.regret_text and said not in self._said:
             self._said.add(said)
-            self.console.print(said, markup=False, soft_wrap=True)
+            spent = f"{search.runs_done} runs, {hours_text(search.core_seconds / 3600)} core-hours"
+            self.console.print(f"{said} ({spent})", markup=False, soft_wrap=True)
 
     def close(self) -> None:
         """Take the live bar away."""
