@@ -116,16 +116,6 @@ def test_rounds_bring_seeds_that_no_setting_had_until_the_regret_is_small(
     assert little.budget_text == "expected regret 5%, or 4 trials per option"
 
 
-def test_untuned_settings_that_had_luck_are_trained_again(tiny_task: str, tmp_path: Path) -> None:
-    def speed(entry: Entry, seed: int) -> float:
-        lucky = entry.algorithm_options.lr == 5e-4 and seed < 1_000_002
-        return 1.0 if lucky else near(2e-2, 1.5)(entry, seed)
-
-    found = finish(Bayesian(request(tiny_task, trials=60), tmp_path), Recorder(tmp_path / "tuning", speed))
-    assert len([trial for trial in found.trials if trial.number == 0]) > 1
-    assert not found.behind
-
-
 def test_a_range_is_extended_while_the_best_lies_at_its_end(tiny_task: str, tmp_path: Path) -> None:
     found = finish(
         Bayesian(request(tiny_task, trials=60), tmp_path), Recorder(tmp_path / "tuning", near(0.05))
