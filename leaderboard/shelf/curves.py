@@ -452,11 +452,13 @@ _TOLERANCE = 1e-6  # a mean of scores in [0, 1] may leave it by rounding
 
 
 def _tuned_text(tuning: Mapping[str, Any]) -> str:
-    """Say how much was tuned, as far as it is known: `tuned (24 trials, 32 seeds)`."""
+    """Say how much was tuned, as far as it is known: `tuned (24 trials, 32 seeds, regret 5%)`."""
     known = [counted(int(tuning["trials"]), "trial")] if tuning.get("trials") is not None else []
     if isinstance(tuning.get("seeds"), str):
         with contextlib.suppress(OptionError):  # text of another suite, which a record may hold
             known.append(counted(len(parse_seeds(tuning["seeds"])), "seed"))
+    if tuning.get("regret") is not None:
+        known.append(f"regret {tuning['regret']['expected']:.0%}")
     changed = [name.partition(".")[2] for name in tuning.get("changed") or ()]
     text = f"tuned ({', '.join(known)})" if known else "tuned"
     return f"{text} but {', '.join(changed)}" if changed else text

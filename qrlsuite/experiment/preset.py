@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from qrlsuite import files, options
 from qrlsuite.errors import OptionError
@@ -70,6 +70,12 @@ class TuningRecord(options.Table):
         Field(description="chosen on seeds that entries are judged by; always so where `seeds` has some"),
     ] = False
 
+    @model_serializer(mode="wrap")
+    def _without_regret(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `regret` out where it is not known: hashes of older studies cover records without it."""
+        content: dict[str, Any] = write(self)
+        return {name: value for name, value in content.items() if (name, value) != ("regret", None)}
+
     @model_validator(mode="before")
     @classmethod
     def _mark(cls, data: Any) -> Any:
@@ -91,7 +97,7 @@ class EntryTuning(TuningRecord):
 
     def plain(self) -> dict[str, Any]:
         """Return what `entry.json` stores."""
-        unknown = {name for name in ("runs", "budget", "rungs", "regret") if getattr(self, name) is None}
+        unknown = {name for name in ("runs", "budget", "rungs") if getattr(self, name) is None}
         return self.model_dump(mode="json", exclude=unknown)  # 0.1.0 reads records without these keys only
 
 

@@ -71,6 +71,7 @@ class Bayesian(Search):
             encode=self._encode,
             extends=self._extends,
             seed=request.sampler_seed,
+            shared=[i for i, d in enumerate(self.space) if d.name in self._coarse],
         )
         self._latest: dict[int, Trial] = {}
         self._steps = self._proposals()

@@ -109,6 +109,8 @@ class Climb:
         Tells whether option d may go on beyond its range, `low` and `high` in places.
     seed:
         Of everything that is drawn.
+    shared:
+        Options in which each `DESIGN` places that come first are alike: they are cheaper together.
 
     Attributes
     ----------
@@ -131,6 +133,7 @@ class Climb:
         encode: Callable[[Floats], Floats] = lambda place: place,
         extends: Callable[[int, float, float], bool] = lambda d, low, high: True,
         seed: int = 0,
+        shared: Sequence[int] = (),
     ) -> None:
         self._snap, self._encode, self._extends, self._seed = snap, encode, extends, seed
         self.low, self.high = np.zeros(len(given[0])), np.ones(len(given[0]))
@@ -141,6 +144,8 @@ class Climb:
         self._rounds = 0
         self._wanted: list[int] = []
         spread = self._halton(DESIGN * len(self.low))
+        own = [*shared]
+        spread[:, own] = spread[np.arange(len(spread)) // DESIGN * DESIGN][:, own]
         self._first = [place for place in (*given, *spread) if self._add(place) is not None]
         self._first_left = list(range(len(self.tried)))
 

@@ -17,6 +17,7 @@ from qrlsuite import options
 from qrlsuite.engine.budget import Budget
 from qrlsuite.errors import OptionError, PluginError
 from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.leaderboard.shelf.curves import _tuned_text
 from qrlsuite.options import Tuned, parse_setting
 from qrlsuite.results.store import FORMAT_VERSION, EntryStore, table_bytes
 from qrlsuite.tuning import bayesian, runner, search, space, surrogate
@@ -177,7 +178,9 @@ def test_with_real_training_two_models_are_searched_until_the_same_regret(
         entry = resolve(tiny_task, each.base.model.name, preset=str(each.path))
         assert entry.hash == each.best.entry.hash
         assert entry.tuning is not None
-        assert entry.tuning["regret"]["goal"] == 0.05
+        said = entry.tuning["regret"]
+        assert said["goal"] == 0.05
+        assert _tuned_text(entry.tuning).endswith(f"regret {said['expected']:.0%})")
         assert EntryStore.create(tmp_path / "runs", entry).record()["tuning"] == entry.tuning
 
 
@@ -218,6 +221,8 @@ def test_lists_and_steps_of_two(tiny_task: str, tmp_path: Path) -> None:
     assert tried <= {500 * 2**k for k in range(-3, 9)}
     assert len(tried) > 2
     assert found.beside == 1
+    first = [(t.point["model.activation"], t.point["algorithm.buffer"]) for t in found.trials[:9]]
+    assert len(set(first)) == 3, "the untuned settings, and two populations of four"
 
 
 @pytest.mark.parametrize(
