@@ -247,6 +247,17 @@ def test_outcomes_are_those_of_kraus_operators() -> None:
         for k, (state, basis) in enumerate(product(states, paulis)):
             rho = sum(each @ np.outer(state, state.conj()) @ each.conj().T for each in kraus)
             assert row[k] == pytest.approx((1 + np.trace(rho @ basis).real) / 2)
+    lanes = ChannelLanes(ChannelOptions(steps=3), 500)
+    lanes.autoreset = False
+    lanes.reset(seed=0)
+    returns = lanes.step(np.full(500, 2))[1] + lanes.step(np.full(500, 6))[1]
+    likelihood = np.prod(np.stack([1 - lanes.plus, lanes.plus], -1) ** lanes.counts[:, None], (2, 3))
+    np.testing.assert_allclose(lanes.believed, likelihood / likelihood.sum(1, keepdims=True))
+    names = np.arange(500) % 5
+    _, rewards, _, _, infos = lanes.step(12 + names)
+    believed = lanes.believed[np.arange(500), names]
+    np.testing.assert_allclose(returns + rewards, believed - 0.2, atol=1e-12)
+    assert infos["final_info"]["score"].mean() == pytest.approx(believed.mean(), abs=0.1), "5 standard errors"
     informed, in_turn = (
         scores(ChannelLanes(ChannelOptions(), 400), policy) for policy in (Informative, InTurn)
     )

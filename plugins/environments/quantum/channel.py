@@ -80,12 +80,14 @@ class Channel(Drawn):
 
     ## Observation Space
 
-    `Box(0, 1, (25,), float32)`: for each experiment how often +1 and how often -1 was measured, divided by `steps`;
-    then the part of the steps that is over. Nothing else that was seen says more about the channel.
+    `Box(-1, 1, (25,), float32)`: for each experiment the mean outcome, 0 where it was not made, and how often it was
+    made, divided by `steps`; then the part of the steps that is over. Nothing else that was seen says more.
 
     ## Rewards
 
-    1 for the right name, else 0.
+    With p the probability of a channel by Bayes' rule, after what was measured: an experiment earns by how much the
+    highest p rises; a name earns its p less the highest, and an end without a name 0 less the highest. So a return is
+    the probability that the name is right, less 1/5.
 
     ## Episode End
 
@@ -119,7 +121,7 @@ class Channel(Drawn):
 
     def moment(self) -> FloatArray:
         """Return the probability of each channel after what was measured, (5,)."""
-        believed: FloatArray = self.lanes.posterior()[0]
+        believed: FloatArray = self.lanes.believed[0].copy()
         return believed
 
     def figure(self) -> Figure:
@@ -149,30 +151,30 @@ class ChannelLanes(QuantumLanes):
         The channel, and the one that was named, -1 where none was yet, (L,).
     counts:
         How often -1 and +1 were measured, (L, 12, 2).
+    believed:
+        How probable each channel is after that, by Bayes' rule, (L, 5).
     """
 
     name = "channel"
 
     def __init__(self, options: ChannelOptions, num_envs: int) -> None:
-        observation = Box(0.0, 1.0, (2 * len(EXPERIMENTS) + 1,), np.float32)
+        observation = Box(-1.0, 1.0, (2 * len(EXPERIMENTS) + 1,), np.float32)
         super().__init__(options, num_envs, observation, Discrete(len(EXPERIMENTS) + len(CHANNELS)))
         self.plus = probabilities(options.strength)
         self.kind = np.zeros(num_envs, np.int64)
         self.named = np.full(num_envs, -1, np.int64)
         self.counts = np.zeros((num_envs, len(EXPERIMENTS), 2), np.int64)
+        self.believed = np.full((num_envs, len(CHANNELS)), 1 / len(CHANNELS))
         self._luck = np.zeros((num_envs, options.steps))
 
-    def posterior(self) -> FloatArray:
-        """Return how probable each channel is after what was measured, by Bayes' rule, (L, 5)."""
-        likelihood = np.ones((self.num_envs, len(CHANNELS)))
-        for k in range(len(EXPERIMENTS)):
-            for outcome, chance in enumerate((1.0 - self.plus[:, k], self.plus[:, k])):
-                likelihood *= chance ** self.counts[:, k, outcome, None]
-        result: FloatArray = likelihood / likelihood.sum(1, keepdims=True)
-        return result
-
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {"kind": self.kind, "named": self.named, "counts": self.counts, "luck": self._luck}
+        return {
+            "kind": self.kind,
+            "named": self.named,
+            "counts": self.counts,
+            "believed": self.believed,
+            "luck": self._luck,
+        }
 
     def _draw(self, stream: np.random.Generator, count: int) -> FloatArray:
         return stream.random((count, 1 + self.options.steps))
@@ -180,20 +182,29 @@ class ChannelLanes(QuantumLanes):
     def _begin(self, lanes: NDArray[np.intp], drawn: FloatArray) -> None:
         self.kind[lanes] = (drawn[:, 0] * len(CHANNELS)).astype(np.int64)
         self._luck[lanes] = drawn[:, 1:]
-        self.named[lanes], self.counts[lanes] = -1, 0
+        self.named[lanes], self.counts[lanes], self.believed[lanes] = -1, 0, 1 / len(CHANNELS)
 
     def _act(self, actions: NDArray[Any], running: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.bool_]]:
         names = actions >= len(EXPERIMENTS)
+        before = self.believed.max(1)
         tried = np.flatnonzero(running & ~names)
-        chance = self.plus[self.kind[tried], actions[tried]]
-        outcome = self._luck[tried, self.step_count[tried] - 1] < chance
+        plus = self.plus[:, actions[tried]].T
+        luck = self._luck[tried, self.step_count[tried] - 1]
+        outcome = luck < plus[np.arange(len(tried)), self.kind[tried]]
         self.counts[tried, actions[tried], outcome.astype(np.int64)] += 1
-        self.named = np.where(running & names, actions - len(EXPERIMENTS), self.named)
-        return self._scores(), names
+        likely = self.believed[tried] * np.where(outcome[:, None], plus, 1.0 - plus)
+        self.believed[tried] = likely / likely.sum(1, keepdims=True)
+        self.named[running & names] = actions[running & names] - len(EXPERIMENTS)
+        named = np.where(self.named < 0, 0.0, self.believed[np.arange(self.num_envs), self.named])
+        ends = names | (self.step_count >= self.options.steps)
+        return np.where(ends, named, self.believed.max(1)) - before, names
 
     def _seen(self) -> NDArray[np.float32]:
-        parts = self.counts[:, :, ::-1].reshape(self.num_envs, -1), self.step_count
-        seen: NDArray[np.float32] = (np.column_stack(parts) / self.options.steps).astype(np.float32)
+        made = self.counts.sum(2)
+        means = (self.counts[:, :, 1] - self.counts[:, :, 0]) / np.maximum(made, 1)
+        pairs = np.stack([means, made / self.options.steps], axis=2).reshape(self.num_envs, -1)
+        over = self.step_count / self.options.steps
+        seen: NDArray[np.float32] = np.column_stack([pairs, over]).astype(np.float32)
         return seen
 
     def _scores(self) -> FloatArray:
@@ -207,6 +218,7 @@ class ChannelLanes(QuantumLanes):
             and np.isin(state["named"], (-1, *kinds)).all()
             and state["counts"].min() >= 0
             and (state["counts"].sum((1, 2)) <= state["step"]).all()
+            and np.allclose(state["believed"].sum(1), 1)
             and ((state["luck"] >= 0) & (state["luck"] < 1)).all()
         )
 
@@ -225,7 +237,7 @@ class Informative:
 
     def __call__(self, observations: NDArray[np.float32]) -> IntArray:
         """Return actions (L,)."""
-        believed = self.envs.posterior()
+        believed = self.envs.believed
         last = self.envs.step_count >= self.envs.options.steps - 1
         named = len(EXPERIMENTS) + believed.argmax(1)
         result: IntArray = np.where(last, named, self.experiments(believed)).astype(np.int64)
