@@ -53,7 +53,7 @@ def test_the_core_hours_are_the_boards() -> None:
     ("first", "second", "sentence"),
     [
         ("mlp width=16 lr=0.002", "vqc-native qubits=6", "beats the 6-qubit circuit ({} of 49 cells)"),
-        ("mlp width=16 lr=0.002", "vqc-native qubits=8", "and the 8-qubit one ({} cell)"),
+        ("mlp width=16 lr=0.002", "vqc-native qubits=8", "and the 8-qubit one ({} cells)"),
         ("vqc-native qubits=10", "mlp width=16 lr=0.002", "but loses to 10 qubits ({} cells)"),
         ("vqc-native qubits=12", "mlp width=16 lr=0.002", "and to 12 ({} cells)."),
     ],
@@ -75,6 +75,6 @@ def test_the_two_halves_of_the_seeds() -> None:
         assert comparison.count(Verdict.LOSS) == 0
         return comparison.count(Verdict.WIN)
 
-    assert ahead(slice(0, 50)) == 0
-    sentence = f"on seeds 50 to 99 the circuit is ahead in {ahead(slice(50, 100))} cells"
+    first, second = ahead(slice(0, 50)), ahead(slice(50, 100))
+    sentence = f"the 10-qubit circuit is ahead in {first} cell; on seeds 50 to 99 the circuit is ahead in {second} cells"
     assert sentence in BOARD.replace("\n", " ")
