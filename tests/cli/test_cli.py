@@ -413,8 +413,10 @@ def test_show_says_how_a_published_entry_was_made() -> None:
     name = ("show", "cartpole/reinforce mlp", "--published")
     shown = answer(*name)
     assert (shown["seeds"], shown["parameters"]["classical"]) == (100, 114)
-    assert shown["provenance"][0]["versions"]["qrlsuite"] == "0.1.0"
-    assert answer(*name, "--identity")["seeds"] == {"0:100": ["not recorded"]}
+    assert shown["provenance"][0]["versions"]["qrlsuite"] == "0.1.1"
+    assert answer("show", "ppo mlp width=64", "--published", "--identity")["seeds"] == {
+        "0:20": ["not recorded"]
+    }
 
 
 def test_version_and_help() -> None:

@@ -261,7 +261,7 @@ def test_agents_play_another_task_as_that_tasks_own_would(folder: Path, tmp_path
         (["mlp", "--task", "cartpol"], "did you mean 'cartpole'"),
         (["mlp", "--perturb", "-1"], "give a relative size"),
         (["mlp", "--perturb", "nan"], "give a relative size"),
-        (["beam6g/ddqn mlp width=16", "--published"], "is published as curves without agents"),
+        (["beam6g/ddqn mlp width=256", "--published"], "is published as curves without agents"),
     ],
 )  # fmt: skip
 def test_what_agents_cannot_play_is_said_in_one_line(
