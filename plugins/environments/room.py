@@ -7,15 +7,13 @@ from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.actions import check_actions
-from qrlsuite.environment import LaneEnv, OneLane, State, batched_spaces, endings, require_state
+from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane
 from qrlsuite.errors import StoreError
 
 ID = "qrlsuite/Room-v1"
@@ -120,7 +118,7 @@ class Room(OneLane):
         return self.lanes.picture()
 
 
-class RoomLanes(LaneEnv):
+class RoomLanes(EpisodeLanes):
     """Vector form of `Room` with same-step autoreset; see there for spaces and rewards.
 
     Observations are flat, (L, channels * height * width). An episode begins with three uniform numbers of the lane's
@@ -134,105 +132,54 @@ class RoomLanes(LaneEnv):
         Number of lanes L, at least 1.
     """
 
+    name = "room"
+    cut = True
+
     def __init__(self, options: RoomOptions, num_envs: int) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
-        self.options = options
         side = options.sight if options.view == "own" else options.size
         self.unflattened_space = Box(0.0, 1.0, (2 if options.view == "own" else 6, side, side), np.float32)
         count = int(np.prod(self.unflattened_space.shape))
-        batched_spaces(self, Box(0.0, 1.0, (count,), np.float32), Discrete(3), num_envs)
-        self.streams = []
+        super().__init__(options, num_envs, Box(0.0, 1.0, (count,), np.float32), Discrete(3))
         self._lane = np.arange(num_envs)
         self._agent = np.ones((num_envs, 3), np.int64)
         """x, y and direction."""
         self._goal = np.ones((num_envs, 2), np.int64)
-        self._step = np.zeros(num_envs, np.int64)
         self._best = np.ones(num_envs, np.int64)
         """Steps of the shortest way."""
-        self._ended = np.zeros(num_envs, np.bool_)
-        self._begun = False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin a new episode in every lane; returns observations (L, n) and an empty dictionary."""
-        if seed is not None or not self.streams:
-            self.seed_from(seed)
-        self._begin(self._lane)
-        self._begun = True
-        return self._observations(), {}
-
-    def step(
-        self, actions: NDArray[np.int64]
-    ) -> tuple[
-        NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:
-        """Turn or walk, `actions` (L,).
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        gymnasium.error.InvalidAction
-            If an action is not in 0..2.
-        """
-        if not self._begun:
-            raise ResetNeeded("call reset() before step()")
-        actions = np.asarray(actions)
-        check_actions(actions, self.num_envs, 3)
-        running, steps = ~self._ended, self.options.steps
+    def _act(
+        self, actions: NDArray[np.int64], running: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Turn or walk; `step_count` already has this step."""
         ahead = self._agent[:, :2] + FORWARD[self._agent[:, 2]]
         free = ((ahead > 0) & (ahead < self.options.size - 1)).all(1) & (actions == AHEAD) & running
         self._agent[free, :2] = ahead[free]
         turn = np.where(actions == LEFT, 3, np.where(actions == RIGHT, 1, 0)) * running
         self._agent[:, 2] = (self._agent[:, 2] + turn) % 4
-        self._step += running
-        terminated = (self._agent[:, :2] == self._goal).all(1) & running
-        truncated = (self._step >= steps) & running & ~terminated
-        rewards = np.where(terminated, 1.0 - 0.9 * self._step / steps, 0.0)
-        seen, done = self._observations(), terminated | truncated
-        infos: dict[str, Any] = {}
-        if done.any():
-            infos = endings(done, seen, score=rewards / (1.0 - 0.9 * np.minimum(self._best, steps) / steps))
-            self._ended |= done
-            if self.autoreset:
-                self._begin(np.flatnonzero(done))
-                seen = self._observations()
-        return seen, rewards, terminated, truncated, infos
+        return self._rewards(), self._found()
 
-    def state_dict(self) -> State:
-        """Return the episodes' state, lane-first: `agent` (L, 3), `goal` (L, 2), `step`, `best` and `ended` (L,).
+    def _found(self) -> NDArray[np.bool_]:
+        """Return which agents stand on the goal (L,)."""
+        found: NDArray[np.bool_] = (self._agent[:, :2] == self._goal).all(1)
+        return found
 
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            If there was no reset.
-        """
-        if not self._begun:
-            raise ResetNeeded("call reset() before state_dict()")
-        return {name: value.copy() for name, value in self._state().items()}
+    def _rewards(self) -> NDArray[np.float64]:
+        """Return what agents get where they stand, (L,)."""
+        return np.where(self._found(), 1.0 - 0.9 * self.step_count / self.options.steps, 0.0)
 
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue where `state_dict` was taken; states may be sliced and joined along the lanes.
+    def _scores(self) -> NDArray[np.float64]:
+        """Return the reward over that of the shortest way."""
+        steps = self.options.steps
+        scores: NDArray[np.float64] = self._rewards() / (1.0 - 0.9 * np.minimum(self._best, steps) / steps)
+        return scores
 
-        Raises
-        ------
-        qrlsuite.errors.StoreError
-            If an array is missing, has another shape, or stands outside the room; nothing is changed then.
-        """
-        known = self._state()
-        require_state("room", state, {name: value.shape for name, value in known.items()})
+    def _possible(self, state: Mapping[str, NDArray[Any]]) -> bool:
+        """Refuse agents and goals outside the room."""
         places = np.concatenate([state["agent"][:, :2], state["goal"]])
-        if (
-            places.min() < 1
-            or places.max() > self.options.size - 2
-            or not np.isin(state["agent"][:, 2], range(4)).all()
-        ):
+        inside = places.min() >= 1 and places.max() <= self.options.size - 2
+        if not inside or not np.isin(state["agent"][:, 2], range(4)).all():
             raise StoreError(f"room: an agent or a goal stands outside the room of side {self.options.size}")
-        for name, value in known.items():
-            value[...] = state[name]
-        self._begun = True
+        return True
 
     def ways(self, lanes: NDArray[np.intp]) -> NDArray[np.int64]:
         """Return the steps of the shortest way to the goal from where the agents of `lanes` are, (n,)."""
@@ -266,29 +213,20 @@ class RoomLanes(LaneEnv):
         ] = (0, 114, 178)
         return image
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {
-            "agent": self._agent,
-            "goal": self._goal,
-            "step": self._step,
-            "best": self._best,
-            "ended": self._ended,
-        }
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"agent": self._agent, "goal": self._goal, "best": self._best}
 
-    def _begin(self, lanes: NDArray[np.intp]) -> None:
+    def _draw(self, stream: np.random.Generator, count: int) -> NDArray[np.float64]:
+        return stream.random((count, 3))
+
+    def _begin(self, lanes: NDArray[np.intp], drawn: NDArray[np.float64]) -> None:
         """Put `lanes` (ascending) at the beginning of new episodes."""
-        owners, counts = np.unique(lanes // (self.num_envs // len(self.streams)), return_counts=True)
-        numbers = np.concatenate(
-            [self.streams[owner].random((count, 3)) for owner, count in zip(owners.tolist(), counts.tolist())]
-        )
         side = self.options.size - 2
         cells = side * side
-        agent, goal, direction = (numbers * (cells, cells - 1, 4)).astype(np.int64).T
+        agent, goal, direction = (drawn * (cells, cells - 1, 4)).astype(np.int64).T
         goal += goal >= agent  # any other cell
         self._agent[lanes] = np.stack([1 + agent % side, 1 + agent // side, direction], axis=1)
         self._goal[lanes] = np.stack([1 + goal % side, 1 + goal // side], axis=1)
-        self._step[lanes] = 0
-        self._ended[lanes] = False
         self._best[lanes] = self.ways(lanes)
 
     def _seen_cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -300,7 +238,7 @@ class RoomLanes(LaneEnv):
         dx, dy = FORWARD[direction, 0], FORWARD[direction, 1]
         return x + forward * dx - side * dy, y + forward * dy + side * dx
 
-    def _observations(self) -> NDArray[np.float32]:
+    def _seen(self) -> NDArray[np.float32]:
         """Return what every lane sees (L, n), a new array."""
         assert self.unflattened_space is not None
         seen = np.zeros((self.num_envs, *(self.unflattened_space.shape or ())), np.float32)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from qrlsuite.actions import draw
+from qrlsuite.environment import EpisodeLanes
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.plugins.environments.quantum import channel, clifford, episode, pulse, vqe
 from qrlsuite.plugins.environments.quantum.channel import (
@@ -29,7 +30,7 @@ from qrlsuite.plugins.environments.quantum.clifford import (
     GreedyCircuit,
     ShortestCircuit,
 )
-from qrlsuite.plugins.environments.quantum.lanes import Drawn, QuantumLanes, pauli
+from qrlsuite.plugins.environments.quantum.lanes import Drawn, pauli
 from qrlsuite.plugins.environments.quantum.pulse import (
     BestPulse,
     GreedyPulse,
@@ -53,7 +54,7 @@ each = pytest.mark.parametrize(
 )
 
 
-def scores(lanes: QuantumLanes, policy: Any = None, seed: int = 0) -> NDArray[np.float64]:
+def scores(lanes: EpisodeLanes, policy: Any = None, seed: int = 0) -> NDArray[np.float64]:
     """Return the scores of one episode in every lane; without a policy, of random actions."""
     lanes.autoreset = False
     seen, _ = lanes.reset(seed=seed)

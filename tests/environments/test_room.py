@@ -28,16 +28,16 @@ def placed(agent: tuple[int, int, int], goal: tuple[int, int], **options: Any) -
 
 def test_what_an_agent_sees_by_itself() -> None:
     """In the left upper corner, turned down: the wall is at its right hand, and the goal two cells ahead."""
-    wall, goal = placed((1, 1, 1), (1, 3))._observations().reshape(2, 3, 3)
+    wall, goal = placed((1, 1, 1), (1, 3))._seen().reshape(2, 3, 3)
     assert wall.tolist() == [[0, 0, 1], [0, 0, 1], [0, 0, 1]]
     assert goal.tolist() == [[0, 1, 0], [0, 0, 0], [0, 0, 0]]
-    wall, goal = placed((3, 2, 0), (3, 1))._observations().reshape(2, 3, 3)
+    wall, goal = placed((3, 2, 0), (3, 1))._seen().reshape(2, 3, 3)
     assert wall.tolist() == [[1, 1, 1], [1, 1, 1], [0, 0, 0]], "a wall ahead, and what is behind it"
     assert goal.tolist() == [[0, 0, 0], [0, 0, 0], [1, 0, 0]], "at its left hand"
 
 
 def test_the_whole_room() -> None:
-    seen = placed((2, 3, 3), (1, 1), view="whole")._observations().reshape(6, 5, 5)
+    seen = placed((2, 3, 3), (1, 1), view="whole")._seen().reshape(6, 5, 5)
     assert seen[0].sum() == 16
     assert seen[1].tolist()[1] == [0, 1, 0, 0, 0]
     assert [int(seen[channel].sum()) for channel in range(2, 6)] == [0, 0, 0, 1]

@@ -13,9 +13,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv
 from qrlsuite.plugins.environments.quantum import pictures
-from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes
+from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -133,7 +133,7 @@ class Channel(Drawn):
         )
 
 
-class ChannelLanes(QuantumLanes):
+class ChannelLanes(EpisodeLanes):
     """Vector form of `Channel`; see there for spaces and rewards.
 
     An episode begins with uniform numbers of the lane's stream: one for the channel, and one for each outcome.

@@ -14,10 +14,10 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
-from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes
+from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -163,7 +163,7 @@ class Clifford(Drawn):
         return pictures.clifford(circuit, self.shown[-1], options.qubits, options.steps)
 
 
-class CliffordLanes(QuantumLanes):
+class CliffordLanes(EpisodeLanes):
     """Vector form of `Clifford`; see there for spaces and rewards.
 
     Parameters

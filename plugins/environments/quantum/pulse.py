@@ -14,14 +14,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv
 from qrlsuite.errors import OptionError
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.lanes import (
     ComplexArray,
     Drawn,
     FloatArray,
-    QuantumLanes,
     pauli,
     words,
 )
@@ -208,7 +207,7 @@ class Pulse(Drawn):
         )
 
 
-class PulseLanes(QuantumLanes):
+class PulseLanes(EpisodeLanes):
     """Vector form of `Pulse`; see there for spaces and rewards.
 
     Parameters

@@ -14,10 +14,10 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from qrlsuite import options as option_words
-from qrlsuite.environment import LaneEnv
+from qrlsuite.environment import EpisodeLanes, LaneEnv
 from qrlsuite.plugins.environments.quantum import pictures
 from qrlsuite.plugins.environments.quantum.compiled import optimize
-from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, QuantumLanes, pauli
+from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, pauli
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -183,7 +183,7 @@ class VQE(Drawn):
         return pictures.vqe(names, angles, self.shown, lanes.options, title, float(lanes.gap[lanes.which[0]]))
 
 
-class VQELanes(QuantumLanes):
+class VQELanes(EpisodeLanes):
     """Vector form of `VQE`; see there for spaces and rewards.
 
     Parameters
