@@ -241,13 +241,13 @@ class Bayesian(Search):
                 wanted = [*wanted[:-1], 0]
             seeds = tuple(range(first + last * each, first + (last + 1) * each))
             yield [
-                Proposal(number, self._point(self._climb.tried[number]), seeds, last, self._seen(number))
+                Proposal(number + 1, self._point(self._climb.tried[number]), seeds, last, self._seen(number))
                 for number in wanted
             ]
-            self._latest |= {trial.number: trial for trial in self.trials}
+            self._latest |= {trial.number - 1: trial for trial in self.trials}
             latest = [*self._latest.values()]
             self._climb.tell(
-                [trial.number for trial in latest],
+                [*self._latest],
                 np.array([max(trial.merit.signal, 1.0) for trial in latest]),
                 np.array([trial.spread for trial in latest]),
                 np.array([len(trial.seeds) for trial in latest], np.float64),
