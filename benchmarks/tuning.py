@@ -188,9 +188,10 @@ def main() -> None:
         )
     ended = results[:, -1, -2:]
     ended = ended[~np.isnan(ended[:, 0])]
+    at, error = ended[:, 1].mean(), ended[:, 1].std() / math.sqrt(len(ended))
+    print(f"{len(ended) / count:.0%} of today's searches state {REGRET:.0%} or less by then,")
     print(
-        f"{len(ended) / count:.0%} of today's searches state {REGRET:.0%} before, first after {ended[:, 0].mean():.0f} runs on average; "
-        f"their real regret is then {ended[:, 1].mean():.1%} +- {ended[:, 1].std() / math.sqrt(len(ended)):.1%}"
+        f"first after {ended[:, 0].mean():.0f} runs on average; their real regret is then {at:.1%} +- {error:.1%}"
     )
     print(f"{time.monotonic() - begin:.0f} s")
 
