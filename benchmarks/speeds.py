@@ -12,6 +12,7 @@ entries, and this machine's calibration beside them.
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import tempfile
 import tomllib
@@ -87,7 +88,7 @@ def _seconds(entry: Entry, seeds: int, epochs: int) -> float:
 
 def written(row: Row) -> str:
     """Return a row as TOML."""
-    options = ", ".join(f"{name} = {value}" for name, value in row["options"].items())
+    options = ", ".join(f"{name} = {json.dumps(value)}" for name, value in row["options"].items())
     names = "".join(f'{name} = "{row[name]}"\n' for name in ("environment", "algorithm", "model"))
     numbers = "".join(f"{name} = {row[name]}\n" for name in ("seconds", "group", "alone") if name in row)
     source = f'source = "{row["source"]}"\n' if "source" in row else ""

@@ -134,7 +134,7 @@ def board(
     --------
     >>> found = board("beam6g", runs="none-yet", published=True, entries=["mlp width=64", "mlp width=16"])
     >>> [(row.rank_text, row.entry.label) for row in found.sections[0].times.rows]
-    [('1-2', 'ddqn mlp width=64'), ('11', 'ddqn mlp width=16')]
+    [('2', 'ddqn mlp width=64'), ('11', 'ddqn mlp width=16')]
     >>> names = ["vqc-native qubits=6", "mlp width=16"]
     >>> found = board("beam6g", by="executions", runs="none-yet", published=True, entries=names)
     >>> [(row.entry.label, row.price.problem) for row in found.sections[0].rows]
@@ -259,7 +259,7 @@ def compare(
     --------
     >>> found = compare("mlp width=64", "mlp width=16", task="beam6g", runs="none-yet", published=True)
     >>> found.verdict
-    'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 57%, 100 seeds each, p < .0001)'
+    'mlp width=64 needs 53% fewer steps than mlp width=16 (50% to 56%, 100 seeds each, p < .0001)'
     """
 
     def find(entry: str | EntryResults, beside: str | EntryResults) -> EntryResults:

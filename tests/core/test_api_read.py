@@ -114,7 +114,7 @@ def test_results_show_themselves(small: EntryResults, large: EntryResults) -> No
     comparison = api.compare(large, small)
     for shown in (board._repr_html_(), printed(board), repr(board), str(board)):
         assert "beam6g, ddqn, 200k steps" in shown
-        assert "42.5k (40.6k to 44.5k)" in shown
+        assert "42.6k (40.8k to 44.4k)" in shown
         assert "1 of 1 pair of 2 entries decided" in shown, (
             "entries that were read are compared by themselves"
         )

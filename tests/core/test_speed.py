@@ -120,16 +120,20 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
     }
     known = Speeds(references=[replace(row, calibration=None) for row in speed.load(path)])
     found = [file for folder in published.folders() for file in folder.glob("*/*/entry.json")]
-    assert len(found) >= 37
+    checked = 0
     for file in found:
         record = json.loads(file.read_text())
         if {provenance.device_kind(made) for made in record["published"]["provenance"]} != {"cpu"}:
             continue  # hours of a GPU are no core-hours
         entry = from_record(record, str(file))
         hours = record["published"]
+        if any(made.get("numerics", {}).get("model", 1) != entry.model.numerics for made in hours["provenance"]):
+            continue  # trained by other code
+        checked += 1
         seconds = hours["core_hours"] * 3600 / hours["seeds"] / hours["epochs"]
         low, high = known.estimate(entry, min(hours["seeds"], 50)).range(1) or (0.0, 0.0)
         assert low <= seconds <= high, (record["label"], seconds, low, high)
+    assert checked >= 37
 
 
 def test_the_median_of_an_entrys_epochs_is_measured(train: Train, tmp_path: Path) -> None:

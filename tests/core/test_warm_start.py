@@ -180,7 +180,7 @@ def test_workers_without_a_shared_folder_and_the_probe_begin_alike(root: Path) -
         (["mlp width=8", "--from", "tiny/mlp"], "does not fit the entry's model: 'w0' is float32 of shape"),
         (["vqc-native qubits=3", "--from", "tiny/mlp"], "does not fit the entry's model: it has no"),
         (["mlp width=16", "--from", "nothing"], "no entry 'nothing'"),
-        (["mlp width=16", "--from", "beam6g/ddqn mlp width=16"], "curves without agents"),
+        (["mlp width=16", "--from", "beam6g/ddqn mlp width=256"], "curves without agents"),
     ],
 )
 def test_what_is_refused_is_said_in_one_line_and_trains_nothing(
