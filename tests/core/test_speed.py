@@ -127,7 +127,9 @@ def test_the_reference_speeds_agree_with_the_hours_of_published_entries() -> Non
             continue  # hours of a GPU are no core-hours
         entry = from_record(record, str(file))
         hours = record["published"]
-        if any(made.get("numerics", {}).get("model", 1) != entry.model.numerics for made in hours["provenance"]):
+        if any(
+            made.get("numerics", {}).get("model", 1) != entry.model.numerics for made in hours["provenance"]
+        ):
             continue  # trained by other code
         checked += 1
         seconds = hours["core_hours"] * 3600 / hours["seeds"] / hours["epochs"]
