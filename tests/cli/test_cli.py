@@ -302,7 +302,7 @@ tune mlp --task tiny.toml --sampler 'random trial=3' => did you mean 'trials'
 study run fig66 => unknown study 'fig66'; did you mean 'fig6'
 study run gone.toml => study file gone.toml cannot be read
 study run fig6 --budget soon => write 90s, 30min, 8h
-study run fig6 --budget 1s => cannot hold one group
+study run fig6 --budget 0.2s => cannot hold one group
 study run fig6 --engine lokal => did you mean 'local'
 study run fig6 --seeds a:b => write a number (100)
 study run fig6 --partition x => --partition is gone: --engine 'slurm partition=gpu
