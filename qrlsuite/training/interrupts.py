@@ -13,6 +13,9 @@ from typing import Any
 class Interruptible:
     """While entered, SIGINT and SIGTERM raise KeyboardInterrupt, inside `deferred()` only at its end.
 
+    Where other code swallows the exception, a finalizer or a compiled call, the end of the next `deferred()` raises it
+    again.
+
     Outside the main thread, where signals cannot be handled, it changes nothing.
     """
 
@@ -36,9 +39,8 @@ class Interruptible:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._deferring:
-            self._pending = True
-        else:
+        self._pending = True
+        if not self._deferring:
             raise KeyboardInterrupt
 
     @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
@@ -14,6 +15,7 @@ from qrlsuite.results import checkpoint
 from qrlsuite.results.claims import claims
 from qrlsuite.results.store import EntryStore
 from qrlsuite.training import group
+from qrlsuite.training.interrupts import Interruptible
 from qrlsuite.training.trainer import Trainer
 from tests.commands import Command, start_worker
 from tests.conftest import HANGS, Train, most_epochs, results
@@ -125,3 +127,13 @@ def test_sigterm_saves_and_exits_130(train: Train) -> None:
     assert process.wait(HANGS) == 130
     assert checkpoint.headers(EntryStore(entry))[0].epoch >= 3
     assert not list((entry / "claims").glob("*.json"))
+
+
+def test_an_interruption_that_other_code_swallows_is_raised_at_the_end_of_the_next_deferred_block() -> None:
+    with Interruptible() as guard:
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt), guard.deferred():
+            pass
+        with guard.deferred():
+            pass
