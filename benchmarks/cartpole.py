@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from qrlsuite.environment import LaneEnv
 from qrlsuite.gymlanes import GymLanes
-from qrlsuite.plugins.environments.cartpole import CartPoleOptions, make_vector
+from qrlsuite.plugins.environments.cartpole import CartPoleLanes, CartPoleOptions
 
 GROUP = 10
 Play = Callable[[NDArray[np.int64]], None]
@@ -78,8 +78,10 @@ def main() -> None:
         "Gymnasium's own vector": lambda count: vector(
             gymnasium.make_vec("CartPole-v1", count, vectorization_mode="vector_entry_point")
         ),
-        "CartPole in lanes": lambda count: vector(make_vector(CartPoleOptions(), count)),
-        "the same, arctan": lambda count: vector(make_vector(CartPoleOptions(normalization="arctan"), count)),
+        "CartPole in lanes": lambda count: vector(CartPoleLanes(CartPoleOptions(), count)),
+        "the same, arctan": lambda count: vector(
+            CartPoleLanes(CartPoleOptions(normalization="arctan"), count)
+        ),
     }
     print(f"{'':24}{'lanes':>8}{'us/round':>12}{'ns/step':>10}{'steps/s':>14}{'ratio':>8}")
     for count in arguments.lanes:

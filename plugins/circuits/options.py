@@ -9,6 +9,9 @@ from pydantic.dataclasses import dataclass
 
 from qrlsuite.options import Since
 
+NOISE_FACTORS = (1, 3, 5)
+"""How many times the noise is there where it is extrapolated to zero: circuits are folded."""
+
 DiffMethod = Literal["auto", "backprop", "adjoint", "parameter-shift"]
 
 

@@ -29,7 +29,7 @@ from qrlsuite.circuit.angles import AngleTable
 from qrlsuite.circuit.description import Circuit, Operation
 from qrlsuite.circuit.shifts import measured, shift_rule
 from qrlsuite.errors import OptionError, nearest
-from qrlsuite.plugins.circuits.options import PennyLaneOptions
+from qrlsuite.plugins.circuits.options import NOISE_FACTORS, PennyLaneOptions
 
 BACKPROP = "default.qubit"
 """The device through which torch can differentiate.
@@ -62,9 +62,6 @@ SIMULATORS = (
     "qsim",
 )
 """Words in the names of devices that only simulate; any other device is taken for hardware."""
-
-NOISE_FACTORS = (1, 3, 5)
-"""How many times the noise is there where it is extrapolated to zero: the circuit is folded."""
 
 PACKAGES = {
     "braket": "'qrlsuite[braket]'",

@@ -34,8 +34,8 @@ from qrlsuite.circuit.elementary import Elementary
 from qrlsuite.circuit.shifts import measured, random_signs, shift_rule, spsa_rule, stream
 from qrlsuite.errors import OptionError, nearest
 from qrlsuite.plugins.circuits.native import NativeBackend
-from qrlsuite.plugins.circuits.options import QiskitOptions
-from qrlsuite.plugins.circuits.runtime import NOISE_FACTORS, Runtime, fake_device, open_device
+from qrlsuite.plugins.circuits.options import NOISE_FACTORS, QiskitOptions
+from qrlsuite.plugins.circuits.runtime import Runtime, fake_device, open_device
 
 DENSITY_QUBITS = 12
 """Qubits up to which noise is simulated exactly, as a density matrix; beyond, shots are needed."""

@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrlsuite.errors import OptionError
-from qrlsuite.plugins.circuits.options import QiskitOptions
-
-NOISE_FACTORS = (1, 3, 5)
-"""How many times the noise is there where it is extrapolated to zero: gates are followed by their inverses."""
+from qrlsuite.plugins.circuits.options import NOISE_FACTORS, QiskitOptions
 
 
 class Runtime:

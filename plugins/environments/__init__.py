@@ -58,7 +58,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_BEAM6G}.angle:AngleOptions",
             gymnasium_id="qrlsuite/BeamAngle-v1",
             entry_point=f"{_BEAM6G}.angle:BeamAngle",
-            vector=f"{_BEAM6G}.angle:make_vector",
+            vector=f"{_BEAM6G}.angle:AngleLanes",
             policies={
                 "optimal": f"{_BEAM6G}.angle:BestAngle",
                 "same angle": f"{_BEAM6G}.angle:SameAngle",
@@ -73,7 +73,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_HERE}.room:RoomOptions",
             gymnasium_id="qrlsuite/Room-v1",
             entry_point=f"{_HERE}.room:Room",
-            vector=f"{_HERE}.room:make_vector",
+            vector=f"{_HERE}.room:RoomLanes",
             policies={"shortest way": f"{_HERE}.room:ShortestWay"},
             views=("view", "sight"),
         )
@@ -85,7 +85,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_HERE}.cartpole:CartPoleOptions",
             gymnasium_id="qrlsuite/CartPole-v1",
             entry_point=f"{_HERE}.cartpole:CartPole",
-            vector=f"{_HERE}.cartpole:make_vector",
+            vector=f"{_HERE}.cartpole:CartPoleLanes",
         )
     )
     register(
@@ -104,7 +104,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_QUANTUM}.pulse:PulseOptions",
             gymnasium_id="qrlsuite/Pulse-v1",
             entry_point=f"{_QUANTUM}.pulse:Pulse",
-            vector=f"{_QUANTUM}.pulse:make_vector",
+            vector=f"{_QUANTUM}.pulse:PulseLanes",
             pictures=(_EPISODE,),
             policies={"best pulse": f"{_QUANTUM}.pulse:BestPulse", "greedy": f"{_QUANTUM}.pulse:GreedyPulse"},
         )
@@ -116,7 +116,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_QUANTUM}.clifford:CliffordOptions",
             gymnasium_id="qrlsuite/Clifford-v1",
             entry_point=f"{_QUANTUM}.clifford:Clifford",
-            vector=f"{_QUANTUM}.clifford:make_vector",
+            vector=f"{_QUANTUM}.clifford:CliffordLanes",
             pictures=(_EPISODE,),
             policies={
                 "shortest circuit": f"{_QUANTUM}.clifford:ShortestCircuit",
@@ -131,7 +131,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_QUANTUM}.vqe:VQEOptions",
             gymnasium_id="qrlsuite/VQE-v1",
             entry_point=f"{_QUANTUM}.vqe:VQE",
-            vector=f"{_QUANTUM}.vqe:make_vector",
+            vector=f"{_QUANTUM}.vqe:VQELanes",
             pictures=(_EPISODE,),
             policies={"best circuit": f"{_QUANTUM}.vqe:BestCircuit", "greedy": f"{_QUANTUM}.vqe:GreedyGate"},
         )
@@ -143,7 +143,7 @@ def register_environments(register: Callable[[EnvironmentSpec], None]) -> None:
             options=f"{_QUANTUM}.channel:ChannelOptions",
             gymnasium_id="qrlsuite/Channel-v1",
             entry_point=f"{_QUANTUM}.channel:Channel",
-            vector=f"{_QUANTUM}.channel:make_vector",
+            vector=f"{_QUANTUM}.channel:ChannelLanes",
             pictures=(_EPISODE,),
             policies={
                 "most informative": f"{_QUANTUM}.channel:Informative",

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import gymnasium
 import numpy as np
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from gymnasium.error import ResetNeeded
@@ -24,8 +23,6 @@ from qrlsuite.compiled.cache import rounded
 from qrlsuite.environment import LaneEnv, State, batched_spaces, require_state
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.normalization import KIND, Kind, Normalization
-
-ID = "qrlsuite/CartPole-v1"
 
 GRAVITY = 9.8  # m/s^2
 POLE_MASS = 0.1  # kg
@@ -370,17 +367,3 @@ def parse(values: Mapping[str, Any]) -> CartPoleOptions:
     """
     options: CartPoleOptions = option_words.build(CartPoleOptions, values, "environment 'cartpole'")
     return options
-
-
-def make_vector(options: CartPoleOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return CartPoleLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/CartPole-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.cartpole:CartPole")
-
-
-register()

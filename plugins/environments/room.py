@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from qrlsuite import options as option_words
 from qrlsuite.environment import EpisodeLanes, LaneEnv, OneLane
 from qrlsuite.errors import StoreError
 
-ID = "qrlsuite/Room-v1"
 FORWARD = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 """(x, y) of a step in each direction, clockwise: to the right, down, left, up."""
 LEFT, RIGHT, AHEAD = range(3)
@@ -272,17 +270,3 @@ class ShortestWay:
         right = (offset * FORWARD[(direction + 1) % 4]).sum(1)
         actions: NDArray[np.int64] = np.where(ahead > 0, AHEAD, np.where(right >= 0, RIGHT, LEFT))
         return actions
-
-
-def make_vector(options: RoomOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return RoomLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/Room-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.room:Room")
-
-
-register()

@@ -14,7 +14,6 @@ from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.plugins.environments.cartpole import (
     FORCE,
     GRAVITY,
-    ID,
     LENGTH,
     POLE_MASS,
     TAU,
@@ -183,7 +182,7 @@ def test_normalizations() -> None:
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*infinity:UserWarning")  # as Gymnasium's own
 @pytest.mark.parametrize("normalization", ["none", "bounds", "arctan"])
 def test_the_single_environment_passes_gymnasiums_check_and_agrees(normalization: Any) -> None:
-    env = gymnasium.make(ID, normalization=normalization, steps=15)
+    env = gymnasium.make("qrlsuite/CartPole-v1", normalization=normalization, steps=15)
     check_env(env.unwrapped, skip_render_check=True)
     vector = lanes(1, normalization=normalization, steps=15)
     expected, _ = env.reset(seed=3)
@@ -203,7 +202,7 @@ def test_running_statistics_are_asked_for_in_lanes_and_refused_alone() -> None:
     assert lanes(1, normalization="running").running_statistics
     assert not lanes(1, normalization="arctan").running_statistics
     with pytest.raises(OptionError, match=r"belong to an agent.*gymnasium.wrappers.NormalizeObservation"):
-        gymnasium.make(ID, normalization="running")
+        gymnasium.make("qrlsuite/CartPole-v1", normalization="running")
 
 
 @pytest.mark.parametrize(

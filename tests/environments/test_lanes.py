@@ -17,7 +17,7 @@ from tests.environments.strangers import HERE
 
 MADE: dict[str, Callable[[int], LaneEnv]] = {
     "beam6g": lambda count: beam6g.make_vector(beam6g.BeamOptions(steps=12), count),
-    "cartpole": lambda count: cartpole.make_vector(cartpole.CartPoleOptions(), count),
+    "cartpole": lambda count: cartpole.CartPoleLanes(cartpole.CartPoleOptions(), count),
     "gym": lambda count: GymLanes(f"{HERE}:Walk-v0", count),
 }
 HIGHEST = {"beam6g": 2, "cartpole": 1, "gym": 2}

@@ -287,4 +287,6 @@ def test_states_that_cannot_be(env: Drawn) -> None:
 
 
 def test_registered_by_import() -> None:
-    assert {each.ID for each in (channel, clifford, pulse, vqe)} <= set(gymnasium.registry)
+    assert {f"qrlsuite/{name}-v1" for name in ("Channel", "Clifford", "Pulse", "VQE")} <= set(
+        gymnasium.registry
+    )

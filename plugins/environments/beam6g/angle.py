@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
@@ -20,8 +19,6 @@ from qrlsuite.errors import StoreError
 from qrlsuite.plugins.environments.beam6g import trajectory
 from qrlsuite.plugins.environments.beam6g.options import checked
 from qrlsuite.plugins.environments.beam6g.physics import Antenna, FloatArray, offsets, physics
-
-ID = "qrlsuite/BeamAngle-v1"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -313,17 +310,3 @@ class SameAngle:
             return np.zeros((len(observations), 1), np.float32)
         angles: NDArray[np.float32] = np.clip(observations[:, -2:-1] * np.float32(np.pi), 0, self._high)
         return angles
-
-
-def make_vector(options: AngleOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return AngleLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/BeamAngle-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.beam6g.angle:BeamAngle")
-
-
-register()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ID = "qrlsuite/Channel-v1"
 IntArray = NDArray[np.int64]
 CHANNELS = ("bit flip", "bit-phase flip", "phase flip", "depolarizing", "amplitude damping")
 INPUTS: dict[str, tuple[int, int, int]] = {"0": (0, 0, 1), "1": (0, 0, -1), "+": (1, 0, 0), "+i": (0, 1, 0)}
@@ -265,17 +263,3 @@ def _entropy(plus: FloatArray) -> FloatArray:
     p = np.stack([plus, 1.0 - plus])
     result: FloatArray = -(p * np.log(np.maximum(p, 1e-300))).sum(0)
     return result
-
-
-def make_vector(options: ChannelOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return ChannelLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/Channel-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.quantum.channel:Channel")
-
-
-register()

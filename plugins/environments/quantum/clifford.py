@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ID = "qrlsuite/Clifford-v1"
 Coupling = Literal["line", "ring", "all"]
 Gate = tuple[str, tuple[int, ...]]
 IntArray = NDArray[np.int64]
@@ -309,17 +307,3 @@ class GreedyCircuit:
         wrong = (after != np.eye(after.shape[-1])).sum((2, 3))
         best: IntArray = np.argmin(wrong, axis=1).astype(np.int64)
         return best
-
-
-def make_vector(options: CliffordOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return CliffordLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/Clifford-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.quantum.clifford:Clifford")
-
-
-register()

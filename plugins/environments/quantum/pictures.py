@@ -22,6 +22,7 @@ def figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
     made = Figure(figsize=(width, height), dpi=100, facecolor="white", layout="constrained")
+    made.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr, call-arg]
     FigureCanvasAgg(made)
     return made
 
@@ -66,7 +67,7 @@ def pulse(
     times = np.arange(steps + 1) * (options.duration / steps)
     for q in range(qubits):
         values = [each[q] for each in fields]
-        name = f"field {q}" if qubits > 1 else "field"
+        name = f"field {q} / strength" if qubits > 1 else "field / strength"
         below.stairs(values, times[: len(values) + 1], color=COLORS[q], lw=1.4, label=name)
     below.plot(times[: len(fidelity)], fidelity, ".-", color=COLORS[2], lw=1, label="fidelity")
     below.set(xlim=(0, times[-1]), ylim=(-0.05, 1.05))

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
@@ -28,7 +27,6 @@ from qrlsuite.plugins.environments.quantum.lanes import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ID = "qrlsuite/Pulse-v1"
 EXHAUSTED = 4096
 """Most pulses of half an episode that `BestPulse` goes through, for all pulses of an episode."""
 STARTS = 100
@@ -465,17 +463,3 @@ def _infidelity(envs: PulseLanes, lane: int, fields: FloatArray) -> tuple[float,
     turned = back[:, None] @ (scale * envs.controls) @ vectors[:, None]
     slopes = 2.0 * np.einsum("kba,kab,kqab->kq", inner, divided, turned).real
     return 1.0 - float(envs.fidelity(states[-1][None])[0]), -slopes.reshape(-1)
-
-
-def make_vector(options: PulseOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return PulseLanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/Pulse-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.quantum.pulse:Pulse")
-
-
-register()

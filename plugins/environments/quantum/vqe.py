@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from qrlsuite.plugins.environments.quantum.lanes import Drawn, FloatArray, pauli
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ID = "qrlsuite/VQE-v1"
 IntArray = NDArray[np.int64]
 SWEEPS = 3
 """Passes over all angles after every gate."""
@@ -346,17 +344,3 @@ def _searched(options: VQEOptions) -> IntArray:
             )
         plan.append(gates[int(np.argmin(reached))])
     return np.stack(plan)
-
-
-def make_vector(options: VQEOptions, num_envs: int) -> LaneEnv:
-    """Return the vector environment of `options` with `num_envs` lanes."""
-    return VQELanes(options, num_envs)
-
-
-def register() -> None:
-    """Register `qrlsuite/VQE-v1` with Gymnasium; a second call does nothing."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point="qrlsuite.plugins.environments.quantum.vqe:VQE")
-
-
-register()
