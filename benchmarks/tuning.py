@@ -69,17 +69,28 @@ class Surface:
         return math.exp(float(self(place[None])[0]) - self.least) - 1
 
 
-def climb(surface: Surface, untuned: Floats, runs: Sequence[int], seed: int) -> list[list[float]]:
+def climb(
+    surface: Surface, untuned: Floats, runs: Sequence[int], seed: int, shared: int
+) -> list[list[float]]:
     """Return real regret, and expected regret, 5th and 95th percentile and probability of 3 percent as stated.
 
-    Behind them, the runs after which at most 5 percent were stated first, and the real regret then; nan before that.
+    Behind them, populations for each place so far; the runs after which at most 5 percent were stated first, and the
+    real regret then; nan before that. The first `shared` options have six values, and places that differ in them train
+    apart.
     """
-    search = Climb([untuned], seed=seed)
+
+    def snap(place: Floats) -> Floats:
+        return np.concatenate([np.round(5 * place[:shared]) / 5, place[shared:]])
+
+    search = Climb([snap(untuned)], snap, seed=seed, shared=range(shared))
+    populations, visits = 0, 0
     found: dict[int, Floats] = {}
     results = []
     first = [math.nan, math.nan]
     for most in runs:
         while sum(map(len, found.values())) + VISIT * len(wanted := search.next()) <= most:
+            visits += len(wanted)
+            populations += len({search.tried[number][:shared].tobytes() for number in wanted})
             for number in wanted:
                 drawn = surface.runs(search.tried[number], VISIT)
                 found[number] = np.concatenate([found.get(number, np.empty(0)), drawn])
@@ -96,7 +107,7 @@ def climb(surface: Surface, untuned: Floats, runs: Sequence[int], seed: int) -> 
         said = search.regret
         assert said is not None
         real = surface.regret(search.tried[search.best])
-        results.append([real, said.expected, said.low, said.high, said.near, *first])
+        results.append([real, said.expected, said.low, said.high, said.near, populations / visits, *first])
     return results
 
 
@@ -150,11 +161,13 @@ def random(surface: Surface, untuned: Floats, runs: int) -> float:
     return surface.regret(places[int(np.argmin([surface.runs(each, SEEDS).mean() for each in places]))])
 
 
-def repeat(number: int, options: int, runs: Sequence[int], width: float, ripple: float) -> Floats:
-    """Return, (runs, 9): the three searches' regrets, and what today's says of its own."""
+def repeat(
+    number: int, options: int, runs: Sequence[int], width: float, ripple: float, shared: int
+) -> Floats:
+    """Return, (runs, 10): the three searches' regrets, and what today's says of its own."""
     generator = np.random.default_rng([50, number])
     surface, untuned = Surface(options, generator, width, ripple), generator.random(options)
-    mine = climb(surface, untuned, runs, number)
+    mine = climb(surface, untuned, runs, number, shared)
     others = [[random(surface, untuned, most), halving(surface, untuned, most)] for most in runs]
     return np.concatenate([others, mine], axis=1)
 
@@ -166,25 +179,25 @@ def main() -> None:
     parser.add_argument("--runs", type=int, nargs="+", default=[150, 300, 600])
     parser.add_argument("--width", type=float, default=0.8)
     parser.add_argument("--ripple", type=float, default=0.02)
+    parser.add_argument("--shared", type=int, default=0, help="options that take a population of their own")
     arguments = parser.parse_args()
     begin = time.monotonic()
     with concurrent.futures.ProcessPoolExecutor(os.cpu_count()) as pool:
         count = arguments.repetitions
-        shared = [
-            [each] * count for each in (arguments.options, arguments.runs, arguments.width, arguments.ripple)
-        ]
-        results = np.array(list(pool.map(repeat, range(count), *shared, chunksize=5)))
+        own = arguments.options, arguments.runs, arguments.width, arguments.ripple, arguments.shared
+        results = np.array(list(pool.map(repeat, range(count), *([each] * count for each in own))))
     print(f"{arguments.options} options, {count} surfaces, {BATCH} settings at once on {VISIT} seeds each")
     print(
-        "runs | random | halving | today's | it says | real within its 90 percent | within 3 percent | it says"
+        "runs | random | halving | today's | it says | real within its 90 percent | within 3 percent | it says | "
+        "populations"
     )
     for most, each in zip(arguments.runs, results.transpose(1, 0, 2)):
-        other, old, real, said, low, high, near, *_ = each.T
+        other, old, real, said, low, high, near, populations, *_ = each.T
         error = real.std(ddof=1) / math.sqrt(count)
         inside = np.mean((low <= real + 1e-9) & (real <= high + 1e-9))
         print(
             f"{most} | {other.mean():.1%} | {old.mean():.1%} | {real.mean():.1%} +- {error:.1%} | {said.mean():.1%} | "
-            f"{inside:.0%} | {np.mean(real <= NEAR):.0%} | {near.mean():.0%}"
+            f"{inside:.0%} | {np.mean(real <= NEAR):.0%} | {near.mean():.0%} | {BATCH * populations.mean():.1f}"
         )
     ended = results[:, -1, -2:]
     ended = ended[~np.isnan(ended[:, 0])]

@@ -12,7 +12,9 @@ Draws of f from the posterior answer two questions:
 
 - *Regret*: exp(f(chosen) - min f) - 1 of a draw, the minimum over what was tried and some hundred other places. Its
   mean over draws is the expected regret.
-- *What next*: the places where draws have their minimum (Thompson 1933), whether they were tried before or not.
+- *What next*: the places where draws have their minimum (Thompson 1933), whether they were tried before or not. Where
+  what trains together has to share some options, it is the first few values of these that draws ask for, and then the
+  minima of further draws among places that have them.
 """
 
 from __future__ import annotations
@@ -110,7 +112,8 @@ class Climb:
     seed:
         Of everything that is drawn.
     shared:
-        Options in which each `DESIGN` places that come first are alike: they are cheaper together.
+        Options in which places are cheaper together if they are alike: each `DESIGN` of those that come first are, and
+        later ones have at most `BATCH` / `DESIGN` different values of them at once.
 
     Attributes
     ----------
@@ -144,8 +147,8 @@ class Climb:
         self._rounds = 0
         self._wanted: list[int] = []
         spread = self._halton(DESIGN * len(self.low))
-        own = [*shared]
-        spread[:, own] = spread[np.arange(len(spread)) // DESIGN * DESIGN][:, own]
+        self._shared = [*shared]
+        spread[:, self._shared] = spread[np.arange(len(spread)) // DESIGN * DESIGN][:, self._shared]
         self._first = [place for place in (*given, *spread) if self._add(place) is not None]
         self._first_left = list(range(len(self.tried)))
 
@@ -201,36 +204,56 @@ class Climb:
     def _look(self, numbers: Sequence[int], surrogate: Surrogate, generator: np.random.Generator) -> None:
         """Choose, state the regret, and see which places come next."""
         at_tried = surrogate.means(self._coordinates(numbers))
-        ranked = np.argsort(at_tried, kind="stable")
-        self.order = [numbers[i] for i in ranked]
-        self.best = self.order[0]
-        others = self._others(generator)
-        draws = surrogate.draws(
-            np.concatenate([self._coordinates(numbers), [self._encode(place) for place in others]]), generator
-        )
-        regrets = np.exp(draws[ranked[0]] - draws.min(axis=0)) - 1
+        ranked = [numbers[i] for i in np.argsort(at_tried, kind="stable")]
+        self.order, self.best = ranked, ranked[0]
+        places, draws = self._draws(ranked, self._others(generator), surrogate, generator)
+        regrets = np.exp(draws[0] - draws.min(axis=0)) - 1
         low, high = np.quantile(regrets, (0.05, 0.95))
         self.regret = Regret(float(regrets.mean()), float(low), float(high), float((regrets <= NEAR).mean()))
         self._wanted = []
         if self._first_left:
             return
-        lowest = dict.fromkeys([int(ranked[0]), *map(int, draws.argmin(axis=0))])
-        for i in [*lowest, *map(int, ranked)]:
-            number = numbers[i] if i < len(numbers) else self._add(others[i - len(numbers)])
+        if self._shared:
+            asked = (self._values(places[i]) for i in (0, *draws.argmin(axis=0)))
+            values = [*dict.fromkeys(asked)][: BATCH // DESIGN]
+            ranked = [number for number in ranked if self._values(self.tried[number]) in values]
+            places, draws = self._draws(ranked, self._others(generator, values), surrogate, generator)
+        for i in dict.fromkeys([0, *map(int, draws.argmin(axis=0)), *range(len(ranked))]):
+            number = ranked[i] if i < len(ranked) else self._add(places[i])
             if number is not None and number not in self._wanted:
                 self._wanted.append(number)
             if len(self._wanted) == BATCH:
                 break
 
-    def _others(self, generator: np.random.Generator) -> list[Floats]:
-        """Return places that were not tried, anywhere in the ranges and near the best ones."""
+    def _draws(
+        self,
+        numbers: Sequence[int],
+        others: Sequence[Floats],
+        surrogate: Surrogate,
+        generator: np.random.Generator,
+    ) -> tuple[list[Floats], Floats]:
+        """Return places, those of the numbers first, and the log steps at each in each draw."""
+        places = [*(self.tried[number] for number in numbers), *others]
+        return places, surrogate.draws(np.array([self._encode(place) for place in places]), generator)
+
+    def _values(self, place: Floats) -> tuple[float, ...]:
+        """Return what a place shares with others that are trained with it."""
+        return tuple(np.round(place[self._shared], 9))
+
+    def _others(
+        self, generator: np.random.Generator, values: Sequence[tuple[float, ...]] = ()
+    ) -> list[Floats]:
+        """Return places that were not tried, anywhere in the ranges and near the best ones; with shared values."""
         size = len(self.low)
         anywhere = self.low + (self.high - self.low) * generator.random((_ELSEWHERE, size))
         centers = np.array([self.tried[number] for number in self.order[:_NEARBY]])
         near = centers[np.arange(_ELSEWHERE) % len(centers)]
         widths = np.array(_STEPS)[generator.integers(len(_STEPS), size=(_ELSEWHERE, 1))]
         near = np.clip(near + widths * generator.standard_normal((_ELSEWHERE, size)), self.low, self.high)
-        snapped = [np.asarray(self._snap(place), np.float64) for place in (*anywhere, *near)]
+        both = np.concatenate([anywhere, near])
+        if values:
+            both[:, self._shared] = np.array(values)[generator.integers(len(values), size=len(both))]
+        snapped = [np.asarray(self._snap(place), np.float64) for place in both]
         distinct = {place.tobytes(): place for place in snapped if place.tobytes() not in self._known}
         return list(distinct.values())
 
