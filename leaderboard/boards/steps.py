@@ -6,13 +6,16 @@ a provisional section of their own length.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from qrlsuite.errors import PluginError, QrlSuiteError
-from qrlsuite.experiment.task import ScoreSection
+from qrlsuite.experiment.task import ScoreSection, digest
 from qrlsuite.leaderboard.boards.ranked import (
     Complexity,
     complexity_at,
@@ -131,11 +134,17 @@ class Section:
         """The side of a threshold where a run has not reached it: `below`, or `above`."""
         return self.score.before
 
+    @property
+    def hash(self) -> str:
+        """16 hexadecimal digits of what is ranked: entries with their tasks, seeds and scores, in any order."""
+        return digest([self.horizon, sorted(map(_content, (row.entry for row in self.rows)))])
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         return {
             "task": self.task,
             "horizon": self.horizon,
+            "hash": self.hash,
             "provisional": self.provisional,
             "cell": self.cell,
             "rule": self.rule,
@@ -320,6 +329,11 @@ def untiered_reason(row: Row) -> str:
     if len(row.entry.seeds) < MIN_RUNS:
         return TOO_FEW
     return "undecided: nothing to compare with"
+
+
+def _content(entry: EntryResults) -> list[str]:
+    scores = hashlib.sha256(np.array(entry.seeds, "<i8").tobytes() + entry.curves.astype("<f8").tobytes())
+    return [entry.name, entry.task_hash, scores.hexdigest()]
 
 
 def _row_dict(row: Row) -> dict[str, Any]:

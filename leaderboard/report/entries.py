@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.report.encode import clean, pack, scale, thinned
 from qrlsuite.leaderboard.report.words import ranges
-from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.leaderboard.shelf.curves import EntryResults, registered_task
+from qrlsuite.notation import write_setting
 from qrlsuite.results.text import counted
 
+LONGEST_COMMAND = 1000
 SINGLE_RUNS = 100_000
 """Values of single runs that a page carries at most, all entries together: two bytes each."""
 
@@ -30,6 +34,8 @@ class EntryView:
         The label, with the ansatz where there is one.
     facts:
         What it was made with: (term, description).
+    commands:
+        What repeats it and shows more: (term, command line).
     options:
         (heading, lines), a line being (option, value).
     """
@@ -40,6 +46,7 @@ class EntryView:
     color: int
     legend: str
     facts: tuple[tuple[str, str], ...]
+    commands: tuple[tuple[str, str], ...]
     options: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
 
     @property
@@ -65,6 +72,7 @@ def views(entries: Sequence[EntryResults]) -> list[EntryView]:
                 entry.legend if labels.count((task, label)) == 1 else f"{entry.legend} ({entry.name})"
             ),
             facts=tuple((term, value) for term, value in _facts(entry) if value),
+            commands=tuple((term, clean(line, LONGEST_COMMAND)) for term, line in _commands(entry)),
             options=tuple(_options(entry)),
         )
         for index, (entry, (task, label)) in enumerate(zip(entries, labels))
@@ -78,6 +86,7 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
         ("Algorithm", clean(entry.algorithm)),
         ("Model", clean(entry.model)),
         ("Parameters", f"{classical:,} classical, {quantum:,} quantum{entry.fixed_text}{_networks(entry)}"),
+        ("Agents", f"of {counted(len(entry.agents), 'seed')}" if entry.agents else ""),
         ("Seeds", f"{len(entry.seeds)} ({ranges(entry.seeds)})"),
         ("Unfinished seeds", ranges(entry.left_out)),
         ("Length", f"{counted(entry.curves.shape[1], 'epoch')} of {entry.steps_per_epoch:,} steps"),
@@ -93,6 +102,44 @@ def _facts(entry: EntryResults) -> list[tuple[str, str]]:
         ("Source", _told(entry.source)),
         ("Task definition", clean(entry.task_hash)),
     ]
+
+
+def _commands(entry: EntryResults) -> list[tuple[str, str]]:
+    """Return the command lines that train it, check it, draw its curves and play its agents, where they can be given.
+
+    Of curves that other programs made, and of tasks that are not installed, none is known.
+    """
+    changed = changed_options(entry)
+    if entry.external or entry.plan or changed is None:
+        return []
+    task = [
+        entry.task.partition("+")[0],
+        *(word for each in changed for word in ("--set", f"environment.{each}")),
+    ]
+    published = ["--published"] * (entry.source == "published")
+    named, place = f"{entry.task}/{entry.name}", entry.folder.parts[-4:]
+    lines = [("Train", ["run", entry.label, "--task", *task, "--seeds", str(len(entry.seeds))])]
+    if published and place[0] == "leaderboard":
+        lines.append(("Check", ["verify", "/".join(place), "--rerun", "2"]))
+    lines.append(("Curves", ["plot", "curves", "--task", entry.task, "--entry", entry.name, *published]))
+    if entry.agents or not published:
+        lines.append(("Play", ["play", named, *published]))
+    return [(term, shlex.join(["qrlsuite", *words])) for term, words in lines]
+
+
+def changed_options(entry: EntryResults) -> list[str] | None:
+    """Return the options of the environment in which its task differs from the registered one; None if not known."""
+    name, _, changed = entry.task.partition("+")
+    task, options = registered_task(name), entry.task_file.environment.options
+    if task is None:
+        return None
+    usual = task.file.environment.options
+    values = {option: value for option, value in options.items() if usual.get(option) != value and changed}
+    try:
+        same = task.with_environment(values).name == entry.task
+    except QrlSuiteError:
+        return None
+    return [write_setting(option, value) for option, value in values.items()] if same else None
 
 
 def _networks(entry: EntryResults) -> str:

@@ -14,7 +14,7 @@ from markupsafe import Markup
 import qrlsuite
 from qrlsuite.leaderboard.boards.board import Leaderboard
 from qrlsuite.leaderboard.boards.tables import cost_text
-from qrlsuite.leaderboard.report import entries, sections
+from qrlsuite.leaderboard.report import entries, sections, winners
 from qrlsuite.leaderboard.report import looks as looks_report
 from qrlsuite.leaderboard.report.encode import clean, script_json
 from qrlsuite.results.text import counted
@@ -68,6 +68,7 @@ def render(
             title=clean(title),
             version=qrlsuite.__version__,
             date=f"{now.day} {now:%B %Y}",
+            outcome=winners.outcome(view.winners for view in boards),
             extent=sections.extent(boards, shown),
             sections=boards,
             entries=shown,

@@ -13,13 +13,16 @@ from qrlsuite.experiment.task import RankingSection
 from qrlsuite.leaderboard.boards import tables
 from qrlsuite.leaderboard.boards.pair import pair_on
 from qrlsuite.leaderboard.boards.ranked import ranking_of
-from qrlsuite.leaderboard.boards.steps import Row, Section
-from qrlsuite.leaderboard.boards.times import TimeRanking, TimeRow
+from qrlsuite.leaderboard.boards.steps import Section
+from qrlsuite.leaderboard.boards.times import TimeRanking
 from qrlsuite.leaderboard.report import ladder, timed
+from qrlsuite.leaderboard.report.cite import Citation, cite
 from qrlsuite.leaderboard.report.encode import clean
-from qrlsuite.leaderboard.report.entries import EntryView
+from qrlsuite.leaderboard.report.entries import EntryView, changed_options
 from qrlsuite.leaderboard.report.judge import Judgement, judge
+from qrlsuite.leaderboard.report.rows import RowView, row_view
 from qrlsuite.leaderboard.report.surfaces import CellView, bar_grid, surface, symbol
+from qrlsuite.leaderboard.report.winners import Winners, winners
 from qrlsuite.leaderboard.report.words import listed
 from qrlsuite.leaderboard.shelf.absent import absent
 from qrlsuite.results.text import counted, steps_text
@@ -27,34 +30,6 @@ from qrlsuite.statistics import Evidence, Grid, Outcome
 from qrlsuite.statistics.compare import TOO_FEW
 
 SIGNS = {Outcome.OUTPERFORMS: "win", Outcome.OUTPERFORMED: "loss", Outcome.TRADE_OFF: "both"}
-
-
-@dataclass(frozen=True)
-class RowView:
-    """A line of the leaderboard; `low`, `point` and `high` are the mean's, in percent of the horizon."""
-
-    place: int
-    entry: EntryView
-    name: str
-    """The label, without the algorithm where all entries of the board have the same."""
-    row: Row
-    time: TimeRow
-    mean: str
-    mean_interval: str
-    at_cap: str
-    low: float
-    point: float
-    high: float
-    steps: str
-    interval: str
-    reason: str
-
-    @property
-    def kind(self) -> str:
-        """`quantum`, `classical`, or `external`: of what another program trained, nobody here knows what it is."""
-        if self.entry.curves.external:
-            return "external"
-        return "quantum" if self.entry.quantum else "classical"
 
 
 @dataclass(frozen=True)
@@ -66,11 +41,15 @@ class SectionView:
     section: Section
     judgement: Judgement
     horizon: str
+    changed: str
+    """Options of the environment in which the task differs from the registered one."""
     algorithm: str
     """That of all entries; empty where they differ."""
     lead: str
     answers: tuple[str, ...]
     """What the board says of the pairs that a reader asks for first, in sentences."""
+    winners: Winners
+    citation: Citation
     picked: tuple[int, ...]
     """Places of the entries whose learning curves are drawn at first."""
     sentences: tuple[tuple[int, int, str], ...]
@@ -131,7 +110,8 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     if len(set(names)) < len(names):
         names = [entry.label for entry in shown]
     rows = tuple(
-        _row(place, *each, section) for place, each in enumerate(zip(section.rows, shown, names, strict=True))
+        row_view(place, *each, section)
+        for place, each in enumerate(zip(section.rows, shown, names, strict=True))
     )
     order = np.array(section.times.order)
     grid = judgement.grid
@@ -141,16 +121,20 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     deltas = tuple(f"{float(delta):g}" for delta in grid.deltas)
     missing = sorted({clean(name) for row in section.rows for name in absent(row.entry)})
     surfaces = tuple(surface(judgement.own(place), ranking) for place in range(len(rows)))
-    asked = _asked(rows)
+    winning = winners(rows, section.times)
+    asked = winning.asked(rows)
     return SectionView(
         id=f"board-{number}",
         number=number,
         section=section,
         judgement=judgement,
         horizon=steps_text(section.horizon),
+        changed=clean(", ".join(changed_options(section.rows[0].entry) or ())),
         algorithm=algorithm,
         lead=_lead(rows, section.times),
-        answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) == 1) for pair in asked),
+        answers=tuple(_verdict(section, grid, *pair, kinds=len(asked) < 3) for pair in asked),
+        winners=winning,
+        citation=cite(section, rows),
         picked=tuple(
             sorted({row.place for pair in asked for row in pair} or {row.place for row in rows[:3]})
         ),
@@ -193,49 +177,12 @@ def view(section: Section, number: int, entries: dict[int, EntryView]) -> Sectio
     )
 
 
-def _asked(rows: Sequence[RowView]) -> list[tuple[RowView, RowView]]:
-    """Return the pairs that are told first, the entry with fewer steps first.
-
-    All pairs of up to three ranked entries; of more, the best classical and the best quantum entry, or the first and
-    the last where there is one kind.
-    """
-    ranked = [row for row in rows if row.time.ranks is not None]
-    if len(ranked) <= 3:
-        return list(itertools.combinations(ranked, 2))
-    best = [next((row for row in ranked if row.kind == kind), None) for kind in ("classical", "quantum")]
-    both = sorted((row for row in best if row is not None), key=lambda row: row.place)
-    return [(both[0], both[1]) if len(both) == 2 else (ranked[0], ranked[-1])]
-
-
 def _verdict(section: Section, grid: Grid, one: RowView, other: RowView, kinds: bool = False) -> str:
     """Return the board's verdict on two rows in a sentence; `kinds` says which is classical and which quantum."""
     kinds = kinds and {one.kind, other.kind} == {"classical", "quantum"}
     first, second = (f"{row.kind} {row.name}" if kinds else row.name for row in (one, other))
     said = pair_on(section.times, one.time, other.time, grid, (first, second)).sentence
     return f"{said}.".replace("p = ", "p\u00a0=\u00a0").replace("p < ", "p\u00a0<\u00a0")
-
-
-def _row(place: int, row: Row, entry: EntryView, name: str, section: Section) -> RowView:
-    reference, horizon, time = row.reference, section.horizon, section.times.rows[place]
-    mean, low, high = time.mean.mean, *time.mean.interval
-    kind, levels = section.times.kind, section.times.levels
-    shares = (f"{kind} {level}: {share:.0%}" for level, share in zip(levels, time.mean.at_cap))
-    return RowView(
-        place=place,
-        entry=entry,
-        name=name,
-        row=row,
-        time=time,
-        mean=steps_text(mean, digits=3),
-        mean_interval=f"{steps_text(low, digits=3)} to {steps_text(high, digits=3)}",
-        at_cap=f"never there: {', '.join(shares)}; {steps_text(round(time.mean.half))} at half the horizon",
-        low=100 * low / horizon,
-        point=100 * mean / horizon,
-        high=100 * high / horizon,
-        steps=("≥ " if reference.unsettled else "") + steps_text(reference.steps),
-        interval=f"{steps_text(reference.low)} to {steps_text(reference.high)}",
-        reason=row.reason,
-    )
 
 
 def _lead(rows: Sequence[RowView], times: TimeRanking) -> str:

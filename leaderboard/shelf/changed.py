@@ -25,8 +25,8 @@ _OF_ENTRY, _OF_STUDY = ("entry.json", CURVES, SEEDS, AGENTS), (FILE, LOG)
 def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
     """Return the folders of entries, and of studies, in which a checkout differs from a commit; both sorted.
 
-    Files that git does not track yet count, those that it ignores do not. What is gone is left out; an entry of which
-    one file is gone is not.
+    Files that git does not track yet count, those that it ignores do not. So do entries that are gone, as a whole or
+    one file of them: removing what others published is no change that passes unseen.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def changed(base: str, checkout: Path) -> tuple[list[Path], list[Path]]:
         path, problem = root / name, _problem(root, name)
         if problem and os.path.lexists(path):
             raise QrlSuiteError(f"{name!r}: {problem}; refused, nothing was verified")
-        if not problem and path.parent.is_dir():
+        if not problem:
             folders.add(path.parent)
     studies = {folder for folder in folders if folder.parent == root / PLACES[2]}
     return sorted(folders - studies), sorted(studies)

@@ -73,6 +73,8 @@ class EntryResults(Shown):
         Whether the curves were read from a results folder or from a published entry.
     external:
         Whether another program made the curves: nobody here trained them, or can check them.
+    agents:
+        The seeds whose trained agents are published with it; none of an entry from a results folder.
     color:
         Number of its color and pattern in pictures, so that it keeps them where others are left out; None counts.
     unprobed:
@@ -117,6 +119,7 @@ class EntryResults(Shown):
     source: Literal["runs", "published"] = "runs"
     external: bool = False
     runs: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    agents: tuple[int, ...] = ()
     color: int | None = None
     records: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     networks: int | None = None
@@ -408,13 +411,17 @@ def current(stored: TaskFile, name: str, hash_: str) -> TaskFile:
 
     Ranking is no part of a definition: without this the cells of a board would be those of whichever entry comes first.
     """
-    registered = _registered(registry.load(), name)
+    registered = registered_task(name)
     return registered.file if registered is not None and registered.hash == hash_ else stored
+
+
+def registered_task(name: str) -> Task | None:
+    """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
+    return _registered(registry.load(), name)
 
 
 @functools.lru_cache(maxsize=256)
 def _registered(known: registry.Registry, name: str) -> Task | None:
-    """Return a registered task, read once for all its entries; None where there is none, or it cannot be built."""
     if name not in known.of(specs.TaskSpec):
         return None
     try:

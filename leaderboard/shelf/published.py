@@ -175,6 +175,7 @@ class PublishedEntry:
             codes=codes.distinct([codes.read(self.record, self.folder / "entry.json")]),
             source="published",
             chosen_seeds=self.chosen_seeds,
+            agents=self.agents,
             measured={seed: self.metrics(row) for row, seed in enumerate(self.seeds)}
             if self.measured
             else {},
@@ -303,6 +304,7 @@ def read(folder: Path, label: bool = True) -> PublishedEntry:
 
 
 def _read(folder: Path, label: bool) -> PublishedEntry:
+    _require(folder.is_dir(), folder, "it is gone: restore it; what is published is removed by maintainers")
     for name in ("entry.json", CURVES, SEEDS):
         if not (folder / name).is_file():
             raise StoreError(f"{folder}: {name} is missing; write the entry again with `qrlsuite export`")

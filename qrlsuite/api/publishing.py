@@ -187,7 +187,7 @@ def find_published(paths: Sequence[Path], base: str | None) -> ToVerify:
     given = list(paths or published.folders())
     of_studies = [path for path in given if published_studies.is_published(path)]
     if base is not None:
-        given, of_studies = changed(base, Path.cwd())
+        return ToVerify(*changed(base, Path.cwd()))
     return ToVerify([folder for path in given for folder in checks.find(path)], of_studies)
 
 

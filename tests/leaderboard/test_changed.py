@@ -124,7 +124,7 @@ def test_a_folder_that_is_no_repository(tmp_path: Path) -> None:
 
 
 def test_what_differs_is_found(repository: Path) -> None:
-    """Committed, changed, not added yet, and with one file gone; not what is gone as a whole."""
+    """Committed, changed, not added yet, and gone in part."""
     assert changed("HEAD", repository) == ([], [])
     propose(repository, "leaderboard/unranked/beam6g+7d1167f1/one/curves.parquet")
     propose(repository, f"leaderboard/plans/{PLAN}/plan.toml")
@@ -135,8 +135,6 @@ def test_what_differs_is_found(repository: Path) -> None:
     added = ["leaderboard/plans/new/task/entry", "leaderboard/unranked/beam6g+7d1167f1/one"]
     assert [str(path.relative_to(repository)) for path in entries] == [PLACE, *added]
     assert [path.name for path in plans] == [PLAN]
-    shutil.rmtree(repository / PLACE)
-    assert PLACE not in [str(path.relative_to(repository)) for path in changed("HEAD", repository)[0]]
 
 
 def test_a_badly_named_file_can_be_removed(repository: Path) -> None:
@@ -159,6 +157,13 @@ def test_the_command_checks_entries_and_plans_that_differ(repository: Path) -> N
     assert not study["ok"]
     done = qrlsuite("verify", PLACE, "--base", "HEAD", cwd=repository)
     assert "give PATH or --base, not both" in done.stderr
+
+
+def test_what_another_has_published_is_not_removed_unseen(repository: Path) -> None:
+    shutil.rmtree(repository / PLACE)
+    done = qrlsuite("verify", "--base", "HEAD", cwd=repository)
+    assert done.returncode == 1
+    assert f"{PLACE}: it is gone: restore it" in done.stdout
 
 
 def test_every_published_name_is_one() -> None:

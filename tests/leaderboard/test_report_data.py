@@ -6,19 +6,29 @@ import base64
 import dataclasses
 import json
 import re
+import shlex
 from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+import qrlsuite
+from qrlsuite import api
+from qrlsuite.experiment.entry import resolve
 from qrlsuite.leaderboard.boards.ranked import learning_curves
-from qrlsuite.leaderboard.report import encode, entries, ladder, render, words
+from qrlsuite.leaderboard.report import encode, entries, ladder, render, sections, winners, words
 from qrlsuite.leaderboard.report.judge import judge
+from qrlsuite.leaderboard.shelf.curves import EntryResults
+from qrlsuite.options import parse_setting
 from qrlsuite.statistics import Outcome, Verdict, compare
 from tests.commands import say
 from tests.conftest import Train
+from tests.core.test_docs import parse
 from tests.leaderboard import boards
 
+ROOT = Path(__file__).parents[2]
 NAMES = {
     Verdict.WIN: "+",
     Verdict.LOSS: "-",
@@ -167,3 +177,65 @@ def test_the_command_writes_a_page(tmp_path: Path, train: Train) -> None:
     assert result.stdout == f"wrote {folder / 'leaderboard.html'}\n"
     assert "<h1>Leaderboard</h1>" in (folder / "leaderboard.html").read_text()
     assert "--format html" in boards.refused("leaderboard", "--runs", folder, "--out", "page.html")
+
+
+def test_boards_are_counted_and_a_circuit_is_set_against_the_network_of_its_size() -> None:
+    """100 parameters are nearer to 110 than to 90, by ratio; the fast network and the slow one are on both boards."""
+
+    def drawn(task: str, circuit: float) -> list[EntryResults]:
+        made = [boards.entry(f"mlp width={n}", speed=v, task=task) for n, v in ((99, 3), (9, 2), (11, 1))]
+        made = [
+            dataclasses.replace(each, parameters=(n, 0))
+            for each, n in zip(made, (1000, 90, 110), strict=True)
+        ]
+        return [
+            *made,
+            dataclasses.replace(boards.entry("vqc", speed=circuit, task=task), parameters=(60, 40)),
+        ]
+
+    board = boards.of([*drawn("beam6g", 1.6), *drawn("cartpole", 0.5)])
+    shown = entries.views([row.entry for section in board.sections for row in section.rows])
+    by_curves = {id(entry.curves): entry for entry in shown}
+    found = [sections.view(section, 0, by_curves).winners for section in board.sections]
+    assert [each.sized.name for each in found if each.sized is not None] == ["mlp width=11"] * 2
+    assert winners.outcome(found) == [
+        "The best network needs fewer steps than the best circuit on 2 of 2 boards.",
+        "The best circuit needs fewer steps than the network nearest in size on 1 of 2 boards, more on 1.",
+    ]
+    assert winners.outcome(found[:1]) == []
+
+
+@pytest.mark.parametrize("task", ["cartpole", "beam6g+7d1167f1"])
+def test_every_published_entry_is_one_click_from_its_commands(task: str) -> None:
+    board = api.board(task, published=True, runs="none")
+    for view in entries.views([row.entry for row in board.sections[0].rows]):
+        commands = {term: shlex.split(line) for term, line in view.commands}
+        assert list(commands) == ["Train", "Check", "Curves"] + ["Play"] * bool(view.curves.agents)
+        assert {parse(words[1:]) for words in commands.values()} == {""}
+        _, _, label, _, name, *rest = commands["Train"]
+        assert (
+            resolve(name, label, settings=[parse_setting(text) for text in rest[1:-2:2]]).name
+            == view.curves.name
+        )
+        assert (ROOT / commands["Check"][2] / "entry.json").is_file()
+
+
+def test_a_board_is_cited_by_what_it_ranks() -> None:
+    """The hash follows a score and no order, and JSON has it; names of files are no markup in a badge."""
+    one, other = boards.entry("<b>fast</b>", speed=2), boards.entry("slow", speed=0.5)
+    changed = dataclasses.replace(
+        other, curves=np.where(other.curves == other.curves.max(), 0.5, other.curves)
+    )
+    board = boards.of([one, other])
+    ((content,), (turned,), (forged,)) = (
+        [section.hash for section in boards.of(each).sections]
+        for each in ([one, other], [other, one], [one, changed])
+    )
+    assert content == turned != forged
+    assert board.as_dict()["sections"][0]["hash"] == content
+    page = render(board)
+    assert f"version = {{{qrlsuite.__version__}}}" in page
+    assert f"note = {{2 entries, content hash {content}}}" in page
+    (saved,) = re.findall(r'download="beam6g.svg" href="data:image/svg\+xml,([^"]+)"', page)
+    texts = [element.text for element in ElementTree.fromstring(unquote(saved)).iter()]
+    assert "<b>fast</b>: rank 1 of 2 entries" in texts

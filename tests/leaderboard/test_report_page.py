@@ -86,7 +86,7 @@ def test_the_page_begins_with_the_boards_verdict(opened: Open) -> None:
     assert alone.startswith("mlp width=16 needs ")
     words = "classical mlp width=16 needs", "than quantum vqc qubits=4"
     wanted = re.sub("mlp width=16 needs(.*)than vqc qubits=4", rf"{words[0]}\1{words[1]}", alone)
-    answer = tab.locator(".answers span").first
+    answer = tab.locator(".answers .said span").first
     said = answer.inner_text().replace("\u00a0", " ")
     assert said.partition(", p ")[0].partition(", adjusted p")[0] == wanted.partition(", p ")[0]
     assert re.search(r", 20 seeds each, adjusted p [=<] \.\d+\)\.$", said)
@@ -95,7 +95,7 @@ def test_the_page_begins_with_the_boards_verdict(opened: Open) -> None:
 
 def test_a_board_of_three_begins_with_every_pair(opened: Open) -> None:
     tab = opened(boards.of([boards.entry(f"at {speed}", speed=speed) for speed in (3, 1.5, 0.5)]))
-    said = [text.partition(" (")[0] for text in tab.locator(".answers span").all_inner_texts()]
+    said = [text.partition(" (")[0] for text in tab.locator(".answers .said span").all_inner_texts()]
     assert [re.sub(r"\d+%", "n%", line) for line in said] == [
         "at 3 needs n% fewer steps than at 1.5",
         "at 3 needs n% fewer steps than at 0.5",
@@ -103,7 +103,7 @@ def test_a_board_of_three_begins_with_every_pair(opened: Open) -> None:
     ]
     assert (
         tab.locator("#board-0 .verdicts .verdict").all_inner_texts()
-        == tab.locator(".answers span").all_inner_texts()
+        == tab.locator(".answers .said span").all_inner_texts()
     )
 
 
@@ -111,7 +111,7 @@ def test_what_another_program_trained_is_neither_classical_nor_quantum(opened: O
     entries = [boards.entry(f"at {speed}", speed=speed, quantum=9 * (speed == 1)) for speed in (3, 2, 1, 0.5)]
     tab = opened(boards.of([dataclasses.replace(entries[0], external=True), *entries[1:]]))
     assert "external" in tab.locator("#board-0-table tbody tr").first.inner_text()
-    assert tab.locator(".answers span").inner_text().startswith("classical at 2 needs ")
+    assert tab.locator(".answers .said span").inner_text().startswith("classical at 2 needs ")
     assert "Curves that other programs made" in tab.locator("#board-0-notes").inner_text()
 
 

@@ -73,7 +73,8 @@ def export(
     elif written[-1].entry is None:
         typer.echo(f"next: {command('show', str(written[-1].folder))}")
     else:
-        target = Path(str(written[-1].folder)).parents[1]
+        last = Path(str(written[-1].folder))
+        target = last if len(written) == 1 else last.parents[1]
         typer.echo(f"next: {command('verify', str(target), '--rerun', '2')}")
 
 
