@@ -1,7 +1,7 @@
 """Continuous actions and memory, side by side with Stable-Baselines3 and sb3-contrib at equal settings.
 
     pip install 'qrlsuite[bench]'
-    python benchmarks/continuous.py [--algorithms sac td3 ppo lstm] [--seeds 5] [--epochs 10] [--json out.json]
+    python benchmarks/continuous.py [--algorithms sac td3 ppo hill lstm] [--seeds 5] [--epochs 10] [--json out.json]
 
 SAC, TD3 and PPO learn Pendulum-v1. Every agent has the same network (two hidden layers of 64 rectifiers, torch's own
 initialization), learning rate, discount, batch, replay buffer, gradient steps per interaction and noise; it learns from
@@ -11,16 +11,20 @@ divide 1000 samples; what its peer does otherwise is switched to what the suite 
 torch's initialization, and actions rescaled to -1 .. 1, as the suite's networks have them. SAC and TD3 of the peer do
 that themselves.
 
+`hill` is TD3 on MountainCarContinuous-v0 (`mountaincar-continuous`) with four environments: one gradient step for four
+interactions, and noise of the same spread and correlation from step to step. That of its peer begins anew in every
+episode, ours in every epoch.
+
 `lstm` is PPO with memory beside RecurrentPPO of sb3-contrib, on CartPole-v1 without velocities (`cartpole-hidden`), in
 four environments: an LSTM of 64 numbers and a linear layer, for actor and critic each, and minibatches of 125 steps.
 Those of its peer follow each other in one environment or two, and are cut where episodes end; ours are five sequences
 of 25 steps from anywhere.
 
 Printed are the measures of `benchmarks/learning.py`: medians over seeds and, in brackets, their 5th to 95th bootstrap
-percentiles (whole runs resampled, 10,000 times), interactions until a mean return first reaches -500 and -200 (with
-memory a mean score of 0.2 and 0.5), the mean of the whole curve, the last mean return or score, and seconds of
-processor time per seed spent on learning, without evaluation. Differences are ours minus theirs. One thread; all seeds
-of the suite are trained together, those of its peer one after another.
+percentiles (whole runs resampled, 10,000 times), interactions until a mean return first reaches -500 and -200 (on the
+hill 50 and 90, with memory a mean score of 0.2 and 0.5), the mean of the whole curve, the last mean return or score,
+and seconds of processor time per seed spent on learning, without evaluation. Differences are ours minus theirs. One
+thread; all seeds of the suite are trained together, those of its peer one after another.
 """
 
 from __future__ import annotations
@@ -55,7 +59,9 @@ MEMORY = [
     "batch=125",
     "length=25",
 ]
-SETTINGS = {"sac": [], "td3": [], "ppo": ["batch=50"], "lstm": MEMORY}
+SETTINGS = {"sac": [], "td3": [], "ppo": ["batch=50"], "hill": [], "lstm": MEMORY}
+TASKS = {"hill": ("mountaincar-continuous", "mlp", "td3"), "lstm": ("cartpole-hidden", "lstm", "ppo")}
+THRESHOLDS = {"hill": (50, 90), "lstm": (0.2, 0.5)}
 
 
 def validated(trainer: Trainer, act: Callable[..., Any], epoch: int) -> FloatArray:
@@ -119,6 +125,9 @@ def environment(entry: Entry) -> Any:
     """Return what a peer learns from."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 
+    if entry.task.name == "mountaincar-continuous":
+        made = entry.task.file.protocol.environments * [lambda: gymnasium.make("MountainCarContinuous-v0")]
+        return DummyVecEnv(made)
     if not hidden(entry):
         made = gymnasium.make("Pendulum-v1")
         if entry.algorithm.name == "ppo":
@@ -137,7 +146,7 @@ def environment(entry: Entry) -> Any:
 def peer(entry: Entry) -> Callable[[Any, int], Any]:
     """Return a maker of the peer's agents at an entry's settings."""
     import stable_baselines3 as sb3
-    from stable_baselines3.common.noise import NormalActionNoise
+    from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
     o, network = entry.algorithm_options, entry.model_options
     layers = [network.width] * getattr(network, "depth", 0)
@@ -181,6 +190,11 @@ def peer(entry: Entry) -> Callable[[Any, int], Any]:
             "target_noise_clip": o.target_clip,
             "action_noise": NormalActionNoise(np.zeros(1), np.full(1, o.noise)),
         }
+        if o.correlation:
+            step = np.full(1, o.noise * np.sqrt(1 - o.correlation**2))
+            common["action_noise"] = OrnsteinUhlenbeckActionNoise(
+                np.zeros(1), step, theta=1 - o.correlation, dt=1.0
+            )
     cls = {"sac": sb3.SAC, "td3": sb3.TD3, "ppo": sb3.PPO}[entry.algorithm.name]
     return lambda made, seed: cls("MlpPolicy", made, policy_kwargs=policy, seed=seed, **common)
 
@@ -199,10 +213,9 @@ def main() -> None:
     seeds, stored = range(arguments.seeds), {}
     for algorithm in arguments.algorithms:
         settings = [parse_setting(word) for word in [*SETTINGS[algorithm], *arguments.set]]
-        names = ("cartpole-hidden", "lstm", "ppo") if algorithm == "lstm" else ("pendulum", "mlp", algorithm)
-        entry = resolve(*names, settings)
-        learning.THRESHOLDS = (0.2, 0.5) if algorithm == "lstm" else (-500, -200)
-        name = "RecurrentPPO" if algorithm == "lstm" else f"SB3 {algorithm.upper()}"
+        entry = resolve(*TASKS.get(algorithm, ("pendulum", "mlp", algorithm)), settings)
+        learning.THRESHOLDS = THRESHOLDS.get(algorithm, (-500, -200))
+        name = "RecurrentPPO" if algorithm == "lstm" else f"SB3 {entry.algorithm.name.upper()}"
         all_runs = [
             ours(entry, seeds, arguments.epochs),
             theirs(name, peer(entry), entry, seeds, arguments.epochs),

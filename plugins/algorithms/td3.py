@@ -11,7 +11,9 @@ With actor mu, critics Q1 and Q2, slowly following copies mu', Q1' and Q2', disc
 
 Losses are summed over the S agents, so that gradients do not mix. Per round, every environment takes one step with
 clip(mu(s) + sigma n, -1, 1), the transitions enter the replay buffer, and `updates` steps are made on batches drawn
-uniformly, with replacement, from what it holds. The first `warm_up` transitions of a seed come from uniform actions,
+uniformly, with replacement, from what it holds. With correlation rho, the noise of a step is sqrt(1 - rho^2) n + rho
+times that of the step before: an Ornstein-Uhlenbeck process as in DDPG (Lillicrap et al. 2015, arXiv:1509.02971), of
+the same spread, that begins anew in every epoch. The first `warm_up` transitions of a seed come from uniform actions,
 and nothing is learned before.
 
 Actions are numbers in -1 .. 1, linear in the box of the environment's (`qrlsuite.actions.from_units`); mu is the
@@ -28,6 +30,7 @@ Deviations from the paper:
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, cast
 
@@ -69,6 +72,9 @@ class TD3Options:
     noise: Annotated[
         float, Field(ge=0, description="sigma: spread of exploration, in halves of an action's range")
     ] = 0.1
+    correlation: Annotated[
+        float, Field(ge=0, lt=1, description="rho: of exploration, from one step to the next")
+    ] = 0.0
     target_noise: Annotated[float, Field(ge=0, description="sigma': spread of the copies' actions")] = 0.2
     target_clip: Annotated[float, Field(ge=0, description="c: bound of that noise")] = 0.5
     delay: Annotated[int, Field(ge=1, description="critics' steps per step of the actor")] = 2
@@ -162,6 +168,10 @@ class TD3:
             exploration = streams.numpy("exploration", self.epoch)
             explore[s] = exploration.standard_normal(explore.shape[1:])
             uniform[s] = exploration.uniform(-1.0, 1.0, uniform.shape[1:])
+            for k in range(1, rounds) if o.correlation else ():
+                explore[s, k] = (
+                    math.sqrt(1.0 - o.correlation**2) * explore[s, k] + o.correlation * explore[s, k - 1]
+                )
             replay = streams.numpy("replay", self.epoch)
             draws[s] = replay.random(draws.shape[1:])
             noise[s] = replay.standard_normal(noise.shape[1:])

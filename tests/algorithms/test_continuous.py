@@ -153,6 +153,15 @@ def test_td3_begins_uniformly_and_delays_its_actor() -> None:
     assert not any(torch.equal(before[name], value) for name, value in td3.policy_state().items())
 
 
+def test_exploration_of_td3_lasts_and_keeps_its_spread() -> None:
+    noise = made("td3", correlation=0.8)._epoch_numbers(4000)[0]  # (S, rounds, E, A)
+    assert noise.std().item() == pytest.approx(1.0, abs=0.05)
+    shifted = (noise[:, 1:] * noise[:, :-1]).mean((1, 3)) / noise.square().mean((1, 3))
+    np.testing.assert_allclose(shifted.numpy(), 0.8, atol=0.05)
+    first = made("td3")._epoch_numbers(4000)[0][:, 0]
+    assert torch.equal(noise[:, 0], first), "the first of an epoch is drawn as ever"
+
+
 def test_soft_values_of_discrete_actions_are_those_by_hand() -> None:
     sac: SAC = Group("sac", range(2), Contexts(4), temperature=0.5).start().algorithm
     states = normal(2, 6, 4)
