@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -21,8 +22,10 @@ from qrlsuite.cli.training import (
     TrackOption,
     WorkersOption,
 )
+from qrlsuite.engine.terminal import command
 from qrlsuite.errors import OptionError
-from qrlsuite.notation import Written, parse_entry
+from qrlsuite.experiment.entry import Entry, resolve
+from qrlsuite.notation import Written, parse_entry, split
 
 QUICK_SEEDS = 8
 QUICK_EPOCHS = 10
@@ -106,8 +109,9 @@ def run(
     --set qubits=6
     """
     where = where_of(engine, workers, device, fresh, same)
+    written = _written(entry or [], model, settings or [], quick)
     done = train_entry(
-        resolve_entry(task, _written(entry or [], model, settings or [], quick), runs=runs),
+        resolve_entry(task, written, runs=runs),
         where,
         seeds or (QUICK_SEEDS if quick else None),
         epochs or (QUICK_EPOCHS if quick else None),
@@ -122,6 +126,33 @@ def run(
         typer.echo(json.dumps({"submitted": done.submitted} if done.submitted else done.summary()))
     elif done.submitted is not None:
         typer.echo(done.submitted)
+    elif done.work.todo and done.work.entry.model.family == "quantum":
+        given = {"--seeds": seeds, "--epochs": epochs}
+        words = [word for name, value in given.items() if value is not None for word in (name, str(value))]
+        with contextlib.suppress(OptionError):  # what a plugin's algorithm takes no networks for
+            typer.echo(
+                _of_its_size(done.work.entry, task, written, [*words, *["--quick"] * quick], runs), err=True
+            )
+
+
+def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], runs: Path) -> str:
+    """Return a line that says how to train the network to which a circuit is compared."""
+    from qrlsuite.population import remembers  # torch is slow to import
+    from qrlsuite.studies.sizes import nearest_size, parameters
+    from qrlsuite.training.trainer import first_network
+
+    sides = circuit.algorithm_options, circuit.task.environment_options
+    shared = {name for own in sides for name in options.field_names(type(own))} - {"quantum_lr"}
+    kept = tuple(s for s in written.settings if s.side != "model" and s.name in shared)
+    model = "gru" if remembers(first_network(circuit)) else "mlp"
+
+    def network(width: int) -> Entry:
+        sized = Written(model, written.algorithm, (*kept, options.Setting("model", "width", width)))
+        return resolve(task, sized)
+
+    found = network(nearest_size(network, circuit))
+    counts = f"{parameters(found)} and {parameters(circuit)} parameters"
+    return f"a network of its size ({counts}): {command('run', *split(found.label), '--task', task, *words, runs=runs)}"
 
 
 def _written(words: list[str], model: str | None, settings: list[str], quick: bool) -> Written:
