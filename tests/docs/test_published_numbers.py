@@ -45,8 +45,8 @@ def test_the_decided_pairs_are_the_boards() -> None:
 
 def test_the_core_hours_are_the_boards() -> None:
     [section] = api.board("beam6g", published=True, runs="none").sections
-    assert f"{sum(row.entry.hours for row in section.rows):.1f} core-hours for the eleven" in BOARD
-    assert len(section.rows) == 11
+    hours = sum(row.entry.hours for row in section.rows)
+    assert f"{hours:.1f} core-hours for all {len(section.rows)}," in BOARD
 
 
 @pytest.mark.parametrize(
