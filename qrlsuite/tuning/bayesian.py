@@ -12,7 +12,7 @@ until the same regret are compared fairly, though one may need more trials than 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from typing import Any
 
@@ -236,7 +236,7 @@ class Bayesian(Search):
     def _proposals(self) -> Generator[list[Proposal], None, None]:
         """Propose trials that do not depend on each other, until nothing more is to be tried."""
         first, each, last = self.request.seeds[0], len(self.request.seeds), 0
-        while (wanted := self._climb.next()) and self._allowed(wanted):
+        while wanted := self._climb.next()[: self._room]:
             if self.behind and 0 not in wanted:  # untuned settings that had luck get further seeds
                 wanted = [*wanted[:-1], 0]
             seeds = tuple(range(first + last * each, first + (last + 1) * each))
@@ -258,15 +258,18 @@ class Bayesian(Search):
     def _seen(self, number: int) -> tuple[int, ...]:
         return self._latest[number].seeds if number in self._latest else ()
 
-    def _allowed(self, wanted: Sequence[int]) -> bool:
-        """Tell whether the search goes on: the regret is not small enough yet, and the budget holds these trials."""
+    @property
+    def _room(self) -> int:
+        """How many trials the budget holds; a first round at least, and none more where the regret is small enough."""
         if self.regret_reached:
-            return False
-        spent, hours = self.core_seconds, self.request.core_hours
-        if hours is not None and spent + self._pace * len(wanted) * len(self.request.seeds) > 3600 * hours:
-            return self.asked == 0
-        limited = hours is None or self.request.trials is not None
-        return not limited or self.asked + len(wanted) <= self.planned or self.asked == 0
+            return 0
+        hours, trials = self.request.core_hours, surrogate.BATCH
+        if hours is not None and self.asked:
+            left = 3600 * hours - self.core_seconds
+            trials = int(left / (self._pace * len(self.request.seeds))) if self._pace else trials
+        if (hours is None or self.request.trials is not None) and self.asked:
+            trials = min(trials, self.planned - self.asked)
+        return max(trials, 0)
 
     def _spread(self, curves: surrogate.Floats, worth: Callable[[surrogate.Floats], Merit]) -> float:
         """Return the jackknife's standard deviation of a run, in units of the mean."""
