@@ -54,7 +54,9 @@ DIAGNOSTICS = {
     "entanglement": lambda row: row["meyer-wallach"],
     "parameters": lambda row: row["parameters"],
 }
+LOGARITHMIC = ("gradient variance, local", "gradient variance, global", "expressibility")
 HYPOTHESES = len(DIAGNOSTICS) - 1
+SIZES = 2  # planned: 6 and 8 qubits
 
 
 def options_of(circuit: str, qubits: int, rates: tuple[float, float]) -> dict[str, Any]:
@@ -106,13 +108,13 @@ def correlations(values: NDArray[np.float64], outcomes: NDArray[np.float64]) -> 
     return found
 
 
-def holm(values: list[float]) -> list[float]:
-    """Return p values corrected for all of them."""
+def holm(values: list[float], planned: int) -> list[float]:
+    """Return p values corrected for as many as were planned; those that are missing count as the largest."""
     order = np.argsort(values)
     corrected = np.empty(len(values))
     largest = 0.0
     for place, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(values) - place) * values[index]))
+        largest = max(largest, min(1.0, (planned - place) * values[index]))
         corrected[index] = largest
     return corrected.tolist()
 
@@ -146,7 +148,10 @@ def main() -> None:
         drawn[n] = np.array(values).T, np.array(outcomes)
         found[n] = correlations(*drawn[n])
     corrected = iter(
-        holm([each[name][1] for each in found.values() for name in list(DIAGNOSTICS)[:HYPOTHESES]])
+        holm(
+            [each[name][1] for each in found.values() for name in list(DIAGNOSTICS)[:HYPOTHESES]],
+            HYPOTHESES * max(SIZES, len(found)),
+        )
     )
     print(
         "\n| diagnostic | qubits | rank correlation | 95% interval | p | p, Holm |\n|---|---|---|---|---|---|"
@@ -160,17 +165,21 @@ def main() -> None:
 
 
 def draw(drawn: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], out: Path) -> None:
-    """Draw outcomes against every diagnostic, a row for each size."""
+    """Draw outcomes against every diagnostic, two rows for each size."""
     from matplotlib.figure import Figure
 
-    figure = Figure((15, 2.6 * len(drawn)), layout="constrained")
-    axes = figure.subplots(len(drawn), HYPOTHESES, squeeze=False, sharey="row")
-    for line, (n, (values, outcomes)) in zip(axes, drawn.items()):
+    figure = Figure((9, 4.6 * len(drawn)), layout="constrained")
+    axes = figure.subplots(2 * len(drawn), 4, squeeze=False, sharey=True)
+    for n, (values, outcomes), lines in zip(drawn, drawn.values(), axes.reshape(len(drawn), 8)):
         error = outcomes.std(1, ddof=1) / np.sqrt(outcomes.shape[1])
-        for ax, name, row in zip(line, DIAGNOSTICS, values):
+        for ax, name, row in zip(lines, list(DIAGNOSTICS)[:HYPOTHESES], values):
             ax.errorbar(row, outcomes.mean(1) / 1e3, error / 1e3, fmt="o", ms=4)
             ax.set_xlabel(name)
-        line[0].set_ylabel(f"{n} qubits: steps below\nthreshold, thousands")
+            if name in LOGARITHMIC:
+                ax.set_xscale("log")
+        lines[HYPOTHESES].axis("off")
+        for ax in lines[::4]:
+            ax.set_ylabel(f"{n} qubits: steps below\nthreshold, thousands")
     figure.savefig(out, dpi=150)
 
 

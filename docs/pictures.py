@@ -69,6 +69,7 @@ class Unpublished:
     """A picture of runs that are not published: the command trains them, draws it, and says where it lies."""
 
     command: str
+    program: str = "qrlsuite"
 
 
 Picture = Plot | Screenshot | Unpublished
@@ -91,6 +92,9 @@ PICTURES: dict[str, Picture] = {
     "report-narrow.png": Screenshot(BOARD, ("entries/beam6g/*",), 390, 1000),
     "report-pairs.png": Screenshot(BOARD, ("entries/beam6g/*",), 1160, 1000, "Who outperforms whom"),
     "report-wide.png": Screenshot(BOARD, ("entries/beam6g/*",), 1400, 1300),
+    "predictors.png": Unpublished(
+        "benchmarks/predictors.py --qubits 6 --out predictors.png", program="python"
+    ),
     "policies.png": Unpublished(  # after `study run fig8 --seeds 30`: it plays agents that were trained here
         "evaluate 'mlp width=64' 'vqc-native qubits=14' --best 10 --episodes 1000 --out policies.png"
     ),
@@ -141,6 +145,7 @@ CAPTIONS = {
     "study-fidelity-text.png": "The text's replay buffer and copies",
     "study-quantum-or-not-entries.png": "A study with looks: every entry",
     "study-quantum-or-not-pairs.png": "A study with looks: every pair below its question",
+    "predictors.png": "Sixteen circuits: how fast they learn, and what was known of them before",
     "diagnose-circuit.png": "A circuit from 2 to 16 qubits: gradients, Fisher information, frequencies, states",
     "diagnose-agents.png": "Trained agents beside themselves before training",
     "policies.png": "What trained agents earn",
@@ -166,7 +171,8 @@ def gallery() -> str:
     for name, caption in CAPTIONS.items():
         picture = PICTURES[name]
         note = "\nIts runs are not published: the command needs agents or seeds that you train.\n"
-        text += f"\n## {caption}\n\n```sh\nqrlsuite {picture.command}\n```\n"
+        program = picture.program if isinstance(picture, Unpublished) else "qrlsuite"
+        text += f"\n## {caption}\n\n```sh\n{program} {picture.command}\n```\n"
         text += note * isinstance(picture, Unpublished) + f"\n![{caption}](images/{name})\n"
     return text
 
@@ -204,7 +210,7 @@ def main(chosen: Sequence[str]) -> None:
         for name in chosen or PICTURES:
             picture = PICTURES[name]
             if isinstance(picture, Unpublished):
-                print(f"kept {name}: its runs are not published; qrlsuite {picture.command}")
+                print(f"kept {name}: its runs are not published; {picture.program} {picture.command}")
                 continue
             made = Path(folder, name)
             if isinstance(picture, Plot):

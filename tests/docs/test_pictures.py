@@ -45,7 +45,11 @@ def test_pictures_show_what_is_published_by_commands_of_the_suite() -> None:
             picture
         )
     for picture in pictures.PICTURES.values():
-        assert parse(shlex.split(picture.command)) == ""
+        words = shlex.split(picture.command)
+        if isinstance(picture, pictures.Unpublished) and picture.program == "python":
+            assert (ROOT / words[0]).is_file()
+        else:
+            assert parse(words) == ""
 
 
 def test_a_mark_follows_the_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
