@@ -326,7 +326,7 @@ def test_a_search_ends_the_same_side_by_side_and_in_turn(tiny_task: str, tmp_pat
             for trial in found.trials
             for line in read_lines(EntryStore.find(found.runs, trial.entry).seed(trial.seeds[0]).timings)
         }
-        assert sizes == ({2, 6, 24} if begun else {10, 24}), "5 settings on two seeds, then 12"
+        assert sizes == ({2, 6, 24} if begun else {10, 24, 6}), "5 settings on two seeds, then 12, then 3"
 
     stopped = bayesian(tiny_task, tmp_path / "stopped")
 
