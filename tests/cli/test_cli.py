@@ -148,14 +148,16 @@ def test_what_comes_next_works_as_it_is_printed(task: str, tmp_path: Path) -> No
 
 
 def test_a_trained_circuit_is_followed_by_a_network_of_its_size(task: str, tmp_path: Path) -> None:
-    words = ["run", "vqc-native", "qubits=3", "gamma=.9", "quantum_lr=.01", "--task", task]
-    words += ["--seeds", "1", "--epochs", "1", "--runs", str(tmp_path)]
+    words = ["run", "vqc-native", "qubits=3", "gamma=.9", "quantum_lr=.01", "environment.degree=4"]
+    words += ["--task", task, "--seeds", "1", "--epochs", "1", "--runs", str(tmp_path / "runs")]
     said, _, typed = qrlsuite(*words).stderr.splitlines()[-1].partition("): ")
     network, circuit = map(int, re.findall(r"\d+", said))
     assert 0.8 < network / circuit < 1.25
     assert "ddqn mlp width=" in typed
     assert "gamma=0.9" in typed
     assert qrlsuite(*shlex.split(typed)[1:]).returncode == 0
+    (one,) = (tmp_path / "runs").iterdir()
+    assert len(list(one.glob("ddqn-*"))) == 2, "both are on one task"
     assert "of its size" not in qrlsuite(*words).stderr, "nothing was trained"
 
 

@@ -23,9 +23,9 @@ from qrlsuite.cli.training import (
     WorkersOption,
 )
 from qrlsuite.engine.terminal import command
-from qrlsuite.errors import OptionError
+from qrlsuite.errors import OptionError, QrlSuiteError
 from qrlsuite.experiment.entry import Entry, resolve
-from qrlsuite.notation import Written, parse_entry, split
+from qrlsuite.notation import Written, parse_entry, split, write_setting
 
 QUICK_SEEDS = 8
 QUICK_EPOCHS = 10
@@ -126,10 +126,10 @@ def run(
         typer.echo(json.dumps({"submitted": done.submitted} if done.submitted else done.summary()))
     elif done.submitted is not None:
         typer.echo(done.submitted)
-    elif done.work.todo and done.work.entry.model.family == "quantum":
+    elif done.work.todo and done.work.entry.model.family == "quantum" and done.work.entry.start is None:
         given = {"--seeds": seeds, "--epochs": epochs}
         words = [word for name, value in given.items() if value is not None for word in (name, str(value))]
-        with contextlib.suppress(OptionError):  # what a plugin's algorithm takes no networks for
+        with contextlib.suppress(QrlSuiteError):  # a preset or an algorithm that is for circuits alone
             typer.echo(
                 _of_its_size(done.work.entry, task, written, [*words, *["--quick"] * quick], runs), err=True
             )
@@ -141,18 +141,24 @@ def _of_its_size(circuit: Entry, task: str, written: Written, words: list[str], 
     from qrlsuite.studies.sizes import nearest_size, parameters
     from qrlsuite.training.trainer import first_network
 
-    sides = circuit.algorithm_options, circuit.task.environment_options
-    shared = {name for own in sides for name in options.field_names(type(own))} - {"quantum_lr"}
-    kept = tuple(s for s in written.settings if s.side != "model" and s.name in shared)
+    learning, world = (
+        [s for s in written.settings if s.side in (None, side) and s.name in options.field_names(type(own))]
+        for side, own in (
+            ("algorithm", circuit.algorithm_options),
+            ("environment", circuit.task.environment_options),
+        )
+    )
+    kept = tuple(s for s in (*learning, *world) if s.name != "quantum_lr")
     model = "gru" if remembers(first_network(circuit)) else "mlp"
 
     def network(width: int) -> Entry:
-        sized = Written(model, written.algorithm, (*kept, options.Setting("model", "width", width)))
-        return resolve(task, sized)
+        width_of = options.Setting("model", "width", width)
+        return resolve(task, Written(model, written.algorithm, (*kept, width_of), written.preset))
 
     found = network(nearest_size(network, circuit))
     counts = f"{parameters(found)} and {parameters(circuit)} parameters"
-    return f"a network of its size ({counts}): {command('run', *split(found.label), '--task', task, *words, runs=runs)}"
+    entry = [*split(found.label), *(write_setting(f"environment.{s.name}", s.value) for s in world)]
+    return f"a network of its size ({counts}): {command('run', *entry, '--task', task, *words, runs=runs)}"
 
 
 def _written(words: list[str], model: str | None, settings: list[str], quick: bool) -> Written:
