@@ -211,7 +211,7 @@ def forward(x: Any, parameters: Any, sizes: Any, activation: int, records: Any, 
                 chunk += 1
             samples = min(wide, x.shape[1] - start)
             _fill(x, s, start, samples, rows)
-            begin, place = 0, 0
+            begin, place = np.int64(0), 0  # of a literal 0, numba compiles a second version of what it calls
             for layer in range(last + 1):
                 o, i = sizes[layer + 1], sizes[layer]
                 _multiply(
@@ -243,7 +243,7 @@ def backward(
     gradients:
         Laid out as the parameters are.
     """
-    wide, chunk, last = records.shape[2], 0, len(sizes) - 2
+    wide, chunk, last, zero = records.shape[2], 0, len(sizes) - 2, np.int64(0)  # see `forward`
     vector, batch, seeds, height = wide // 2, cotangents.shape[1], cotangents.shape[0], 0
     for layer in range(len(sizes)):
         height += sizes[layer]
@@ -259,7 +259,7 @@ def backward(
         for start in range(0, batch, wide):
             rows = records[chunk]
             chunk += 1
-            samples, side, at = min(wide, batch - start), 0, 0
+            samples, side, at = min(wide, batch - start), 0, zero
             _fill(cotangents, s, start, samples, pair[0])
             begin, place = height - cotangents.shape[2], end
             for back in range(last + 1):
@@ -273,11 +273,11 @@ def backward(
                 if i >= o:
                     columns = -(-i // vector)
                     _turn(rows, begin, i, columns, samples, turned)
-                    _add_products(own, 0, o, turned, columns, samples, sums, at)
+                    _add_products(own, zero, o, turned, columns, samples, sums, at)
                     at += o * columns
                 else:
                     columns = -(-o // vector)
-                    _turn(own, 0, o, columns, samples, turned)
+                    _turn(own, zero, o, columns, samples, turned)
                     _add_products(rows, begin, i, turned, columns, samples, sums, at)
                     at += i * columns
                 side = 1 - side
@@ -295,15 +295,18 @@ def backward(
                 for i in range(x_gradients.shape[2]):
                     for v in range(samples):
                         x_gradients[s, start + v, i] = pair[side, i, v]
-        at, place = 0, end
+        at, place = zero, end
         for back in range(last + 1):
             o, i = sizes[last - back + 1], sizes[last - back]
             place -= seeds * o * (i + 1)
             columns = -(-max(i, o) // vector) * vector
             for j in range(o):
                 gradient = gradients[place + (s * o + j) * i : place + (s * o + j + 1) * i]
-                if i >= o:
-                    gradient[:] = sums[at + j * columns : at + j * columns + i]
+                if (
+                    i >= o
+                ):  # number by number: to copy slices, numba compiles a check of shapes, with its text
+                    for k in range(i):
+                        gradient[k] = sums[at + j * columns + k]
                 else:
                     for k in range(i):
                         gradient[k] = sums[at + k * columns + j]

@@ -10,8 +10,10 @@ The environment variable `QRLSUITE_CHECKPOINT_SECONDS` replaces the minute betwe
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import ctypes
+import gc
 import os
 import signal
 import sys
@@ -171,10 +173,17 @@ def checkpoint_seconds(default: float) -> float:
     return seconds
 
 
-def _set_checkpoint_seconds() -> None:
-    """Set the time between checkpoints from the environment; the errors are those of `checkpoint_seconds`."""
-    from qrlsuite.training import group
+def _import_training() -> None:
+    """Import what trains, and set the time between checkpoints; the errors are those of `checkpoint_seconds`.
 
+    What is imported lives as long as the process: the garbage collector does not look at it, now or later.
+    """
+    gc.disable()
+    try:
+        from qrlsuite.training import group
+    finally:
+        gc.freeze()
+        gc.enable()
     group.CHECKPOINT_SECONDS = checkpoint_seconds(group.CHECKPOINT_SECONDS)
 
 
@@ -198,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.follow_parent is not None and not end_with(options.follow_parent):
         return 130
     try:
-        _set_checkpoint_seconds()
+        _import_training()
         folder, *others = options.folders
         for path in options.folders:
             codes.load_copies(EntryStore(path))
@@ -221,4 +230,5 @@ if __name__ == "__main__":
         signal.SIGUSR2,
     ):  # with which a cluster warns its jobs, and then sends SIGTERM
         signal.signal(warning, signal.SIG_IGN)
+    atexit.register(gc.freeze)  # collecting what is about to end takes most of a second
     sys.exit(main())
