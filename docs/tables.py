@@ -4,6 +4,7 @@ A comment names the task or study and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
+    <!-- table: quantum-or-not+quantum-or-not-degree5 together -->
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from qrlsuite.leaderboard.shelf import published_studies
 from qrlsuite.leaderboard.shelf.published_studies import PublishedStudy
 from qrlsuite.results.text import hours_text, steps_text
 from qrlsuite.studies.outcome import StudyOutcome, by_question, difference_text, versus
+from qrlsuite.studies.together import StudiesTogether
 from qrlsuite.training.trainer import count_parameters
 
 ROOT = Path(__file__).parents[1]
@@ -31,6 +33,7 @@ PAGES = [
         "docs/fidelity.md",
         "docs/leaderboard.md",
         "docs/plans.md",
+        "docs/quantum-or-not.md",
         "leaderboard/README.md",
     )
 ]
@@ -83,6 +86,15 @@ def entries(outcome: StudyOutcome) -> Rows:
                 hours_text(entry["core_hours"]),
                 circuits,
             )
+
+
+def together(names: str) -> Rows:
+    """The pairs that several studies share, on average over their tasks."""
+    read = StudiesTogether(tuple(map(published, names.split("+"))))
+    for place, sheet in enumerate(part for part in read.parts() if isinstance(part, Sheet)):
+        if not place:
+            yield [column.head for column in sheet.columns]
+        yield from sheet.rows
 
 
 def _chosen(sheet: Sheet, heads: Sequence[str]) -> Rows:
@@ -156,7 +168,9 @@ def filled(text: str) -> str:
 
     def table(found: re.Match[str]) -> str:
         name, kind = found.groups()
-        if kind in OF_BOARDS:
+        if kind == "together":
+            header, *rows = together(name)
+        elif kind in OF_BOARDS:
             header, *rows = OF_BOARDS[kind](name)
         else:
             header, *rows = OF_STUDIES[kind](published(name))

@@ -27,6 +27,7 @@ from qrlsuite.results.survey import outline
 if TYPE_CHECKING:
     from qrlsuite.studies.outcome import StudyOutcome
     from qrlsuite.studies.runner import Overview
+    from qrlsuite.studies.together import StudiesTogether
 
 PICTURE = "picture"
 """The one kind that nothing registers."""
@@ -42,7 +43,7 @@ def describe(
     format: str | None = None,
     runs: str | PathLike[str] = "runs",
     published: bool = False,
-) -> dict[str, Any] | Overview | StudyOutcome:
+) -> dict[str, Any] | Overview | StudyOutcome | StudiesTogether:
     """Describe a registered thing, a picture, an entry or a study.
 
     Parameters
@@ -63,7 +64,7 @@ def describe(
 
     Returns
     -------
-    dict or Overview or StudyOutcome
+    dict or Overview or StudyOutcome or StudiesTogether
         Of a study how far it is, as `read_study` returns it.
 
     Raises
@@ -76,7 +77,7 @@ def describe(
     folder = Path(runs)
     of_ansatz = bool(settings or out or format)
     among = [] if kind == PICTURE else [specs.kind(kind)] if kind else list(specs.KINDS.values())
-    if specs.StudySpec in among and (name.endswith(".toml") or published_studies.folder_of(name)):
+    if specs.StudySpec in among and is_study(name):
         among = [specs.StudySpec]
     known = registry.load()
     found = [each for each in among if name in known.of(each)]
@@ -113,6 +114,11 @@ def describe(
         return _code_of_plugin(found[0], name)
     content = catalog.describe(found[0], name)
     return content | ({"promises": rules.load(name).promise} if found[0] is specs.RuleSpec else {})
+
+
+def is_study(name: str) -> bool:
+    """Return whether a name can only be a study's: that of its file, or of a published one or its folder."""
+    return name.endswith(".toml") or published_studies.folder_of(name) is not None
 
 
 def _ansatz(

@@ -37,6 +37,7 @@ from qrlsuite.studies.looks import StudyWithLooks
 from qrlsuite.studies.outcome import StudyOutcome
 from qrlsuite.studies.runner import PendingEntry
 from qrlsuite.studies.study import Member, Study
+from qrlsuite.studies.together import StudiesTogether
 
 ALL = "all"
 """In the place of a study's name: every registered one."""
@@ -156,14 +157,17 @@ def _plugins_of(study: StudyWithLooks, file: Path) -> str:
 
 
 def read_study(
-    name: str, *, runs: str | PathLike[str] = "runs", published: bool = False
-) -> study_runner.Overview | StudyOutcome:
+    name: str, *more: str, runs: str | PathLike[str] = "runs", published: bool = False
+) -> study_runner.Overview | StudyOutcome | StudiesTogether:
     """Read how far a study is: what is trained and missing of it, or what its looks have decided. Trains nothing.
 
     Parameters
     ----------
     name:
         A study (`qrlsuite list studies`), a study file's path, or a folder with a published study.
+    more:
+        Further studies with looks, each of another task: then the pairs that all of them compare are read together, on
+        average over the tasks.
     runs:
         The results folder. A published study with looks that has not begun there is read as it was published.
     published:
@@ -172,10 +176,12 @@ def read_study(
     Raises
     ------
     UnknownNameError, OptionError, FileError
-        If there is no such study, or it is malformed.
+        If there is no such study, or it is malformed, or several cannot be read together.
     StoreError
         If its results are damaged, or were changed after a look.
     """
+    if more:
+        return StudiesTogether(tuple(_outcome(each, Path(runs)) for each in (name, *more)))
     study, folder = studies.find(name), Path(runs)
     if study.file.looks is not None:
         return studies.read_outcome(name, folder)
@@ -184,6 +190,13 @@ def read_study(
     pairs = studies.decided_pairs(studies.read(folder, members, published).values())
     counts = studies.published_seeds(items) if published else None
     return study_runner.Overview(study, items, where.workers, pairs, counts)
+
+
+def _outcome(name: str, runs: Path) -> StudyOutcome:
+    """Read a study that must have looks."""
+    if studies.find(name).file.looks is None:
+        raise OptionError(f"study '{name}' has no looks: only studies with looks are read together")
+    return studies.read_outcome(name, runs)
 
 
 def run_study(

@@ -14,9 +14,11 @@ here knows about tasks, stores or commands, and importing it costs no more than 
 
 from qrlsuite.statistics.across import (
     AcrossTasks,
+    MeanRatio,
     across_tasks,
     horizon_shares,
     interquartile_mean,
+    mean_ratio,
     probability_of_improvement,
     rliable_arrays,
 )
@@ -77,6 +79,7 @@ __all__ = [
     "IntervalRule",
     "LearningCurves",
     "MaxT",
+    "MeanRatio",
     "MeanTime",
     "Need",
     "Outcome",
@@ -110,6 +113,7 @@ __all__ = [
     "horizon_shares",
     "interquartile_mean",
     "last_epochs",
+    "mean_ratio",
     "mean_time",
     "nominal_levels",
     "outperformance",

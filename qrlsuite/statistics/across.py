@@ -3,10 +3,12 @@
 One number per run and task, in [0, 1], less is better: `horizon_shares`. The aggregates are those of rliable
 (Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice"): mean and
 interquartile mean with a stratified bootstrap (runs are redrawn within tasks), and the probability of improvement.
+Of one pair, `mean_ratio` averages the ratios of the mean times, so that no task counts for more because it is longer.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -17,8 +19,8 @@ from qrlsuite.errors import OptionError
 from qrlsuite.statistics.curves import LearningCurves
 from qrlsuite.statistics.grid import FloatArray, Grid, IntArray, whole
 from qrlsuite.statistics.permutation import CHUNK, relabelings, relabelings_for
-from qrlsuite.statistics.times import check_probability, times_below
-from qrlsuite.statistics.times_board import holm
+from qrlsuite.statistics.times import check_probability, student_quantile, times_below
+from qrlsuite.statistics.times_board import holm, log_ratios
 
 Scores = Mapping[str, Sequence[ArrayLike] | NDArray[np.floating]]
 """For each entry K arrays (runs,), one per task, or rliable's array (runs, tasks)."""
@@ -237,3 +239,86 @@ def rliable_arrays(scores: Scores) -> dict[str, FloatArray]:
         n_runs = min(len(each) for each in tasks)
         arrays[name] = np.stack([each[:n_runs] for each in tasks], axis=1)
     return arrays
+
+
+@dataclass(frozen=True, slots=True)
+class MeanRatio:
+    """How many more steps the second of two entries needs, on average over K tasks; all differences are ratios minus 1.
+
+    Attributes
+    ----------
+    differences:
+        On each task: the second's mean time over the first's.
+    difference, interval:
+        The geometric mean of the ratios over the tasks, and its confidence interval. The tasks are fixed: only the
+        seeds are drawn, so nothing follows for other tasks.
+    p:
+        Two-sided, of no mean difference.
+    left_out:
+        Least and greatest `difference` when one of the tasks is left out.
+    """
+
+    differences: tuple[float, ...]
+    difference: float
+    interval: tuple[float, float]
+    p: float
+    left_out: tuple[float, float]
+
+
+def mean_ratio(pairs: Sequence[tuple[IntArray, IntArray]], level: float = 0.95) -> MeanRatio:
+    """Compare two entries on average over tasks, by the log ratios of their mean times.
+
+    The error of each task's log ratio is that of the delta method; the mean's has Welch and Satterthwaite's degrees of
+    freedom.
+
+    Parameters
+    ----------
+    pairs:
+        Of each of two or more tasks the times of the first and the second entry, (N, E): as of `times_below`.
+    level:
+        Of the interval.
+
+    Raises
+    ------
+    OptionError
+        If there are fewer than two tasks, fewer than two runs of an entry, or an entry whose times are all 0.
+
+    Examples
+    --------
+    Twice the steps on one task, half on the other:
+
+    >>> short, long = np.array([[1000], [3000]]), np.array([[2000], [6000]])
+    >>> found = mean_ratio([(short, long), (long, short)])
+    >>> [round(each, 9) for each in (*found.differences, abs(found.difference), *found.left_out)]
+    [1.0, -0.5, 0.0, -0.5, 1.0]
+    """
+    check_probability(level, "level")
+    if len(pairs) < 2:
+        raise OptionError("a mean over tasks needs two tasks or more")
+    if any(len(each) < 2 for pair in pairs for each in pair):
+        raise OptionError("a mean over tasks needs two runs or more of each entry on every task")
+    found = [log_ratios(pair) for pair in pairs]
+    ratios, errors, freedoms = (np.array([float(each[part][1, 0]) for each in found]) for part in range(3))
+    if not np.isfinite(ratios).all():
+        raise OptionError("an entry is below no threshold for a single step: there is no ratio of mean times")
+    variance, slack = (errors**2).sum(), (errors**4 / freedoms).sum()
+    freedom = variance**2 / slack if slack else math.inf
+    mean, error = ratios.mean(), math.sqrt(variance) / len(pairs)
+    reach = error * float(student_quantile((1 + level) / 2, freedom))
+    others = (ratios.sum() - ratios) / (len(ratios) - 1)
+    return MeanRatio(
+        tuple(np.expm1(ratios).tolist()),
+        math.expm1(mean),
+        (math.expm1(mean - reach), math.expm1(mean + reach)),
+        _two_sided(mean, error, freedom),
+        (math.expm1(others.min()), math.expm1(others.max())),
+    )
+
+
+def _two_sided(mean: float, error: float, freedom: float) -> float:
+    """Return Student's two-sided p; without an error, 0 of a difference and 1 of none."""
+    from scipy.special import stdtr
+
+    if error == 0:
+        return float(mean == 0)
+    return float(2 * stdtr(freedom, -abs(mean) / error))

@@ -637,3 +637,53 @@ def test_far_more_seeds_than_the_last_look_are_not_counted(seeds: int, said: str
     outcome: Any = SimpleNamespace(study=study, state=SimpleNamespace(ended=None))
     needs = {"level": 0.0021, "seeds": 40, "seeds_at_this_difference": seeds}
     assert needs_text(outcome, needs) == f"p <= 0.0021 at 40 seeds; {said} difference stays as it is now"
+
+
+TOGETHER = ("quantum-or-not", "quantum-or-not-degree5", "quantum-or-not-a3-0")
+
+
+def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks() -> None:
+    found = answer("show", *TOGETHER)
+    outcomes = [api.read_study(name) for name in TOGETHER]
+    assert found["tasks"] == ["beam6g", "beam6g-degree5", "beam6g-a3-0"]
+    assert found["seeds"] == [20, 20, 20]
+    families = [{(pair["first"], pair["second"]) for pair in each.as_dict()["pairs"]} for each in outcomes]
+    assert [(pair["first"], pair["second"]) for pair in found["pairs"]] == [
+        (pair["first"], pair["second"])
+        for pair in outcomes[0].as_dict()["pairs"]
+        if all((pair["first"], pair["second"]) in family for family in families)
+    ]
+    for pair in found["pairs"]:
+        logs = []
+        for each in outcomes:
+            first, second = (
+                np.mean([each.state.curves[pair[side]].values[:20] < t for t in each.study.grid.thresholds])
+                for side in ("first", "second")
+            )  # of all epochs: a pair that went on counts with its first look, too
+            logs.append(math.log(second / first))
+        assert list(pair["differences"].values()) == pytest.approx(np.expm1(logs))
+        assert pair["difference"] == pytest.approx(math.expm1(np.mean(logs)))
+        assert pair["interval"][0] < pair["difference"] < pair["interval"][1]
+    went_on = next(pair for pair in found["pairs"] if pair["second"] == "width 32")
+    last_look = next(
+        pair for pair in outcomes[0].pairs if (pair.first, pair.second) == ("10 qubits", "width 32")
+    )
+    assert last_look.n_runs == 100
+    assert went_on["differences"]["beam6g"] != pytest.approx(last_look.difference, abs=1e-6)
+    shown = say("show", "study", *TOGETHER).stdout
+    assert "nothing follows for other tasks" in shown
+    assert shown.count("10 qubits / width 14") == 1
+
+
+def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> None:
+    write()
+    for names, said in (
+        ((TOGETHER[0], TOGETHER[0]), "two studies are of task 'beam6g'"),
+        ((TOGETHER[0], "memory"), "two studies are of task 'beam6g'"),
+        ((TOGETHER[0], "quantum-or-not-cartpole"), "have no pair of entries in common"),
+        ((TOGETHER[0], "fig7"), "study 'fig7' has no looks"),
+        ((TOGETHER[0], "widths.toml"), "'widths' has not taken its first look: qrlsuite study run widths"),
+        ((TOGETHER[0], "mlp"), "unknown study 'mlp'"),
+        (("mlp", "gru", "drqn"), "or several studies"),
+    ):
+        assert said in refused("show", *names)

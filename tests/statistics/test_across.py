@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
+from scipy.stats import t as student
 
 from qrlsuite.errors import OptionError
 from qrlsuite.statistics import (
@@ -16,6 +17,7 @@ from qrlsuite.statistics import (
     across,
     across_tasks,
     horizon_shares,
+    mean_ratio,
     probability_of_improvement,
     rliable_arrays,
 )
@@ -114,3 +116,61 @@ def test_arrays_as_rliable_takes_them() -> None:
 def test_bad_scores_are_named(scores: Any, message: str) -> None:
     with pytest.raises(OptionError, match=message):
         across_tasks(scores)
+
+
+def times_of(seed: int, mean: float, runs: int = 20, spread: float = 0.28) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return mean * np.clip(1 + spread * generator.standard_normal((runs, 1)), 0.05, None)
+
+
+def test_a_mean_ratio_is_that_of_the_delta_method() -> None:
+    pairs = [
+        (times_of(1, 1000), times_of(2, 1500, runs=31)),
+        (times_of(3, 70), times_of(4, 60)),
+        (times_of(5, 9), times_of(6, 9, runs=25)),
+    ]
+    found = mean_ratio(pairs)
+    logs = [np.log(b.mean() / a.mean()) for a, b in pairs]
+    parts = [[each.var(ddof=1) / each.mean() ** 2 / len(each) for each in pair] for pair in pairs]
+    counts = np.array([[len(each) for each in pair] for pair in pairs])
+    error = np.sqrt(np.sum(parts)) / 3
+    freedom = np.sum(parts) ** 2 / (np.array(parts) ** 2 / (counts - 1)).sum()
+    expected = student.interval(0.95, freedom, np.mean(logs), error)
+    assert found.differences == pytest.approx(np.expm1(logs))
+    assert found.interval == pytest.approx(np.expm1(expected))
+    assert found.p == pytest.approx(2 * student.sf(abs(np.mean(logs)) / error, freedom))
+    without = [np.mean(logs[:place] + logs[place + 1 :]) for place in range(3)]
+    assert found.left_out == pytest.approx((np.expm1(min(without)), np.expm1(max(without))))
+    turned = mean_ratio([(b, a) for a, b in pairs])
+    assert turned.p == pytest.approx(found.p)
+    assert turned.difference == pytest.approx(1 / (1 + found.difference) - 1)
+
+
+def test_a_mean_ratio_errs_as_often_as_it_says() -> None:
+    """Tasks differ in sign, their mean is 0: about 5 percent of p below .05, 95 percent of intervals around 0."""
+    false, covered, times = 0, 0, 1000
+    for study in range(times):
+        ratios = (1.5, 1 / 1.5, 1.0)
+        found = mean_ratio(
+            [
+                (times_of(7 * study + task, 1000), times_of(100_000 + 7 * study + task, 1000 * ratio))
+                for task, ratio in enumerate(ratios)
+            ]
+        )
+        false += found.p <= 0.05
+        covered += found.interval[0] <= 0 <= found.interval[1]
+    assert covered == times - false
+    assert 0.03 < false / times < 0.075
+
+
+def test_a_mean_ratio_needs_tasks_runs_and_times() -> None:
+    one = (times_of(0, 10), times_of(1, 10))
+    with pytest.raises(OptionError, match="two tasks or more"):
+        mean_ratio([one])
+    with pytest.raises(OptionError, match="two runs or more"):
+        mean_ratio([one, (one[0][:1], one[1])])
+    with pytest.raises(OptionError, match="no ratio"):
+        mean_ratio([one, (one[0] * 0, one[1])])
+    same = np.full((20, 1), 5)
+    assert mean_ratio([(same, same), (same, same)]).p == 1
+    assert mean_ratio([(same, 2 * same), (same, same)]).p == 0

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from qrlsuite.api.showing import describe
+from qrlsuite.api.showing import describe, is_study
 from qrlsuite.cli.arguments import JsonOption, PublishedOption, RunsOption, split_settings
 from qrlsuite.engine.terminal import printable_lines, table_console
 
@@ -24,7 +24,8 @@ def show(
         list[str] | None,
         typer.Argument(
             metavar="NAME|OPTION=VALUE",
-            help="With a kind first, the name: `show ansatz iqp`. Options of an ansatz, and qubits=4 layers=2.",
+            help="With a kind first, the name: `show ansatz iqp`. Further studies, each of another task. Options of an "
+            "ansatz, and qubits=4 layers=2.",
         ),
     ] = None,
     out: Annotated[
@@ -52,21 +53,28 @@ def show(
     """Show options with their defaults and meaning, a task's protocol, how far a study is, or how an entry was made.
 
     A study is given by name, or as its file or the folder of a published one. Of a study you see the seeds that are
-    finished and what the missing ones will take; of a study with looks what is decided, and what open pairs need.
+    finished and what the missing ones will take; of a study with looks what is decided, and what open pairs need; of
+    several, each of another task, the pairs that all of them compare, on average over the tasks.
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp qubits=4;
     qrlsuite show ansatz iqp --format qasm3; qrlsuite show picture bars; qrlsuite show fig7 --published;
-    qrlsuite show "cartpole/reinforce mlp" --published
+    qrlsuite show "cartpole/reinforce mlp" --published; qrlsuite show quantum-or-not quantum-or-not-degree5
     """
     names, settings = split_settings(words)
-    if len(names) > 1:
+    studies = names if name == "study" else [name, *names] if is_study(name) else []
+    if len(studies) > 1 and not (settings or code or out or format):
+        from qrlsuite.api.studies import read_study  # slow to import, and nothing else needs it
+
+        found: Any = read_study(*studies, runs=runs)
+    elif len(names) > 1:
         raise typer.BadParameter(
-            f"{' '.join([name, *names])}: give one name, with a kind before it or without"
+            f"{' '.join([name, *names])}: give one name, with a kind before it or without; or several studies"
         )
-    kind, target = (name, names[0]) if names else (None, name)
-    found = describe(
-        target, kind, settings=settings, code=code, out=out, format=format, runs=runs, published=published
-    )
+    else:
+        kind, target = (name, names[0]) if names else (None, name)
+        found = describe(
+            target, kind, settings=settings, code=code, out=out, format=format, runs=runs, published=published
+        )
     if json_output:
         typer.echo(json.dumps(found if isinstance(found, dict) else found.as_dict()))
     elif not isinstance(found, dict):
