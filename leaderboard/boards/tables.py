@@ -318,7 +318,9 @@ def facts(section: Section) -> list[str]:
     if tuned:
         lines.append(
             "settings found by tuning: "
-            + ", ".join(f"{entry.label} ({_tuning_text(entry.tuning or {})})" for entry in tuned)
+            + ", ".join(
+                f"{entry.label} ({_tuning_text(entry.tuning or {}, entry.preset)})" for entry in tuned
+            )
         )
     mixed = [row.entry for row in section.rows if row.entry.mixed_versions]
     if mixed:
@@ -347,7 +349,7 @@ def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
 
 
 def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
-    """Say which entries have curves that another program made, and which began with trained agents."""
+    """Say which entries have curves that another program made, began with trained agents, or had other code."""
     lines = {
         "curves that other programs made, and nobody here can train or check again": [
             entry.label for entry in entries if entry.external
@@ -358,7 +360,23 @@ def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
             if START in entry.identity
         ],
     }
-    return [f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels]
+    return [*(f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels), *_edited(entries)]
+
+
+def _edited(entries: Sequence[EntryResults]) -> list[str]:
+    """Say of which plugin's file entries were trained with different contents: a circuit, and its control of before."""
+    lines = []
+    for name in sorted({name for entry in entries for name in entry.plugins}):
+        groups: dict[frozenset[str], list[str]] = {}
+        for entry in entries:
+            if name in entry.plugins:
+                groups.setdefault(entry.plugins[name], []).append(entry.label)
+        if len(groups) > 1:
+            texts = " | ".join(", ".join(labels) for labels in groups.values())
+            lines.append(
+                f"{name} was edited between these entries, see `qrlsuite show ENTRY --identity`: {texts}"
+            )
+    return lines
 
 
 def unequal_tuning(section: Section) -> list[str]:
@@ -376,11 +394,15 @@ def unequal_tuning(section: Section) -> list[str]:
     return lines
 
 
-def _tuning_text(tuning: Mapping[str, Any]) -> str:
-    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`."""
+def _tuning_text(tuning: Mapping[str, Any], preset: str | None) -> str:
+    """Say what finding an entry's settings took, as far as it is known: `7 trials, 0.12 core-hours`.
+
+    A preset's own note comes first: the settings may have been found for another size of the model.
+    """
     units = {"trials": "trials", "steps": "steps", "core_hours": "core-hours"}
     known = [f"{tuning[name]:,} {unit}" for name, unit in units.items() if tuning.get(name) is not None]
-    return ", ".join(known) or "budget not known"
+    text = ", ".join(known) or "budget not known"
+    return f"preset '{preset}', {tuning['note']}: {text}" if preset and tuning.get("note") else text
 
 
 SIGNS = {Direction.FEWER: "+", Direction.MORE: "-", Direction.TRADE_OFF: "+/-"}

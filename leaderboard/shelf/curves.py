@@ -20,7 +20,7 @@ from qrlsuite.engine.terminal import Shown
 from qrlsuite.errors import OptionError, QrlSuiteError, StoreError
 from qrlsuite.experiment.task import Task, TaskFile
 from qrlsuite.experiment.task import load as load_task
-from qrlsuite.results import probes, provenance
+from qrlsuite.results import codes, probes, provenance
 from qrlsuite.results.seeds import parse_seeds, read_seeds
 from qrlsuite.results.store import MEASURED
 from qrlsuite.results.text import counted
@@ -53,6 +53,8 @@ class EntryResults(Shown):
         Whether any of these hours are by the clock and not processor time; None where the record does not say.
     codes:
         Digests of the code identities of its seeds; none where all code is the suite's with its first bits, or unknown.
+    plugins:
+        Of the plugins by path among that code, by file name: which contents trained its seeds.
     identity:
         What the entry's hash covers: task, algorithm, model and their resolved options.
     options:
@@ -126,6 +128,7 @@ class EntryResults(Shown):
     fixed: int = 0
     clocked: bool | None = None
     codes: tuple[str, ...] = ()
+    plugins: Mapping[str, frozenset[str]] = field(default_factory=dict)
     refused: tuple[str, ...] = ()
     unprobed: bool = False
     chosen_seeds: str = ""
@@ -203,6 +206,7 @@ class EntryResults(Shown):
             unprobed=any(map(probes.third_party, made_with)) and probes.EQUAL not in probed,
             first_thresholds=task_file.ranking.grid.thresholds,
             external=bool(record.get("imported")),
+            plugins=codes.contents(record, facts.get("codes", ())),
             **facts,
         )
 

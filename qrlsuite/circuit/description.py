@@ -87,8 +87,10 @@ CONTROLLED: dict[str, tuple[float, float, float]] = {
 }
 """Gates without angles as U3, phase included: so they are written where they have a control."""
 
-COMPOSED = {f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"} | {
-    f"ISING{axis}{axis}": f"R{axis}{axis}" for axis in "XYZ"
+COMPOSED = {
+    "CX": "CNOT",
+    **{f"CR{axis}": f"R{axis} with control=q" for axis in "XYZ"},
+    **{f"ISING{axis}{axis}": f"R{axis}{axis}" for axis in "XYZ"},
 }
 """Gates that others have, and how to append them here."""
 
@@ -506,7 +508,7 @@ class Circuit:
             self._append_ising(gate, wires, angles, control)
             return
         if gate not in GATES:
-            hint = COMPOSED.get(gate.upper())
+            hint = COMPOSED.get(gate.upper()) or {name.upper(): name for name in GATES}.get(gate.upper())
             known = f"; write it as {hint}" if hint else nearest(gate, [*GATES, *ISING])
             raise CircuitError(f"unknown gate '{gate}'{known}")
         signature = GATES[gate]

@@ -352,6 +352,20 @@ def _kept(store: EntryStore, record: Mapping[str, Any]) -> Mapping[str, list[str
     return kept
 
 
+def contents(record: Mapping[str, Any], digests: Iterable[str]) -> dict[str, frozenset[str]]:
+    """Return which contents of plugins by path belong to some codes of an entry, by the plugin's file name.
+
+    What a damaged record says of copies is left out: nothing is opened by it.
+    """
+    kept, found = record.get("plugins"), dict[str, set[str]]()
+    places = [kept.get(digest, []) for digest in digests] if isinstance(kept, dict) else []
+    for place in (each for of_code in places if isinstance(of_code, list) for each in of_code):
+        if isinstance(place, str) and _COPY.fullmatch(place):
+            _, mark, name = place.split("/")
+            found.setdefault(name, set()).add(mark)
+    return {name: frozenset(marks) for name, marks in found.items()}
+
+
 def _copied(store: EntryStore, plugin: own.Source) -> str:
     """Copy a plugin into an entry's folder, whatever is there in its place; returns where it is in that folder."""
     place = f"{PLUGINS}/{plugin.mark}/{plugin.name}"

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from qrlsuite import files, options
 from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
 from qrlsuite.experiment.preset import TUNING_SEEDS, EntryTuning
 from qrlsuite.experiment.task import digest
@@ -135,6 +136,8 @@ class StudyWithLooks:
         self.source, self.runs = study.source, runs
         self.folder = runs / FOLDER / study.name
         self.file, members = _fixed(study)
+        if self.begun and (self.folder / FILE).is_file():
+            self.file = _with_code_of(self.file, load_kept(self.folder / FILE).file)
         self.looks = self.file.looks or LooksSection()
         self.hash = _hash(self.file)
         self.epochs = self.looks.epochs or 0
@@ -209,6 +212,12 @@ class StudyWithLooks:
             Saying what was changed, or which seeds were trained.
         """
         if not self.begun:
+            for table, (name, entry) in zip(self.file.entries, self.entries.items()):
+                if table.code not in (None, code_of(entry)):
+                    raise OptionError(
+                        f"{self.source}: the code of '{name}' is not what it was when the study was written, and its "
+                        "hash covers that code: restore it, or write another study with `qrlsuite study new`"
+                    )
             for name, seeds, path in self.trained_before():
                 raise OptionError(
                     f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a study "
@@ -485,8 +494,24 @@ def _fixed_table(member: Member, named: bool) -> EntriesSection:
             "options": values,
             "hash": entry.hash,
             "tuning": None if tuning is None or preset is not None else EntryTuning(**tuning),
+            "code": code_of(entry),
         }
     )
+
+
+def code_of(entry: Entry) -> str | None:
+    """Return the digest of an entry's code where a plugin's is among it; None where all is the suite's."""
+    return identity.of(entry).digest if entry.third_party() else None
+
+
+def _with_code_of(file: StudyFile, kept: StudyFile) -> StudyFile:
+    """Return a study that has begun, with the code that its entries had then: with another one, training is refused."""
+    codes = {table.hash: table.code for table in kept.entries}
+    tables = [
+        table.model_copy(update={"code": codes[table.hash]}) if table.hash in codes else table
+        for table in file.entries
+    ]
+    return file.model_copy(update={"entries": tables})
 
 
 def _difference(entry: Entry, other: Entry) -> dict[str, Any]:
@@ -508,10 +533,10 @@ def _content(file: StudyFile) -> dict[str, Any]:
     looks = (file.looks or LooksSection()).model_dump(mode="json")
     if not looks["questions"]:
         del looks["questions"]
-    keys = {"model", "algorithm", "preset", "options", "hash", "name", "tuning"}
+    keys = {"model", "algorithm", "preset", "options", "hash", "name", "tuning", "code"}
     entries = [table.model_dump(mode="json", include=keys) for table in file.entries]
     for entry in entries:
-        for key in ("name", "tuning"):
+        for key in ("name", "tuning", "code"):
             if entry[key] is None:
                 del entry[key]
     return {"format_version": 1, "name": file.name, "task": file.entries[0].task, **looks, "entries": entries}

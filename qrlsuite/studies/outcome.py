@@ -214,7 +214,7 @@ class StudyOutcome(Shown):
                 "last look"
             )
         if state.begun_at:
-            yield Text(f"first seed begun {state.begun_at}")
+            yield Text(f"hash {study.hash}, first seed begun {state.begun_at}")
         for seeds, when in facts["looks_taken"].items():
             yield Text(f"look at {seeds} seeds taken {when}")
         if note := reason_note(study):

@@ -73,6 +73,10 @@ class EntriesSection(Table):
         EntryTuning | None,
         Field(description="with looks: how the options were found, where a preset file gave them"),
     ] = None
+    code: Annotated[
+        str | None,
+        Field(description="with looks: the code identity of an entry that a plugin's code computes"),
+    ] = None
 
 
 class Question(Table):

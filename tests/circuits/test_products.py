@@ -180,6 +180,8 @@ def test_products_are_drawn():
         (lambda c: c.append("RX", 0, c.input(0) * float("inf")), "numbers must be finite"),
         (lambda c: c.append("RZZ", 0, 0.1), "RZZ takes 2 wires, 1 angle and no control"),
         (lambda c: c.append("RXY", (0, 1), 0.1), "unknown gate 'RXY'; did you mean"),
+        (lambda c: c.append("Ry", 0, 0.1), "unknown gate 'Ry'; write it as RY"),
+        (lambda c: c.append("cx", (0, 1)), "unknown gate 'cx'; write it as CNOT"),
         (lambda c: c.measure([(0, 1), (1, 0)]), "distinct groups of them, or products"),
         (lambda c: c.measure([(0, 0)]), "are needed"),
         (lambda c: c.measure(["X0", "X9"]), r"observables \['X0', 'X9'\]: distinct qubits 0\.\."),

@@ -227,6 +227,43 @@ def test_a_study_and_a_task_name_their_plugins(folder: Path) -> None:
     assert len(list((folder / "runs" / "tiny").iterdir())) == 1, "the entry is the same"
 
 
+def test_a_board_says_that_a_file_was_edited_between_its_entries(trained: Path) -> None:
+    words = ("--task", "tiny", "--runs", "runs")
+    other = ENTRY.replace("layers=1", "layers=2")
+    run(trained, entry=other)
+    first, second = (f"vqc-native qubits=2 layers={layers} ansatz=ring" for layers in (1, 2))
+    compare = ("compare", first, second, *words)
+    said = "ring.py was edited between these entries"
+    before = qrlsuite(*compare, cwd=trained)
+    assert (before.returncode, said in before.stdout) == (0, False), before.stderr
+    (trained / "ring.py").write_text(RING.replace('"RX"', '"RY"'))
+    run(trained, "--fresh", entry=other)
+    assert said in " ".join(qrlsuite(*compare, cwd=trained).stdout.split())
+    board = " ".join(qrlsuite("leaderboard", *words, cwd=trained).stdout.split())
+    assert f"{said}, see `qrlsuite show ENTRY --identity`: " in board
+    assert " | " in board
+
+
+def test_the_hash_of_a_study_with_looks_covers_the_code(folder: Path) -> None:
+    words = ("--task", "tiny.toml", "--plugin", "ring.py")
+    looks = "2,4 first_seed=200 reason=a-test"
+    done = qrlsuite("study", "new", "s.toml", ENTRY, "mlp width=4", *words, "--looks", looks, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    shown = json.loads(qrlsuite("show", "s.toml", "--json", "--plugin", "ring.py", cwd=folder).stdout)
+    again = qrlsuite("study", "new", "again.toml", ENTRY, "mlp width=4", *words, "--looks", looks, cwd=folder)
+    assert again.returncode == 0, again.stderr
+    ring = folder / "ring.py"
+    ring.write_text(RING.replace('"RX"', '"RY"'))
+    for command in (("study", "run"), ("show",)):
+        edited = qrlsuite(*command, "s.toml", cwd=folder)
+        assert edited.returncode == 2
+        assert "is not what it was when the study was written, and its hash covers that code" in edited.stderr
+    ring.write_text(RING)
+    assert qrlsuite("study", "run", "s.toml", cwd=folder).returncode == 0
+    begun = qrlsuite("show", "s.toml", cwd=folder).stdout
+    assert f"hash {shown['hash']}, first seed begun" in begun
+
+
 def test_other_commands_take_it_too(folder: Path) -> None:
     for words, expected in (
         (("show", "ansatz", "ring"), "distribution: ring.py"),
