@@ -116,7 +116,7 @@ class PairVerdict:
             )
         match pair.direction:
             case Direction.UNDECIDED:
-                return f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); {self._not_told_apart}"
+                return f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); so far {self._not_told_apart}"
             case Direction.NOT_TOLD_APART:
                 return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p})"
             case Direction.TRADE_OFF:

@@ -88,14 +88,14 @@ def test_equals_are_not_told_apart_and_few_are_undecided() -> None:
     )
     few = compare_entries(entry("few", spread(20, 10)), second)
     assert few.verdict.startswith(
-        "undecided: fewer than 20 seeds (10 and 30 seeds); few needs 0.0% fewer steps"
+        "undecided: fewer than 20 seeds (10 and 30 seeds); so far few needs 0.0% fewer steps"
     )
     assert {row[-2:] for row in few.pair.rows()} == {("-", "undecided")}
     assert "p " not in few.pair.final.partition(";")[0]
     one = compare_entries(entry("one", spread(20, 1)), second)
     assert (
         one.verdict
-        == "undecided: fewer than 20 seeds (1 and 30 seeds); one needs 9.1% fewer steps than second"
+        == "undecided: fewer than 20 seeds (1 and 30 seeds); so far one needs 9.1% fewer steps than second"
     )
     assert one.pair.final == ""
 

@@ -386,7 +386,7 @@ def test_two_entries_of_few_seeds_have_a_verdict_and_an_axis(opened: Open, exter
     few = [boards.entry(label, 10, speed=speed) for label, speed in (("one", 3), ("other", 1))]
     tab = opened(boards.of([dataclasses.replace(entry, external=external) for entry in few]))
     (said,) = tab.locator("#board-0 .verdicts .verdict").all_inner_texts()
-    assert said.startswith("undecided: fewer than 20 seeds (10 seeds each); one")
+    assert said.startswith("undecided: fewer than 20 seeds (10 seeds each); so far one")
     axis = tab.locator("#board-0 .plot svg").first.text_content()
     assert "score" in axis
     assert ("validation score" in axis) is not external

@@ -18,6 +18,8 @@ from qrlsuite.cli.arguments import (
     RunsOption,
     entries_here,
 )
+from qrlsuite.engine.terminal import command
+from qrlsuite.statistics import Direction
 
 
 def compare(
@@ -51,3 +53,7 @@ def compare(
         typer.echo(json.dumps(comparison.as_dict()))
         return
     Console().print(comparison)
+    if comparison.pair.times.direction in (Direction.UNDECIDED, Direction.NOT_TOLD_APART):
+        among = ["--task", task] if task else []
+        words = [*among, "--published"] if published else among
+        typer.echo(f"how many seeds it takes: {command('power', first, second, *words, runs=runs)}")
