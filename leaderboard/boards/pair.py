@@ -116,7 +116,9 @@ class PairVerdict:
             )
         match pair.direction:
             case Direction.UNDECIDED:
-                return f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); so far {self._not_told_apart}"
+                return (
+                    f"undecided: fewer than {MIN_RUNS} seeds ({self._seeds}); so far {self._not_told_apart}"
+                )
             case Direction.NOT_TOLD_APART:
                 return f"not told apart: {self._not_told_apart} ({self._seeds}, {self._p})"
             case Direction.TRADE_OFF:
@@ -217,9 +219,11 @@ class PairVerdict:
             return ""
         low, high = self.scores.difference_interval[0, 1]
         one, other = self.scores.mean
+        digits = ".3f" if max(abs(one), abs(other)) >= 0.001 else ".3g"
+        means = f"{one:{digits}} against {other:{digits}}"
         p = "" if self.times.direction is Direction.UNDECIDED else f", {p_text(float(self.scores.p[0, 1]))}"
         return (
-            f"final {self.score_name}: {one:.3f} against {other:.3f}, difference {self.scores.difference[0, 1]:+.2g} "
+            f"final {self.score_name}: {means}, difference {self.scores.difference[0, 1]:+.2g} "
             f"({low:+.2g} to {high:+.2g}{p}); mean over the last tenth of the epochs ({self.n_last})"
         )
 

@@ -120,16 +120,18 @@ def import_points(
     by_entry: dict[str, dict[int, NDArray[np.float64]]] = defaultdict(dict)
     for (entry, seed), curve in sorted(scores.items()):
         by_entry[entry][seed] = curve
-    for entry, of_seeds in by_entry.items():
-        _require_no_copies(entry, of_seeds)
     told = {
         "grid": f"every {step} steps, the last score at or before; nothing interpolated",
         "maximum": best,
     }
-    return [
-        _write(entry, of_seeds, name, file, definition, told, points, runs)
-        for entry, of_seeds in by_entry.items()
-    ]
+    stores = {}
+    for entry, of_seeds in by_entry.items():
+        record = _record(entry, name, file, definition, told)
+        stores[entry] = EntryStore(runs / name / str(record["name"])), record
+        _require_no_copies(
+            entry, {seed: curves[entry, seed] for seed in of_seeds}, of_seeds, stores[entry][0]
+        )
+    return [_write(entry, of_seeds, *stores[entry], points) for entry, of_seeds in by_entry.items()]
 
 
 def _score_of(goal: Goal | None, metric: str | None, maximum: float | None) -> dict[str, Any]:
@@ -381,11 +383,21 @@ def _scores(
     return scores
 
 
-def _require_no_copies(entry: str, curves: Mapping[int, NDArray[np.float64]]) -> None:
-    """Refuse two seeds of one curve, but for curves of one or two values, which runs that learn nothing share."""
+def _require_no_copies(
+    entry: str,
+    curves: Mapping[int, NDArray[np.float64]],
+    scores: Mapping[int, NDArray[np.float64]],
+    store: EntryStore,
+) -> None:
+    """Refuse two seeds of one curve, but for curves of one or two values, which runs that learn nothing share.
+
+    Those that were imported before count, too; they are known as scores, in the unit of the task.
+    """
+    present = store.seeds() if store.path.is_dir() else []
+    before = {store.seed(seed).read().curve.tobytes(): seed for seed in present if seed not in curves}
     first: dict[bytes, int] = {}
     for seed, curve in curves.items():
-        other = first.setdefault(curve.tobytes(), seed)
+        other = before.get(scores[seed].tobytes(), first.setdefault(curve.tobytes(), seed))
         if other != seed and len(np.unique(curve)) > 2:
             raise FileError(
                 f"seeds {other} and {seed} of '{entry}' have the same curve: no two runs learn the same by chance; "
@@ -393,17 +405,10 @@ def _require_no_copies(entry: str, curves: Mapping[int, NDArray[np.float64]]) ->
             )
 
 
-def _write(
-    entry: str,
-    curves: Mapping[int, NDArray[np.float64]],
-    task: str,
-    file: TaskFile,
-    definition: Mapping[str, Any],
-    told: Mapping[str, Any],
-    points: Mapping[Run, Points],
-    runs: Path,
-) -> Imported:
-    """Write the seeds of an entry that are not there yet."""
+def _record(
+    entry: str, task: str, file: TaskFile, definition: Mapping[str, Any], told: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what `entry.json` says of an entry."""
     words = _notation_of(entry)
     identity = {
         "task": dict(definition),
@@ -412,12 +417,10 @@ def _write(
         "model": words[0],
         "model_options": {**words[1], "name": entry},
     }
-    name = f"{EXTERNAL}-{words[0]}-{digest(identity)[:8]}"
-    label = f"{EXTERNAL} {entry}"
-    record = {
-        "name": name,
+    return {
+        "name": f"{EXTERNAL}-{words[0]}-{digest(identity)[:8]}",
         "hash": digest(identity),
-        "label": label,
+        "label": f"{EXTERNAL} {entry}",
         "imported": dict(told),
         "preset": None,
         "task_name": task,
@@ -425,7 +428,17 @@ def _write(
         "task_file": file.model_dump(mode="json", exclude={"tuning"}),
         "identity": identity,
     }
-    store = EntryStore(runs / task / name)
+
+
+def _write(
+    entry: str,
+    curves: Mapping[int, NDArray[np.float64]],
+    store: EntryStore,
+    record: dict[str, Any],
+    points: Mapping[Run, Points],
+) -> Imported:
+    """Write the seeds of an entry that are not there yet."""
+    told = record["imported"]
     require_no_link(store.path.parent, store.path)
     if (store.path / "entry.json").exists():
         before = store.record()["imported"].get("maximum")
@@ -450,8 +463,9 @@ def _write(
         claim.release()
     lasts = [int(points[entry, seed].steps[-1]) for seed in curves]
     notes = differences(differing) + _notes(
-        entry, curves, lasts, sorted({*present, *new}), file.protocol.interactions
+        entry, curves, lasts, sorted({*present, *new}), record["task_file"]["protocol"]["interactions"]
     )
+    name, label, task = (str(record[key]) for key in ("name", "label", "task_name"))
     return Imported(store, name, label, task, tuple(new), tuple(known), tuple(notes))
 
 

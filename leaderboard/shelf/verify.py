@@ -223,7 +223,8 @@ def _finds(again: int, count: int) -> str:
     """Say which share of forged seeds this many find."""
     forged = plausible.forged_of(count)
     return (
-        f"{forged} wrong of {count} are met with probability {plausible.found_by(again, forged, count):.2f}"
+        f"if {forged} of {count} were forged, it would be found with probability "
+        f"{plausible.found_by(again, forged, count):.2f}"
     )
 
 
@@ -276,7 +277,12 @@ def _changed_code(entry: PublishedEntry, made_by: Entry) -> str | None:
     if made_with is None:
         return None
     changed = identity.differences(made_with.parts, identity.of(made_by).parts, numerics=False)
-    return f"its seeds cannot be trained again by this code: {listed(changed)}" if changed else None
+    lacking = (
+        "; --plugin PATH brings a plugin's file"
+        if any("not registered here" in each for each in changed)
+        else ""
+    )
+    return f"its seeds cannot be trained again by this code: {listed(changed)}{lacking}" if changed else None
 
 
 def _beginning(entry: PublishedEntry, made_by: Entry, places: Sequence[int]) -> str | None:

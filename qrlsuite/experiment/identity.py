@@ -259,8 +259,11 @@ def differences(before: Sequence[Part], now: Sequence[Part], numerics: bool = Tr
 def _changes(what: str, old: Part | None, new: Part | None) -> Iterator[str]:
     if old == new:
         return
-    if old is None or new is None:
-        yield f"{what} is {'new' if old is None else 'gone'}"
+    if new is None:
+        yield f"{what} of {(old or {}).get('distribution')} is not registered here"
+        return
+    if old is None:
+        yield f"{what} is new"
         return
     owner = new.get("distribution")
     if owner != old.get("distribution"):

@@ -29,6 +29,13 @@ from qrlsuite.results.run_files import MOST_POINTS, cells_of, lines_of, whole
 COLUMNS = ("entry", "seed", "step", "score")
 """Columns of a csv file or a table."""
 
+SYNONYMS: dict[str, tuple[str, ...]] = {
+    "entry": ("model", "algorithm", "algo", "agent", "name", "exp_name"),
+    "seed": ("run", "run_id", "trial"),
+    "step": ("steps", "timestep", "timesteps", "total_timesteps", "env_step", "env_steps", "global_step"),
+}
+"""What others call these columns. What the score is, only who has them knows: it is `score`, or named."""
+
 Run = tuple[str, int]
 """An entry's name and a seed."""
 
@@ -251,13 +258,25 @@ def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str
     FileError
         If one is missing, or there twice.
     """
-    wanted = (*COLUMNS[:3], metric or COLUMNS[3])
-    wrong = [name for name in wanted if list(names).count(name) != 1]
+    have = [name.lower() for name in names]
+    found, wrong, several = list[str](), list[str](), list[str]()
+    for column in COLUMNS:
+        wanted = metric if metric is not None and column == COLUMNS[3] else column
+        exact = [name for name in names if name == wanted]
+        alike = exact or [n for n, lower in zip(names, have) if lower in SYNONYMS.get(column, ())]
+        if len(alike) != 1:
+            wrong.append(wanted)
+            several += alike
+        found += alike[:1]
     if wrong:
         here = listed([ascii(name)[1:-1][:40] for name in names]) or "none"
         other = "; metric=NAME reads another column as the score" if wrong == [COLUMNS[3]] else ""
-        raise FileError(f"{source}: expected the columns {', '.join(wanted)}, each once; found {here}{other}")
-    return wanted
+        which = f"; rename all of {', '.join(several)} but one" if len(set(several)) > 1 else ""
+        raise FileError(
+            f"{source}: expected the columns {', '.join((*COLUMNS[:3], metric or COLUMNS[3]))}, each once; found {here}"
+            f"{which}{other}"
+        )
+    return tuple(found)
 
 
 def _add_row(rows: _Rows, values: Sequence[Any], source: str, place: str) -> None:

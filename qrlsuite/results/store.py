@@ -36,12 +36,14 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 
 from qrlsuite import registry, specs
+from qrlsuite.engine.terminal import again
 from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
 from qrlsuite.experiment.task import TaskFile
 from qrlsuite.results import genuine, parquet
 from qrlsuite.specs import NAME
+from qrlsuite.statistics.grid import settled
 
 FORMAT_VERSION = 1
 MEASURED = "measured"
@@ -233,8 +235,8 @@ def learning_curve(scores: NDArray[np.float32 | np.float64]) -> NDArray[np.float
 
 
 def round_means(means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round means of float32 scores to 7 decimals: a hundred scores of 0.95 have the mean 0.949999988 before."""
-    return np.round(means, 7)
+    """Round means of float32 scores, see `qrlsuite.statistics.grid.settled`."""
+    return settled(means)
 
 
 @dataclass(frozen=True)
@@ -823,6 +825,13 @@ def plugins_in(runs: Path, unknown: str) -> str:
     return ""
 
 
+def another_folder() -> str:
+    """Say how a results folder is made, and how another one is named where somebody is: in a shell or in Python."""
+    if again() == "command":
+        return "`qrlsuite run` makes one, --runs DIR names another"
+    return "`train` makes one, runs=DIR names another (QRLSUITE_RUNS is for the command line)"
+
+
 def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
     """Return every entry's folder below a results folder, sorted by path.
 
@@ -832,8 +841,6 @@ def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
         If there is no such folder.
     """
     if not runs.is_dir():
-        raise StoreError(
-            f"there is no results folder {runs}: `qrlsuite run` makes one, --runs DIR names another"
-        )
+        raise StoreError(f"there is no results folder {runs}: {another_folder()}")
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
     return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]

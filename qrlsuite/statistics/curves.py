@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qrlsuite.errors import OptionError
-from qrlsuite.statistics.grid import BoolArray, Grid, whole
+from qrlsuite.statistics.grid import BoolArray, Grid, settled, whole
 
 Curve = NDArray[np.floating[Any]]
 
@@ -61,9 +61,11 @@ def checked(curves: ArrayLike, *, relative: bool = False, name: str = "curves") 
 def reached(curves: Curve, grid: Grid) -> BoolArray:
     """Return, shape (E, T, N), whether run i is on the goal's side of V* at epoch t: V_t >= V*, or V_t <= V*.
 
-    Thresholds are rounded to the precision of the curves: a float32 score of 0.7 reaches 0.7.
+    Scores are stored rounded (`qrlsuite.statistics.grid.settled`). So a threshold that this would round to its far side
+    is rounded, too: 6 of 11 reaches 6 / 11. And it has the precision of the curves: a float32 score of 0.7 reaches 0.7.
     """
-    thresholds = np.array(grid.thresholds).astype(curves.dtype)
+    nearer = np.minimum if grid.goal == "above" else np.maximum
+    thresholds = nearer(grid.thresholds, settled(grid.thresholds)).astype(curves.dtype)
     values, levels = curves.T[None], thresholds[:, None, None]
     there: BoolArray = values >= levels if grid.goal == "above" else values <= levels
     return there

@@ -69,6 +69,23 @@ def exact(value: object, name: str) -> Decimal:
     return number
 
 
+def settled(scores: ArrayLike) -> FloatArray:
+    """Round scores to 7 decimals, and those below 1e-4 to 7 digits: the noise of means of float32 scores disappears.
+
+    A hundred float32 scores of 0.95 have the mean 0.949999988.
+
+    >>> settled([0.949999988, 6 / 11, 2 / 3e9]).tolist()
+    [0.95, 0.5454545, 6.666667e-10]
+    """
+    values = np.asarray(scores, dtype=np.float64)
+    result: FloatArray = np.round(values, 7)
+    small = (np.abs(values) < 1e-4) & (values != 0)
+    if small.any():
+        scale = 10.0 ** (6 - np.floor(np.log10(np.abs(values[small]))))
+        result[small] = np.round(values[small] * scale) / scale
+    return result
+
+
 def _values(values: ArrayLike | Iterable[Any], name: str) -> list[Decimal]:
     """Read a non-empty one-dimensional list of numbers; a single number is a list of one."""
     if isinstance(values, np.ndarray) and values.ndim > 1:

@@ -208,6 +208,7 @@ BAD = {
         "name,seed,step,reward\n",
         "expected the columns entry, seed, step, score, each once; found name, seed",
     ),
+    "two steps": ("entry,seed,steps,timesteps,score\n", "rename all of steps, timesteps but one"),
     "no score": ("entry,seed,step,r\n", "metric=NAME reads another column as the score"),
     "empty": ("", "found none"),
     "no rows": (GOOD, "there is no score after step 0"),
@@ -233,6 +234,55 @@ def test_bad_csv_is_refused_and_nothing_is_written(case: str, tmp_path: Path) ->
         api.import_curves(path, maximum=100, runs=tmp_path / "runs")
     assert str(refused.value).isprintable()
     assert not (tmp_path / "runs").exists()
+
+
+def test_thresholds_and_scores_are_rounded_alike(tmp_path: Path) -> None:
+    """6 of 11 reaches 6 / 11, and 4e-8 is not 1e-9."""
+    generator = np.random.default_rng(0)
+    wins = {
+        name: (range(20), 6.0 * (generator.random((20, 30)) < share))
+        for name, share in (("a", 0.9), ("b", 0.3))
+    }
+    verdicts = []
+    for task, options in (("raw", {}), ("share", {"maximum": 11})):
+        api.import_curves(
+            wins, steps=10 * np.arange(1, 31), task=task, thresholds=[6], runs=tmp_path, **options
+        )
+        found = api.compare("a", "b", task=task, runs=tmp_path)
+        verdicts.append((found.verdict, str(found.outcome), found.pair.times.means.tolist()))
+    assert verdicts[0] == verdicts[1]
+    assert verdicts[0][0].startswith("a needs")
+    steps, noise = 10 * np.arange(1, 4), 1 + generator.random((20, 1))
+    losses = {"good": (range(20), [1e-1, 1e-9, 1e-9] * noise), "bad": (range(20), [1e-1, 4e-8, 4e-8] * noise)}
+    api.import_curves(losses, steps=steps, task="loss", thresholds=[1e-8], goal="below", runs=tmp_path)
+    assert api.compare("good", "bad", task="loss", runs=tmp_path).pair.times.means.ravel().tolist() == [
+        10,
+        30,
+    ]
+
+
+def test_columns_may_have_their_usual_other_names(tmp_path: Path) -> None:
+    path = tmp_path / "curves.csv"
+    path.write_text("Model,run,global_step,reward\n" + "a,0,10,1\na,0,20,2\na,1,10,2\na,1,20,3\n")
+    with pytest.raises(QrlSuiteError, match="metric=NAME reads another column as the score"):
+        api.import_curves(path, maximum=4, runs=tmp_path)
+    [a] = api.import_curves(path, maximum=4, metric="reward", runs=tmp_path)
+    assert (a.label, a.new) == ("external a", (0, 1))
+    assert a.store.seed(1).read().curve.tolist() == [0.5, 0.75]
+
+
+def test_a_copy_of_a_seed_that_was_imported_before_is_refused(tmp_path: Path) -> None:
+    first, later = tmp_path / "first.csv", tmp_path / "later.csv"
+    first.write_text(lines([(0, t, t) for t in (1, 2, 3)]))
+    later.write_text(
+        lines([(s, t, t + s) for s in (7, 8) for t in (1, 2, 3)] + [(9, t, t) for t in (1, 2, 3)])
+    )
+    api.import_curves(first, maximum=100, runs=tmp_path / "runs")
+    with pytest.raises(QrlSuiteError, match="seeds 0 and 9 of 'a' have the same curve"):
+        api.import_curves(later, maximum=100, runs=tmp_path / "runs")
+    assert len(list((tmp_path / "runs").glob("*/*/seed-*"))) == 1
+    [again] = api.import_curves(first, maximum=100, runs=tmp_path / "runs")
+    assert again.known == (0,)
 
 
 def test_what_a_good_score_is_has_to_be_said(csv: Path, tmp_path: Path) -> None:

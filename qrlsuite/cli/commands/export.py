@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,9 @@ from qrlsuite.api.publishing import export as export_each
 from qrlsuite.api.publishing import export_rliable
 from qrlsuite.cli.arguments import JsonOption, RunsOption, TasksOption, entries_here
 from qrlsuite.engine.terminal import command
+from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results.text import counted
+from qrlsuite.statistics import MIN_RUNS
 
 
 def export(
@@ -68,6 +71,8 @@ def export(
         if not json_output:
             seeds = "" if each.entry is None else f"{counted(len(each.entry.seeds), 'seed')}, "
             typer.echo(f"wrote {each.folder} ({seeds}{each.size / 1000:.0f} kB)")
+            for line in () if each.entry is None else shortfalls(each.entry):
+                typer.echo(f"  {line}")
     if json_output:
         typer.echo(json.dumps([each.as_dict() for each in written]))
     elif written[-1].entry is None:
@@ -76,6 +81,22 @@ def export(
         last = Path(str(written[-1].folder))
         target = last if len(written) == 1 else last.parents[1]
         typer.echo(f"next: {command('verify', str(target), '--rerun', '2')}")
+
+
+def shortfalls(entry: EntryResults) -> Iterator[str]:
+    """Say what keeps an entry from a public board's ranks, or from being checked there."""
+    protocol, epochs = entry.task_file.protocol, entry.curves.shape[1]
+    whole = protocol.algorithm_epochs.get(entry.algorithm, protocol.epochs)
+    if len(entry.seeds) < protocol.seeds or epochs < whole:
+        yield (
+            f"{len(entry.seeds)} of {protocol.seeds} seeds, {epochs} of {whole} epochs of the protocol: boards rank "
+            f"entries with {MIN_RUNS} seeds or more"
+        )
+    if entry.plugins:
+        yield (
+            f"made with {', '.join(sorted(entry.plugins))}, which is not in it: verify needs --plugin PATH, and "
+            "a public board an issue first (docs/add-an-entry.md)"
+        )
 
 
 def _rliable(file: Path, tasks: list[str], names: list[str], runs: Path, json_output: bool) -> None:
