@@ -116,6 +116,11 @@ def compare_entries(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
+    if len({first.environments, second.environments} - {frozenset()}) > 1:
+        raise QrlSuiteError(
+            f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
+            f"'{second.label}': their scores cannot be compared; train one of them again with --fresh"
+        )
     for entry in (first, second):
         if entry.plan:
             raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")

@@ -236,9 +236,10 @@ def _by_horizon(
         return groups
     short = [entry for entry in entries if entry.longest * entry.steps_per_epoch < horizons[0]]
     lengths = sorted({_length(entry) for entry in short}, reverse=True)
-    return groups + [
-        (steps, True, [entry for entry in short if _length(entry) == steps]) for steps in lengths
-    ]
+    for steps in lengths:
+        reached = [entry.reaching(steps // entry.steps_per_epoch) for entry in short]
+        groups.append((steps, True, [entry for entry in reached if entry is not None]))
+    return groups
 
 
 def _length(entry: EntryResults) -> int:

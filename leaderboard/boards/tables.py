@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -42,8 +42,18 @@ def sheets(sections: Sequence[Section], explain: bool = False) -> list[Sheet]:
 
 
 def main_section(sections: Sequence[Section]) -> Section:
-    """Return the section of a task that is shown: not provisional if there is one, with most entries, the longest."""
-    return max(sections, key=lambda each: (not each.provisional, len(each.rows), each.horizon))
+    """Return the section of a task that is shown: not provisional if there is one, with most entries, the longest.
+
+    Of provisional ones it is that at which most entries end: one that has just begun cuts nobody.
+    """
+
+    def entries(section: Section) -> int:
+        if not section.provisional:
+            return len(section.rows)
+        ends = (row.entry.curves.shape[1] * row.entry.steps_per_epoch for row in section.rows)
+        return sum(end == section.horizon for end in ends)
+
+    return max(sections, key=lambda each: (not each.provisional, entries(each), each.horizon))
 
 
 def _elsewhere(main: Section, sections: Sequence[Section]) -> list[str]:
@@ -344,8 +354,15 @@ def facts(section: Section) -> list[str]:
 
 def changed_thresholds(entries: Sequence[EntryResults]) -> list[str]:
     """Say of which entries the thresholds changed after their first seed: they may have been chosen to flatter."""
-    labels = [entry.label for entry in entries if entry.changed_thresholds]
-    return [f"thresholds changed after the first seed: {', '.join(labels)}"] if labels else []
+    used = sorted(ranking_of(entries).grid.thresholds) if entries else []
+    labels = [
+        entry.label
+        for entry in entries
+        if entry.changed_thresholds or sorted(entry.first_thresholds or used) != used
+    ]
+    levels = ", ".join(f"{level:g}" for level in used)
+    told = f"thresholds changed after the first seed: {', '.join(labels)} (judged by {levels})"
+    return [told] if labels else []
 
 
 def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
@@ -360,21 +377,32 @@ def unlike_others(entries: Sequence[EntryResults]) -> list[str]:
             if START in entry.identity
         ],
     }
-    return [*(f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels), *_edited(entries)]
+    told = [f"{what}: {', '.join(labels)}" for what, labels in lines.items() if labels]
+    return [*_other_environments(entries), *told, *_edited(entries)]
+
+
+def _grouped(labels: Mapping[str, Hashable]) -> str:
+    """Write labels in groups: `A, B | C`."""
+    groups: dict[Hashable, list[str]] = {}
+    for label, group in labels.items():
+        groups.setdefault(group, []).append(label)
+    return " | ".join(map(", ".join, groups.values())) if len(groups) > 1 else ""
+
+
+def _other_environments(entries: Sequence[EntryResults]) -> list[str]:
+    """Say which entries were trained in environments of one name and other code: their scores are of other worlds."""
+    groups = _grouped({entry.label: entry.environments for entry in entries if entry.environments})
+    return [f"NOT COMPARABLE, the environment's code was edited between: {groups}"] * bool(groups)
 
 
 def _edited(entries: Sequence[EntryResults]) -> list[str]:
     """Say of which plugin's file entries were trained with different contents: a circuit, and its control of before."""
     lines = []
     for name in sorted({name for entry in entries for name in entry.plugins}):
-        groups: dict[frozenset[str], list[str]] = {}
-        for entry in entries:
-            if name in entry.plugins:
-                groups.setdefault(entry.plugins[name], []).append(entry.label)
-        if len(groups) > 1:
-            texts = " | ".join(", ".join(labels) for labels in groups.values())
+        groups = _grouped({entry.label: entry.plugins[name] for entry in entries if name in entry.plugins})
+        if groups:
             lines.append(
-                f"{name} was edited between these entries, see `qrlsuite show ENTRY --identity`: {texts}"
+                f"{name} was edited between these entries, see `qrlsuite show ENTRY --identity`: {groups}"
             )
     return lines
 

@@ -391,6 +391,7 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         if refused:
             raise StoreError("; ".join(refused))
         return None
+    made_by = [codes.read(run.record, store.seed(run.seed).path) for run in runs]
     entry = EntryResults.of_record(
         record,
         first,
@@ -410,7 +411,8 @@ def read_entry(store: EntryStore, seeds: Collection[int] | None = None) -> Entry
         [made for run in runs for made in run.record.get("provenance", [])],
         _require_independent(store, runs),
         clocked=any(run.clocked for run in runs),
-        codes=codes.distinct(codes.read(run.record, store.seed(run.seed).path) for run in runs),
+        codes=codes.distinct(made_by),
+        environments=codes.environments(made_by),
         refused=tuple(refused),
         measured={run.seed: run.measured for run in runs if run.measured},
     )

@@ -53,6 +53,8 @@ class EntryResults(Shown):
         Whether any of these hours are by the clock and not processor time; None where the record does not say.
     codes:
         Digests of the code identities of its seeds; none where all code is the suite's with its first bits, or unknown.
+    environments:
+        Digests of the environment's code, of every one that occurs among its seeds; none where it is the suite's.
     plugins:
         Of the plugins by path among that code, by file name: which contents trained its seeds.
     identity:
@@ -128,6 +130,7 @@ class EntryResults(Shown):
     fixed: int = 0
     clocked: bool | None = None
     codes: tuple[str, ...] = ()
+    environments: frozenset[str] = frozenset()
     plugins: Mapping[str, frozenset[str]] = field(default_factory=dict)
     refused: tuple[str, ...] = ()
     unprobed: bool = False

@@ -154,6 +154,7 @@ class PublishedEntry:
     def entry_results(self) -> EntryResults:
         """Return what a leaderboard ranks."""
         published = self.record["published"]
+        made_by = [codes.read(self.record, self.folder / "entry.json")]
         return EntryResults.of_record(
             self.record,
             self.task_file,
@@ -172,7 +173,8 @@ class PublishedEntry:
             published["parameters"],
             [made for last in self.provenance for made in provenance.records(last)],
             {self.probe.get("result", "")},
-            codes=codes.distinct([codes.read(self.record, self.folder / "entry.json")]),
+            codes=codes.distinct(made_by),
+            environments=codes.environments(made_by),
             source="published",
             chosen_seeds=self.chosen_seeds,
             agents=self.agents,

@@ -98,6 +98,16 @@ def distinct(codes: Iterable[CodeIdentity | None]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(code.digest for code in known if code is not None))
 
 
+def environments(codes: Iterable[CodeIdentity | None]) -> frozenset[str]:
+    """Return the digests of the environments among identities, where a plugin's code makes them."""
+    parts = (part for code in codes if code is not None for part in code.parts)
+    return frozenset(
+        CodeIdentity((part,)).digest
+        for part in parts
+        if part["role"] == "environment" and part.get("distribution") != identity.OURS
+    )
+
+
 def of_seeds(store: EntryStore) -> list[SameCode]:
     """Return an entry's seeds by their code, those of one code first that the lowest seed has.
 

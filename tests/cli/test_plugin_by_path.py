@@ -244,6 +244,43 @@ def test_a_board_says_that_a_file_was_edited_between_its_entries(trained: Path) 
     assert " | " in board
 
 
+WALK = """
+import gymnasium
+import numpy as np
+
+
+class Walk(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 5
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.zeros(1, np.float32), float(action) * 0.5, self.left == 0, False, {}
+"""
+
+
+def test_entries_of_an_edited_environment_are_not_compared(tmp_path: Path) -> None:
+    (tmp_path / "walk.py").write_text(WALK)
+    words = ("--task", "walk", "--plugin", "walk.py", "--seeds", "2", "--epochs", "1", "--workers", "1")
+    first = qrlsuite("run", "mlp width=2", *words, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    (tmp_path / "walk.py").write_text(WALK.replace("* 0.5", "* 0.25"))
+    assert qrlsuite("run", "mlp width=3", *words, cwd=tmp_path).returncode == 0
+    refused = qrlsuite("compare", "mlp width=2", "mlp width=3", *words[:4], cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "the code of environment 'walk' was edited between" in refused.stderr
+    board = " ".join(qrlsuite("leaderboard", *words[:4], cwd=tmp_path).stdout.split())
+    assert "NOT COMPARABLE, the environment's code was edited between: " in board
+    assert qrlsuite("run", "mlp width=2", *words, "--fresh", cwd=tmp_path).returncode == 0
+    compared = qrlsuite("compare", "mlp width=2", "mlp width=3", *words[:4], cwd=tmp_path)
+    assert compared.returncode == 0, compared.stderr
+
+
 def test_the_hash_of_a_study_with_looks_covers_the_code(folder: Path) -> None:
     words = ("--task", "tiny.toml", "--plugin", "ring.py")
     looks = "2,4 first_seed=200 reason=a-test"

@@ -212,6 +212,18 @@ def test_entries_of_other_lengths_have_a_line_below_the_table() -> None:
     assert found.lines[2:] == tuple(hints)
 
 
+def test_longer_entries_are_in_the_table_of_a_board_without_a_complete_one() -> None:
+    made = boards.of([boards.entry("a", 20, 10), boards.entry("b", 20, 10), boards.entry("longer", 20, 30)])
+    (found,) = made.sheets()
+    assert "20k of 200k steps" in found.title
+    assert len(found.rows) == 3
+    assert not any("shorter" in line for line in found.lines)
+    begun = boards.of([boards.entry("a", 20, 30), boards.entry("b", 20, 30), boards.entry("begun", 20, 1)])
+    (found,) = begun.sheets()
+    assert "60k of 200k steps" in found.title
+    assert found.lines[0].startswith("shorter: begun, ")
+
+
 def test_filters_change_no_rank() -> None:
     asked = {"published": True, "runs": "none"}
     ((full,), (few,)) = (
