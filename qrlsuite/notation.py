@@ -106,7 +106,12 @@ def _parse(text: str, prefix: str) -> tuple[list[str], list[Setting]]:
     """Return the words at the beginning without `=`, and the settings after them."""
     words = split(text)
     count = next((index for index, word in enumerate(words) if "=" in word), len(words))
-    return words[:count], [parse_setting(word, prefix) for word in words[count:]]
+    settings = [parse_setting(word, prefix) for word in words[count:]]
+    first = {(each.side, each.name): each.value for each in reversed(settings)}
+    for each in settings:
+        if each.value != first[each.side, each.name]:
+            raise OptionError(f"{prefix}{each.full_name} is given twice: leave one out")
+    return words[:count], settings
 
 
 def split(text: str) -> list[str]:

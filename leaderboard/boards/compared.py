@@ -116,6 +116,8 @@ def compare_entries(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
+    if (first.folder, first.name, first.seeds) == (second.folder, second.name, second.seeds):
+        raise QrlSuiteError(f"'{first.label}' is compared with itself: name another entry")
     if len({first.environments, second.environments} - {frozenset()}) > 1:
         raise QrlSuiteError(
             f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "

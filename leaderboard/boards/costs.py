@@ -379,8 +379,11 @@ def sections(
         The section; and one line for each entry that was left out. Those that do not reach the task's shortest
         horizon, where others do, are.
     """
-    members, short = collect.equally_long(entries)
-    return [_section(task, members, UNITS[by], alpha)], short
+    paid = {id(e): not price.problem for e, price in zip(entries, prices(entries, UNITS[by].name))}
+    payable = [entry for entry in entries if paid[id(entry)]]
+    members, short = collect.equally_long(payable or entries)  # who pays nothing sets no horizon
+    others = [entry for entry in entries if payable and not paid[id(entry)]]
+    return [_section(task, [*members, *others], UNITS[by], alpha)], short
 
 
 def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: float) -> CostSection:

@@ -120,3 +120,9 @@ def test_a_name_with_options() -> None:
 def test_what_is_no_entry(text: str, message: str) -> None:
     with pytest.raises(OptionError, match=message):
         notation.parse_entry(text)
+
+
+def test_an_option_is_given_once() -> None:
+    with pytest.raises(OptionError, match="entry 'mlp width=4 width=5': width is given twice: leave one out"):
+        notation.parse_entry("mlp width=4 width=5")
+    assert len(notation.parse_entry("mlp width=4 width=4 algorithm.width=5").settings) == 3

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from qrlsuite import api
+from qrlsuite.errors import QrlSuiteError
 from qrlsuite.leaderboard.boards import pair
 from qrlsuite.leaderboard.boards.compared import compare_entries, pair_table
 from qrlsuite.leaderboard.shelf.curves import EntryResults
@@ -167,9 +168,17 @@ def test_thresholds_that_changed_after_the_first_seed_are_named() -> None:
     assert "thresholds changed" not in unchanged.markdown()
 
 
+def test_an_entry_is_not_compared_with_itself() -> None:
+    first = entry("first", spread(18))
+    with pytest.raises(QrlSuiteError, match="'first' is compared with itself"):
+        compare_entries(first, first)
+
+
 def test_entries_whose_task_files_have_other_thresholds_than_the_board_are_named() -> None:
     """A task that is a file: each entry keeps the file with which it began, and most of them decide."""
-    first, second, third = (entry(name, spread(18 + k)) for k, name in enumerate(("first", "second", "third")))
+    first, second, third = (
+        entry(name, spread(18 + k)) for k, name in enumerate(("first", "second", "third"))
+    )
     ranking = first.task_file.ranking.model_copy(update={"epsilons": [0.5]})
     older = first.task_file.model_copy(update={"ranking": ranking})
     first = replace(first, task_file=older, first_thresholds=(0.5,))
