@@ -280,4 +280,5 @@ def sections(
 
 
 def _interval(value: float, low: float, high: float) -> str:
+    value, low, high = (round(each, 3) + 0.0 for each in (value, low, high))  # no -0.000
     return f"{value:.3f} ({low:.3f} to {high:.3f})"
