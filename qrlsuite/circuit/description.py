@@ -519,7 +519,9 @@ class Circuit:
             )
         touched = targets if control is None else (control, *targets)
         if len(targets) != signature.wires or len(set(touched)) != len(touched):
-            raise CircuitError(f"{gate} needs {signature.wires} distinct wire(s), got {touched}")
+            raise CircuitError(
+                f"{gate} needs {signature.wires} distinct qubit{'s' * (signature.wires > 1)}, got {touched}"
+            )
         if not all(map(self._has, touched)) or any(isinstance(w, Outcome) for w in targets):
             raise CircuitError(
                 f"{gate} on qubits {touched}: this circuit has qubits 0..{len(self._wires) - 1}"

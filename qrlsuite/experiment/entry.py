@@ -349,8 +349,16 @@ def _require_not_of_another_ansatz(
         if others:
             raise OptionError(
                 f"{setting.written}: no option of that name: ansatz '{chosen}' has none, {', '.join(others)} "
-                f"{'has' if len(others) == 1 else 'have'} it"
+                f"{'has' if len(others) == 1 else 'have'} it" + _control_of_own(setting, chosen)
             )
+
+
+def _control_of_own(setting: Setting, ansatz: str) -> str:
+    """Say how a circuit of a plugin gets controls, where one was asked for."""
+    own = registry.load().get(specs.AnsatzSpec, ansatz).distribution != "qrlsuite"
+    return "; give its function a parameter `entangled`: docs/controls.md, own circuit" * (
+        own and setting.name == "entangled"
+    )
 
 
 def _hand_to_ansatz(

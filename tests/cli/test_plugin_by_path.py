@@ -281,6 +281,11 @@ def test_entries_of_an_edited_environment_are_not_compared(tmp_path: Path) -> No
     assert compared.returncode == 0, compared.stderr
 
 
+def test_a_control_of_a_circuit_without_one_is_refused_with_the_page(folder: Path) -> None:
+    said = run(folder, entry=f"{ENTRY} entangled=mean-field", code=2)
+    assert "give its function a parameter `entangled`: docs/controls.md" in said
+
+
 def test_the_hash_of_a_study_with_looks_covers_the_code(folder: Path) -> None:
     words = ("--task", "tiny.toml", "--plugin", "ring.py")
     looks = "2,4 first_seed=200 reason=a-test"

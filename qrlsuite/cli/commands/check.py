@@ -133,7 +133,9 @@ def _show(
     broken = sum(not finding.ok for _, findings in results for finding in findings)
     total = sum(len(findings) for _, findings in results)
     if broken:
-        console.print(f"{broken} of {total} rules broken", style="bold red")
+        console.print(
+            f"{broken} of {total} rules broken; some are tried only where those hold", style="bold red"
+        )
     else:
         console.print(f"all {total} rules hold", style="bold green")
     return results
