@@ -119,7 +119,10 @@ def choose(among: Sequence[N], name: str, searched: object) -> N:
 def fitting(among: Sequence[N], name: str) -> list[N]:
     """Return the entries that a name may mean, as `choose` does."""
     whole = [e for e in among if name in _names(e)] or _written(among, name)
-    return whole or [e for e in among if any(known.startswith(name) for known in _names(e))]
+    begun = [e for e in among if any(known.startswith(name) for known in _names(e))]
+    own = {(e.task, e.name) for e in begun}
+    # what `--fresh` set aside is meant where its mark is written
+    return whole or [e for e in begun if (e.task, e.name.partition("@")[0]) not in own or "@" not in e.name]
 
 
 def _written(among: Sequence[N], text: str) -> list[N]:

@@ -184,6 +184,11 @@ def space(
         elif setting.side not in ("environment", "ansatz") and (setting.side or _owned(setting.name, sides)):
             _forget(axes, _full_name(_word(setting), sides, setting.prefix))
     if not axes:
+        if varied:
+            words = ", ".join(_word(setting) for setting in varied)
+            raise OptionError(
+                f"nothing is varied: the entry fixes what --vary names ({words}); leave it out there"
+            )
         raise OptionError(
             f"nothing is varied for {entry.algorithm.name} with {entry.model.name}: --vary takes a grid's name, a grid "
             "file or 'lr=[1e-3, 5e-4]'"

@@ -148,3 +148,13 @@ def test_a_task_narrows_the_search(
         say(*words, "--task", "tny")
     with pytest.raises(UnknownNameError, match="no entry 'ddqn vqc' in runs, task tiny"):
         say(*(word.replace("mlp width=8", "ddqn vqc") for word in words), "--task", "tiny")
+
+
+def test_seeds_that_were_set_aside_are_meant_where_their_mark_is_written() -> None:
+    known = [
+        Entry("ddqn vqc-native qubits=4", "beam6g", "ddqn-vqc-native-1"),
+        Entry("ddqn vqc-native qubits=4 @ad9d", "beam6g", "ddqn-vqc-native-1@ad9d"),
+    ]
+    assert lookup.choose(known, "vqc-native", "runs") is known[0]
+    assert lookup.choose(known, "vqc-native qubits=4 @a", "runs") is known[1]
+    assert lookup.choose(known[1:], "vqc-native", "runs") is known[1]
