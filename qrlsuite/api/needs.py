@@ -16,7 +16,7 @@ from qrlsuite.api.arguments import several
 from qrlsuite.api.entries import load
 from qrlsuite.engine.sheet import Sheet
 from qrlsuite.engine.terminal import Shown
-from qrlsuite.errors import OptionError, StoreError
+from qrlsuite.errors import OptionError, StoreError, UnknownNameError
 from qrlsuite.leaderboard.boards import ranked
 from qrlsuite.leaderboard.shelf.curves import EntryResults
 from qrlsuite.results import speed
@@ -169,17 +169,22 @@ def _core_hours(
 ) -> tuple[float | None, str]:
     """Return the core-hours of a seed of each of two entries together, None where unknown; and what that rests on."""
     speeds = speed.known(runs)
-    total, bases = 0.0, []
+    total, bases = 0.0, dict[str, list[str]]()
     for entry, learned in ((entries[0], curves[0]), (entries[-1], curves[-1])):
         try:
             estimate = speeds.estimate(EntryStore(entry.folder).entry(), None)
         except StoreError:  # imported curves, or an entry of another version
             return None, BASES["unknown"]
+        except UnknownNameError:
+            return None, f"not known without the plugin of {entry.label}"
         if estimate.seconds is None:
             return None, BASES["unknown"]
         total += estimate.seconds * learned.values.shape[1] / 3600
-        bases.append(f"{BASES[estimate.basis]}, to within a factor of {estimate.within:.3g}")
-    return total, "; ".join(dict.fromkeys(bases))
+        within = bases.setdefault(BASES[estimate.basis], [])
+        within += [text for text in [f"{estimate.within:.3g}"] if text not in within]
+    return total, "; ".join(
+        f"{basis}, to within a factor of {' and '.join(within)}" for basis, within in bases.items()
+    )
 
 
 def _row(title: str, need: Need, per_pair: float | None) -> dict[str, Any]:

@@ -286,6 +286,12 @@ def test_a_control_of_a_circuit_without_one_is_refused_with_the_page(folder: Pat
     assert "give its function a parameter `entangled`: docs/controls.md" in said
 
 
+def test_power_reads_curves_without_the_plugin(trained: Path) -> None:
+    done = qrlsuite("power", "vqc-native", "--task", "tiny", "--draws", "20", cwd=trained)
+    assert done.returncode == 0, done.stderr
+    assert "Core-hours are not known without the plugin of " in done.stdout
+
+
 def test_the_hash_of_a_study_with_looks_covers_the_code(folder: Path) -> None:
     words = ("--task", "tiny.toml", "--plugin", "ring.py")
     looks = "2,4 first_seed=200 reason=a-test"
