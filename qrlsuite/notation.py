@@ -107,9 +107,9 @@ def _parse(text: str, prefix: str) -> tuple[list[str], list[Setting]]:
     words = split(text)
     count = next((index for index, word in enumerate(words) if "=" in word), len(words))
     settings = [parse_setting(word, prefix) for word in words[count:]]
-    first = {(each.side, each.name): each.value for each in reversed(settings)}
+    first = {(each.side, each.name): repr(each.value) for each in reversed(settings)}
     for each in settings:
-        if each.value != first[each.side, each.name]:
+        if repr(each.value) != first[each.side, each.name]:
             raise OptionError(f"{prefix}{each.full_name} is given twice: leave one out")
     return words[:count], settings
 

@@ -379,16 +379,18 @@ def sections(
         The section; and one line for each entry that was left out. Those that do not reach the task's shortest
         horizon, where others do, are.
     """
-    paid = {id(e): not price.problem for e, price in zip(entries, prices(entries, UNITS[by].name))}
-    payable = [entry for entry in entries if paid[id(entry)]]
+    paid = {id(entry): price for entry, price in zip(entries, prices(entries, UNITS[by].name))}
+    payable = [entry for entry in entries if not paid[id(entry)].problem]
     members, short = collect.equally_long(payable or entries)  # who pays nothing sets no horizon
-    others = [entry for entry in entries if payable and not paid[id(entry)]]
-    return [_section(task, [*members, *others], UNITS[by], alpha)], short
+    others = [entry for entry in entries if payable and paid[id(entry)].problem]
+    shown = [*members, *others]
+    return [_section(task, shown, [paid[id(entry)] for entry in shown], UNITS[by], alpha)], short
 
 
-def _section(task: str, entries: Sequence[EntryResults], unit: Unit, alpha: float) -> CostSection:
+def _section(
+    task: str, entries: Sequence[EntryResults], paid: Sequence[Price], unit: Unit, alpha: float
+) -> CostSection:
     ranking = ranking_of(entries)
-    paid = prices(entries, unit.name)
     places = [place for place, found in enumerate(paid) if not found.problem]
     budget, part, exact, compared = math.nan, math.nan, True, None
     if places:

@@ -401,9 +401,7 @@ def _edited(entries: Sequence[EntryResults]) -> list[str]:
     for name in sorted({name for entry in entries for name in entry.plugins}):
         groups = _grouped({entry.label: entry.plugins[name] for entry in entries if name in entry.plugins})
         if groups:
-            lines.append(
-                f"{name} was edited between these entries, see `qrlsuite show ENTRY --identity`: {groups}"
-            )
+            lines.append(f"{name} was edited between these entries (its text is not the same): {groups}")
     return lines
 
 

@@ -10,6 +10,7 @@ it. Nothing is interpolated, nothing is carried backward, and no curve goes on b
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections import defaultdict
@@ -393,8 +394,12 @@ def _require_no_copies(
 
     Those that were imported before count, too; they are known as scores, in the unit of the task.
     """
-    present = store.seeds() if store.path.is_dir() else []
-    before = {store.seed(seed).read().curve.tobytes(): seed for seed in present if seed not in curves}
+    before: dict[bytes, int] = {}
+    for seed in store.seeds() if store.path.is_dir() else []:
+        with contextlib.suppress(StoreError):  # a damaged seed is said where it is read
+            run = store.seed(seed).read()
+            if seed not in curves and len(run.scores):
+                before[run.curve.tobytes()] = seed
     first: dict[bytes, int] = {}
     for seed, curve in curves.items():
         other = before.get(scores[seed].tobytes(), first.setdefault(curve.tobytes(), seed))

@@ -263,7 +263,9 @@ def _columns(names: Sequence[str], metric: str | None, source: str) -> tuple[str
     for column in COLUMNS:
         wanted = metric if metric is not None and column == COLUMNS[3] else column
         exact = [name for name in names if name == wanted]
-        alike = exact or [n for n, lower in zip(names, have) if lower in SYNONYMS.get(column, ())]
+        alike = exact or [
+            n for n, lower in zip(names, have) if lower == column or lower in SYNONYMS.get(column, ())
+        ]
         if len(alike) != 1:
             wrong.append(wanted)
             several += alike

@@ -79,7 +79,7 @@ def settled(scores: ArrayLike) -> FloatArray:
     """
     values = np.asarray(scores, dtype=np.float64)
     result: FloatArray = np.round(values, 7)
-    small = (np.abs(values) < 1e-4) & (values != 0)
+    small = (np.abs(values) < 1e-4) & (np.abs(values) > 1e-290)
     if small.any():
         scale = 10.0 ** (6 - np.floor(np.log10(np.abs(values[small]))))
         result[small] = np.round(values[small] * scale) / scale

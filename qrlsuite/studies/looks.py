@@ -214,10 +214,7 @@ class StudyWithLooks:
         if not self.begun:
             for table, (name, entry) in zip(self.file.entries, self.entries.items()):
                 if table.code not in (None, code_of(entry)):
-                    raise OptionError(
-                        f"{self.source}: the code of '{name}' is not what it was when the study was written, and its "
-                        "hash covers that code: restore it, or write another study with `qrlsuite study new`"
-                    )
+                    raise OptionError(f"{self.source}: {self._other_code(name)}")
             for name, seeds, path in self.trained_before():
                 raise OptionError(
                     f"{self.source}: seeds {format_seeds(seeds)} of '{name}' were trained already ({path}): a study "
@@ -265,6 +262,8 @@ class StudyWithLooks:
             As `check`; or if it was ended, or the folder cannot be written.
         """
         begun = self.check()
+        if begun:
+            self._require_code_of_new_entries()
         log = read_lines(self.folder / LOG)
         if (when := _first(log, "ended")) is not None:
             raise OptionError(
@@ -274,6 +273,21 @@ class StudyWithLooks:
             write_atomically(self.folder / FILE, dumps(self.file).encode())
             if _first(log, "begun", self.hash) is None:
                 append(self.folder / LOG, json_line({"begun": _now(), "plan": self.hash}))
+
+    def _require_code_of_new_entries(self) -> None:
+        """Refuse an entry that has no seed yet, where its code is not what the study's hash covers."""
+        for table, (name, entry) in zip(self.file.entries, self.entries.items()):
+            store = EntryStore.find(self.folder, entry)
+            begun = store.path.is_dir() and bool(store.seeds())
+            if not begun and table.code not in (None, code_of(entry)):
+                raise OptionError(f"{self.source}: {self._other_code(name)}")
+
+    @staticmethod
+    def _other_code(name: str) -> str:
+        return (
+            f"the code of '{name}' is not what it was when the study was written, and its hash covers it: restore "
+            "that code, or write another study with `qrlsuite study new`"
+        )
 
     def end(self) -> None:
         """Close the study for good, with its open pairs open.

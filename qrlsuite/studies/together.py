@@ -122,14 +122,29 @@ class StudiesTogether(Shown):
         return times_below(curves.values[:seeds], outcome.study.grid, curves.steps_per_epoch)
 
     @cached_property
+    def _ratios(self) -> dict[tuple[str, str, str], MeanRatio | str]:
+        """The mean ratio of each pair, or why it has none."""
+        found: dict[tuple[str, str, str], MeanRatio | str] = {}
+        for named in self._named:
+            _, first, second = named
+            times = [(self._times(each, first), self._times(each, second)) for each in self.studies]
+            try:
+                found[named] = mean_ratio(times)
+            except OptionError as error:
+                found[named] = f"{first} / {second}: {error}"
+        return found
+
+    @cached_property
     def pairs(self) -> tuple[SharedPair, ...]:
-        """The pairs that all studies compare, in the order of the first study."""
-        ratios = [
-            mean_ratio([(self._times(each, first), self._times(each, second)) for each in self.studies])
-            for _, first, second in self._named
-        ]
-        adjusted = holm(np.array([ratio.p for ratio in ratios])).tolist()
-        return tuple(SharedPair(*named, ratio, p) for named, ratio, p in zip(self._named, ratios, adjusted))
+        """The pairs that all studies compare, in the order of the first study; without those that have no ratio."""
+        known = {named: ratio for named, ratio in self._ratios.items() if not isinstance(ratio, str)}
+        adjusted = holm(np.array([ratio.p for ratio in known.values()])).tolist()
+        return tuple(SharedPair(*named, ratio, p) for (named, ratio), p in zip(known.items(), adjusted))
+
+    @property
+    def left_out(self) -> list[str]:
+        """One line for each pair that has no ratio."""
+        return [each for each in self._ratios.values() if isinstance(each, str)]
 
     @property
     def changed(self) -> list[str]:
@@ -145,6 +160,7 @@ class StudiesTogether(Shown):
             "seeds": list(self.seeds),
             "alpha": ALPHA,
             "changed": self.changed,
+            "left_out": self.left_out,
             "pairs": [
                 {
                     "question": pair.question or None,
@@ -182,6 +198,7 @@ class StudiesTogether(Shown):
             f"error {ALPHA:g} for the {len(self.pairs)} pairs together (Holm). Tasks are fixed, only seeds are drawn: "
             "nothing follows for other tasks."
         )
+        yield from (Text(f"left out: {line}") for line in self.left_out)
         if self.changed:
             yield Text(f"entries with other options on another task: {', '.join(self.changed)}")
 

@@ -30,6 +30,7 @@ from qrlsuite.leaderboard import studies
 from qrlsuite.leaderboard.pictures import outcome as drawing
 from qrlsuite.results.store import EntryStore, json_line, table_bytes
 from qrlsuite.specs import EngineSpec
+from qrlsuite.studies import together
 from qrlsuite.studies.outcome import needs_text
 from tests.commands import answer, qrlsuite, say, start
 from tests.conftest import HANGS, TINY, Hold, cases, results
@@ -687,3 +688,18 @@ def test_studies_that_cannot_be_read_together_are_refused(refused: Refused) -> N
         (("mlp", "gru", "drqn"), "or several studies"),
     ):
         assert said in refused("show", *names)
+
+
+def test_a_pair_without_a_ratio_is_left_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcomes = [api.read_study(name) for name in TOGETHER[1:]]
+    assert all(isinstance(each, studies.StudyOutcome) for each in outcomes)
+    read = together.StudiesTogether(tuple(outcomes))  # type: ignore[arg-type]
+    times = together.StudiesTogether._times
+
+    def never_below(self: Any, outcome: Any, name: str) -> Any:
+        return times(self, outcome, name) * (name != "sine 44")
+
+    monkeypatch.setattr(together.StudiesTogether, "_times", never_below)
+    assert len(read.pairs) == len(read._named) - 2
+    assert [line.partition(":")[0] for line in read.left_out] == ["10 qubits / sine 44", "sine 44 / width 14"]
+    assert "left out: 10 qubits / sine 44: " in repr(read)

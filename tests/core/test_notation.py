@@ -125,4 +125,5 @@ def test_what_is_no_entry(text: str, message: str) -> None:
 def test_an_option_is_given_once() -> None:
     with pytest.raises(OptionError, match="entry 'mlp width=4 width=5': width is given twice: leave one out"):
         notation.parse_entry("mlp width=4 width=5")
+    assert len(notation.parse_entry("mlp lr=nan lr=nan").settings) == 2
     assert len(notation.parse_entry("mlp width=4 width=4 algorithm.width=5").settings) == 3

@@ -53,7 +53,8 @@ def compare(
         typer.echo(json.dumps(comparison.as_dict()))
         return
     Console().print(comparison)
-    if comparison.pair.times.direction in (Direction.UNDECIDED, Direction.NOT_TOLD_APART):
+    pair = comparison.pair.times
+    if pair.direction in (Direction.UNDECIDED, Direction.NOT_TOLD_APART) and min(pair.n_runs) > 1:
         among = ["--task", task] if task else []
         words = [*among, "--published"] if published else among
         typer.echo(f"how many seeds it takes: {command('power', first, second, *words, runs=runs)}")
