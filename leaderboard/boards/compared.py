@@ -116,8 +116,6 @@ def compare_entries(
             f"'{first.label}' was run on {first.task} and '{second.label}' on {second.task} "
             f"(definitions {first.task_hash} and {second.task_hash}): only entries of one task can be compared"
         )
-    if (first.folder, first.name, first.seeds) == (second.folder, second.name, second.seeds):
-        raise QrlSuiteError(f"'{first.label}' is compared with itself: name another entry")
     if len({first.environments, second.environments} - {frozenset()}) > 1:
         raise QrlSuiteError(
             f"the code of environment '{first.task_file.environment.name}' was edited between '{first.label}' and "
@@ -128,6 +126,8 @@ def compare_entries(
             raise QrlSuiteError(f"'{entry.label}' was {WITH_LOOKS}")
         if entry.chosen_seeds:
             raise QrlSuiteError(f"'{entry.label}': {entry.chosen_seeds}")
+    if (first.folder, first.name, first.seeds) == (second.folder, second.name, second.seeds):
+        raise QrlSuiteError(f"'{first.label}' is compared with itself: name another entry")
     epochs = min(first.curves.shape[1], second.curves.shape[1])
     first, second = first.reaching(epochs) or first, second.reaching(epochs) or second
     grid, asked = ranking_of([first, second]).grid, rule is not None

@@ -14,7 +14,7 @@ from qrlsuite.leaderboard.shelf import published as published_entries
 from qrlsuite.leaderboard.shelf.curves import EntryResults, current, require_scores
 from qrlsuite.results import codes, genuine, lookup, probes
 from qrlsuite.results.seeds import format_seeds
-from qrlsuite.results.store import EntryStore, SeedRun, another_folder, entries, parameters_of
+from qrlsuite.results.store import ANOTHER_FOLDER, EntryStore, SeedRun, entries, parameters_of
 
 Key = tuple[str, str]
 """An entry's task and name."""
@@ -313,7 +313,7 @@ def _folders(
     """
     if not runs.is_dir() and not published:
         raise StoreError(
-            f"there is no results folder {runs}: {another_folder()}; `qrlsuite leaderboard --published` shows what "
+            f"there is no results folder {runs}: {ANOTHER_FOLDER}; `qrlsuite leaderboard --published` shows what "
             "comes with the suite"
         )
     stores = entries(runs) if runs.is_dir() else []

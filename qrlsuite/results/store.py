@@ -36,7 +36,6 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 
 from qrlsuite import registry, specs
-from qrlsuite.engine.terminal import again
 from qrlsuite.errors import StoreError, UnknownNameError
 from qrlsuite.experiment.entry import Entry, from_record
 from qrlsuite.experiment.preset import EntryTuning
@@ -829,11 +828,8 @@ def plugins_in(runs: Path, unknown: str) -> str:
     return ""
 
 
-def another_folder() -> str:
-    """Say how a results folder is made, and how another one is named where somebody is: in a shell or in Python."""
-    if again() == "command":
-        return "`qrlsuite run` makes one, --runs DIR names another"
-    return "`train` makes one, runs=DIR names another (QRLSUITE_RUNS is for the command line)"
+ANOTHER_FOLDER = "`qrlsuite run` makes one, --runs DIR (in Python runs=DIR) names another"
+"""How a results folder is made, and named."""
 
 
 def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
@@ -845,6 +841,6 @@ def entries(runs: Path, task: str | None = None) -> list[EntryStore]:
         If there is no such folder.
     """
     if not runs.is_dir():
-        raise StoreError(f"there is no results folder {runs}: {another_folder()}")
+        raise StoreError(f"there is no results folder {runs}: {ANOTHER_FOLDER}")
     pattern = f"{task}/*/entry.json" if task else "*/*/entry.json"
     return [EntryStore(path.parent) for path in sorted(runs.glob(pattern))]
