@@ -101,7 +101,7 @@ def test_what_is_broken_is_said_with_what_to_type(tmp_path: Path) -> None:
 
 def test_a_library_that_ends_the_process_is_named(tmp_path: Path) -> None:
     shadow(tmp_path, "packaging", "gymnasium", "numba")
-    (tmp_path / "gymnasium.py").write_text("import os, sys; sys.stderr.write('bad instruction'); sys.stderr.flush(); os._exit(9)")
+    (tmp_path / "gymnasium.py").write_text("import os; os.write(2, b'bad instruction'); os._exit(9)")
     done = suite(tmp_path, "doctor", "--json", "--runs", str(tmp_path / "runs"))
     answer = json.loads(done.stdout)
     assert done.returncode == 1
