@@ -4,7 +4,7 @@ A comment names the task or study and the kind of the table that follows it:
 
     <!-- table: beam6g tiers -->
     <!-- table: quantum-or-not verdicts -->
-    <!-- table: quantum-or-not+quantum-or-not-degree5 together -->
+    <!-- table: quantum-or-not-degree5+quantum-or-not-a3-0 together -->
 """
 
 from __future__ import annotations

@@ -302,10 +302,8 @@ def backward(
             columns = -(-max(i, o) // vector) * vector
             for j in range(o):
                 gradient = gradients[place + (s * o + j) * i : place + (s * o + j + 1) * i]
-                if (
-                    i >= o
-                ):  # number by number: to copy slices, numba compiles a check of shapes, with its text
-                    for k in range(i):
+                if i >= o:
+                    for k in range(i):  # of `gradient[:] = ...` numba would compile a check of shapes, too
                         gradient[k] = sums[at + j * columns + k]
                 else:
                     for k in range(i):

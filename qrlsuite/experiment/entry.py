@@ -356,7 +356,7 @@ def _require_not_of_another_ansatz(
 def _control_of_own(setting: Setting, ansatz: str) -> str:
     """Say how a circuit of a plugin gets controls, where one was asked for."""
     own = registry.load().get(specs.AnsatzSpec, ansatz).distribution != "qrlsuite"
-    return "; give its function a parameter `entangled`: docs/controls.md, own circuit" * (
+    return "; give its function a parameter `entangled`: docs/controls.md, Controls of your own circuit" * (
         own and setting.name == "entangled"
     )
 

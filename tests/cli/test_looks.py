@@ -648,6 +648,8 @@ def test_pairs_that_several_studies_share_are_read_on_average_over_their_tasks()
     outcomes = [api.read_study(name) for name in TOGETHER]
     assert found["tasks"] == ["beam6g", "beam6g-degree5", "beam6g-a3-0"]
     assert found["seeds"] == [20, 20, 20]
+    assert {"10 qubits", "width 14"} <= set(found["changed"]), "untuned on beam6g, tuned elsewhere"
+    assert answer("show", *TOGETHER[1:])["changed"] == []
     families = [{(pair["first"], pair["second"]) for pair in each.as_dict()["pairs"]} for each in outcomes]
     assert [(pair["first"], pair["second"]) for pair in found["pairs"]] == [
         (pair["first"], pair["second"])

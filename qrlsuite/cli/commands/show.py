@@ -58,7 +58,7 @@ def show(
 
     Examples: qrlsuite show mlp; qrlsuite show task beam6g; qrlsuite show ansatz iqp qubits=4;
     qrlsuite show ansatz iqp --format qasm3; qrlsuite show picture bars; qrlsuite show fig7 --published;
-    qrlsuite show "cartpole/reinforce mlp" --published; qrlsuite show quantum-or-not quantum-or-not-degree5
+    qrlsuite show "cartpole/reinforce mlp" --published; qrlsuite show quantum-or-not-degree5 quantum-or-not-a3-0
     """
     names, settings = split_settings(words)
     studies = names if name == "study" else [name, *names] if is_study(name) else []
