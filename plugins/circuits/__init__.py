@@ -24,7 +24,11 @@ def register_ansatzes(register: Callable[[AnsatzSpec], None]) -> None:
         ),
         ("cx", "A gate on every qubit, then a ring of CNOTs; options: gate, entangled", "GateOptions"),
         ("cz", "A gate on every qubit, then a ring of CZs; options: gate, entangled", "GateOptions"),
-        ("skolik", "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs", "NoOptions"),
+        (
+            "skolik",
+            "Re-uploading with trainable input scaling: RX, RY, RZ and a ring of CZs; option: entangled",
+            "EntangledOptions",
+        ),
         (
             "jerbi",
             "Trained rotations, a ring of CZs and the observation by turns; option: entangled",

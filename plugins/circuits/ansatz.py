@@ -55,13 +55,8 @@ class GateOptions:
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class NoOptions:
-    """An ansatz without options."""
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class EntangledOptions:
-    """Options of `jerbi`."""
+    """Options of `jerbi` and `skolik`."""
 
     entangled: Entangled = True
 
@@ -148,7 +143,7 @@ def cz(qubits: int, layers: int, options: GateOptions) -> Circuit:
     return _reuploading(qubits, layers, options, lambda circuit: _ring(circuit, "CZ"), controlled=False)
 
 
-def skolik(qubits: int, layers: int, options: NoOptions) -> Circuit:
+def skolik(qubits: int, layers: int, options: EntangledOptions) -> Circuit:
     """Build the data re-uploading circuit for Q-learning of Skolik, Jerbi & Dunjko (Quantum 6, 720, 2022).
 
     Every layer: RX(scaling[l, q] * input[q]), then RY(weights[l, q, 0]) and RZ(weights[l, q, 1]) on every qubit,
@@ -156,7 +151,7 @@ def skolik(qubits: int, layers: int, options: NoOptions) -> Circuit:
     at 1, the weights uniform in [0, 2 pi). The paper's last layer of rotations after the last encoding is
     this layer's own.
     """
-    circuit = Circuit(qubits)
+    circuit = _begun(qubits, options.entangled)
     scaling = circuit.parameter("scaling", (layers, qubits), low=1.0, high=1.0)
     weights = circuit.parameter("weights", (layers, qubits, 2))
     for layer in range(layers):
@@ -164,7 +159,8 @@ def skolik(qubits: int, layers: int, options: NoOptions) -> Circuit:
             circuit.append("RX", q, scaling[layer, q] * circuit.input(q))
             circuit.append("RY", q, weights[layer, q, 0])
             circuit.append("RZ", q, weights[layer, q, 1])
-        _ring_once(circuit, "CZ")
+        if options.entangled != "separable":
+            _ring_once(circuit, "CZ")
     return circuit
 
 

@@ -38,6 +38,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from qrlsuite.errors import OptionError
+from qrlsuite.options import Since
 from qrlsuite.plugins.models import vqc
 from qrlsuite.plugins.models.recurrent import lstm_step
 from qrlsuite.plugins.models.vqc import VQCOptions
@@ -53,6 +54,11 @@ class QLSTMOptions(VQCOptions):
     qubits: Annotated[int, Field(ge=1, le=20, description="qubits of each circuit, and numbers of h")] = 4
     layers: Annotated[int, Field(ge=1, le=256, description="layers of each circuit")] = 2
     ansatz: Annotated[str, Field(description="circuit family, see qrlsuite list ansatzes")] = "cz"
+    linear: Annotated[
+        bool,
+        Field(description="linear layers before and behind the circuits; false: none"),
+        Since("0.2.0"),
+    ] = True
 
 
 class Remembering(vqc._Hybrid):

@@ -5,6 +5,7 @@ whose expectation values <Z_q> are read off every qubit, Linear(n -> out). For 3
 6 L n + 7 n + 3 parameters on n qubits with L layers. Quantum parameters start uniform in [0, 2 pi), linear
 layers as `torch.nn.Linear` does. Without linear layers (`linear = false`), as in earlier work on CartPole (Jerbi
 et al. 2021; Skolik, Jerbi & Dunjko 2022), each output is a trained factor, 1 at first, times an expectation value.
+With `linear = "behind"`, as in SimplyQRL, there is the second linear layer alone.
 
 `readout` measures other products of Z than the circuit's own: pairs as in Skolik, Jerbi & Dunjko (2022) on CartPole, or
 the product of all as in Jerbi et al. (2021). `output_reuse` and `output_scale` are the classes OutputReuse and
@@ -53,6 +54,7 @@ NATIVE_STATES, PENNYLANE_STATES = 256 << 20, 1 << 30
 
 Activation = Literal["none", "relu", "tanh"]
 Readout = Literal["ansatz", "single", "pairs", "neighbors", "all-pairs", "product"]
+Linear = bool | Literal["behind"]
 OptionValue = bool | int | float | str
 
 
@@ -101,10 +103,10 @@ class VQCOptions:
         Tuned(0.1, 10, per_agent=True),
     ] = 1.0
     linear: Annotated[
-        bool,
+        Linear,
         Field(
-            description="linear layers before and behind the circuit; false: observations are its inputs, and "
-            "output i is a trained factor times expectation value i"
+            description="linear layers before and behind the circuit; behind: observations are its inputs; false: "
+            "these too, and output i is a trained factor times expectation value i"
         ),
         Since("0.2.0"),
     ] = True
@@ -197,9 +199,9 @@ class VQCOptions:
                 f"init_scale = {self.init_scale:g}: the circuit of ansatz '{self.ansatz}' multiplies no input by a "
                 "parameter"
             )
-        if self.input_reuse and self.linear:
+        if self.input_reuse and self.linear is True:
             raise OptionError(
-                "input_reuse = true needs linear = false: a linear layer gives the circuit all its inputs"
+                "input_reuse = true needs linear = false or behind: a linear layer gives the circuit all its inputs"
             )
         require_computable(circuit, self.backend)
 
@@ -269,7 +271,7 @@ class _Hybrid(nn.Module):
         super().__init__()
         self._runner = runner
         self._copies = 0
-        if runner.options.linear:
+        if runner.options.linear is True:
             self.input = _Affine(state["input.weight"], state["input.bias"])
         self.circuit = nn.ParameterDict(
             {
@@ -325,7 +327,7 @@ class _Hybrid(nn.Module):
     def _circuit_inputs(self, x: Tensor, state: dict[str, Tensor]) -> Tensor:
         """Map (S, B, in) to what the circuit is given, (S, B, circuit.inputs)."""
         inner = x.to(state["output.weight"].dtype)
-        if self._runner.options.linear:
+        if self._runner.options.linear is True:
             inner = linear(inner, state["input.weight"], state["input.bias"])
         elif self._runner.options.input_reuse:
             inner = inner[..., torch.arange(self._runner.circuit.inputs) % inner.shape[-1]]
@@ -476,7 +478,7 @@ def build(
         return mlp.build(obs_dim, out_dim, mlp.MLPOptions(), generator)
     runner = _Runner(options)
     circuit = runner.circuit
-    if not options.linear:
+    if options.linear is not True:
         _require_fit(runner, obs_dim, out_dim, role)
     return VQC(runner, initial(runner, obs_dim, len(circuit.observables), out_dim, (), generator))
 
@@ -500,7 +502,7 @@ def initial(
     """
     circuit, options = runner.circuit, runner.options
     state: dict[str, Tensor] = {}
-    if options.linear:
+    if options.linear is True:
         state["input.weight"], state["input.bias"] = initial_layer(inputs, circuit.inputs, "torch", generator)
     for name, parameter in circuit.parameters.items():
         uniform = torch.rand((*copies, *parameter.shape), generator=generator)
@@ -522,22 +524,23 @@ def initial(
 
 
 def _require_fit(runner: _Runner, inputs: int, outputs: int, role: str) -> None:
-    """Refuse a circuit that cannot stand without linear layers."""
-    circuit = runner.circuit
+    """Refuse a circuit that cannot stand without a linear layer before it, or without both."""
+    circuit, linear = runner.circuit, runner.options.linear
     values = len(circuit.observables) * runner.options.output_reuse
     enough = circuit.inputs >= inputs if runner.options.input_reuse else circuit.inputs == inputs
-    if enough and values >= outputs:
+    shown = linear == "behind" or values >= outputs
+    if enough and shown:
         return
-    advice = (
-        "choose qubits, or options of the ansatz, so that inputs are as many, and expectation values no fewer"
+    advice = "choose qubits, or options of the ansatz, so that inputs are as many" + (
+        "" if linear else ", and expectation values no fewer"
     )
-    if circuit.inputs > inputs and values >= outputs:
+    if circuit.inputs > inputs and shown:
         advice = "choose fewer qubits, or set input_reuse=true, and observations are given several times"
     if role == "critic":
         advice = "set critic=mlp, which takes a perceptron for it, or linear=true"
     raise OptionError(
-        f"linear = false: the circuit has {circuit.inputs} inputs and {values} expectation values, the {role} "
-        f"{inputs} inputs and {outputs} outputs: {advice}"
+        f"linear = {'behind' if linear else 'false'}: the circuit has {circuit.inputs} inputs and {values} expectation "
+        f"values, the {role} {inputs} inputs and {outputs} outputs: {advice}"
     )
 
 

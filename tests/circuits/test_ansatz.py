@@ -63,6 +63,8 @@ def test_skolik_on_three_and_two_qubits():
     assert len(ansatz("skolik", 2, 1)) == 7
     scaling = ansatz("skolik", 2, 1).parameters["scaling"]
     assert (scaling.low, scaling.high) == (1.0, 1.0)
+    assert gates(ansatz("skolik", 3, 2, entangled="separable")) == layer * 2
+    assert ansatz("skolik", 3, 2, entangled="mean-field").mean_field
 
 
 def test_one_qubit_has_no_ring():

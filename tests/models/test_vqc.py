@@ -340,6 +340,53 @@ def test_without_linear_layers_sizes_must_fit(obs, out, advice):
         agents(1, small(qubits=3, linear=False), obs=obs, out=out)
     with pytest.raises(OptionError, match="input_reuse = true needs linear = false"):
         small(input_reuse=True).check()
+    with pytest.raises(OptionError, match=r"linear = behind: the circuit has 3 inputs .* 4 inputs"):
+        agents(1, small(qubits=3, linear="behind"), obs=4, out=2)
+
+
+def test_a_linear_layer_behind_the_circuit_alone():
+    given = small("native", qubits=3, linear="behind")
+    modules = agents(2, given, obs=3, out=5)
+    population, x = vqc.population(modules, given), observations(4, 3)
+    assert sorted(name for name, _ in modules[0].named_parameters()) == [
+        "circuit.scaling",
+        "circuit.weights",
+        "output.bias",
+        "output.weight",
+    ]
+    shown = torch.stack([module(x) for module in modules])
+    torch.testing.assert_close(population(x.expand(2, -1, -1)), shown)
+    # With the identity and no bias before the circuit, both layers compute the same.
+    both = agents(1, small("native", qubits=3), obs=3, out=5)[0]
+    with torch.no_grad():
+        both.input.weight.copy_(torch.eye(3))
+        both.input.bias.zero_()
+    for name, value in modules[0].named_parameters():
+        both.get_parameter(name).data.copy_(value)
+    torch.testing.assert_close(both(x), shown[0])
+
+
+def test_reused_outputs_are_a_larger_step_of_the_layer_behind():
+    """Adam moves each copy of a weight alike, so their sum moves as one weight with a rate as many times as large."""
+    times, rate, x = 8, 0.01, observations(6, 3)
+    reused = agents(1, small("native", output_reuse=times, dtype="float64"))[0]
+    plain = agents(1, small("native", dtype="float64"))[0]
+    for name, value in reused.named_parameters():
+        if name == "output.weight":
+            value = value.unflatten(1, (times, -1)).sum(dim=1)
+        plain.get_parameter(name).data.copy_(value)
+    target = torch.linspace(-2, 2, 18, dtype=torch.float64).reshape(6, 3)
+    for module, factor in ((reused, 1), (plain, times)):
+        groups = [
+            {"params": [value], "lr": rate * (factor if name == "output.weight" else 1)}
+            for name, value in module.named_parameters()
+        ]
+        optimizer = torch.optim.Adam(groups, eps=0)
+        for _ in range(50):
+            optimizer.zero_grad()
+            (module(x) - target).square().mean().backward()
+            optimizer.step()
+    torch.testing.assert_close(reused(x), plain(x), atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(
