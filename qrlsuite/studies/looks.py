@@ -26,7 +26,7 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from qrlsuite import files, options
+from qrlsuite import files, notation, options
 from qrlsuite.errors import OptionError, StoreError
 from qrlsuite.experiment import identity
 from qrlsuite.experiment.entry import Entry, resolve
@@ -52,6 +52,8 @@ from qrlsuite.tuning.search import FOLDER as TUNING
 FOLDER = "decisions"
 """Below the results folder: studies with looks have a folder each, so that leaderboards do not rank their seeds."""
 FILE, LOG = "plan.toml", "looks.jsonl"
+LONG = 40
+"""Characters of a name beyond which a new study leaves out what all of its names share."""
 
 
 @dataclass(frozen=True)
@@ -437,8 +439,20 @@ def new(
     while first_seed is None and study.trained_before():
         moved = study.looks.model_copy(update={"first_seed": study._next_block()})
         study = StudyWithLooks(Study(study.file.model_copy(update={"looks": moved}), "the study"), runs)
+    names = _brief(list(study.entries))
+    if names != list(study.entries):
+        tables = [table.model_copy(update={"name": name}) for table, name in zip(study.file.entries, names)]
+        study = StudyWithLooks(Study(study.file.model_copy(update={"entries": tables}), "the study"), runs)
     study.file = study.file.model_copy(update={"summary": question_of(list(study.entries))})
     return study
+
+
+def _brief(names: Sequence[str]) -> list[str]:
+    """Return names without the options that all of them have, where one is too long for a table's line."""
+    words = [notation.split(name) for name in names]
+    shared = set.intersection(*map(set, words)) if max(map(len, names)) > LONG else set()
+    brief = [" ".join(w for i, w in enumerate(each) if i == 0 or w not in shared) for each in words]
+    return brief if len(set(brief)) == len(brief) else list(names)
 
 
 def _fixed(study: Study) -> tuple[StudyFile, list[Member]]:

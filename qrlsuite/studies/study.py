@@ -385,11 +385,9 @@ def _with_table(data: dict[str, Any]) -> dict[str, Any]:
 
 def question_of(names: Sequence[str]) -> str:
     """Return what is asked about all pairs of some entries."""
-    return (
-        f"Which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
-        if names
-        else "Which needs fewer steps?"
-    )
+    if 0 < len(names) <= 4:
+        return f"Which needs fewer steps, {', '.join(names[:-1])} or {names[-1]}?"
+    return f"Which of {len(names)} entries needs the fewest steps?" if names else "Which needs fewer steps?"
 
 
 def dumps(file: StudyFile) -> str:

@@ -341,6 +341,26 @@ def test_a_new_study_takes_the_first_unused_seeds() -> None:
     assert "Which needs fewer steps, mlp width=16, mlp width=8 or mlp width=4?" in shown
 
 
+def test_names_of_a_new_study_leave_out_what_all_entries_share() -> None:
+    shared = "lr=0.002 gamma=0.9 batch=32 target_steps=100"
+    study = write(
+        *(f"mlp width={width} {shared}" for width in (16, 8, 4, 3)), "mlp width=16 lr=0.002 gamma=0.9"
+    )
+    found = answer("show", study)
+    pairs = [name for pair in found["pairs"] for name in (pair["first"], pair["second"])]
+    assert list(dict.fromkeys(pairs)) == [
+        "mlp width=16 batch=32 target_steps=100",
+        "mlp width=8 batch=32 target_steps=100",
+        "mlp width=4 batch=32 target_steps=100",
+        "mlp width=3 batch=32 target_steps=100",
+        "mlp width=16",
+    ]
+    text = Path(study).read_text()
+    assert 'name = "mlp width=8 batch=32 target_steps=100"' in text
+    assert 'summary = "Which of 5 entries needs the fewest steps?"' in text
+    assert found["hash"] == answer("show", study)["hash"]
+
+
 def test_any_study_with_a_table_of_looks_compares_its_entries() -> None:
     """Groups and grids are those of every study; what is not said is the task's, and a picture is drawn if named."""
     Path("grid.toml").write_text(
